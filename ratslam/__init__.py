@@ -7,8 +7,12 @@ bring their own source or method. Nothing is loaded before it is used.
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from evaluation.metrics.metric import Finding, Metric
+    from evaluation.metrics.registry import METRICS, MetricEntry
+    from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors
     from ratslam.config.run_config import RunConfig, load_config
     from ratslam.core.backend import Backend, Map
+    from ratslam.core.path_map import PathMap
     from ratslam.core.session import Session
     from ratslam.core.types import Action, Estimate
     from ratslam.pipeline.estimate import Health, PoseEstimate
@@ -16,8 +20,11 @@ if TYPE_CHECKING:
     from ratslam.pipeline.slam import Slam
     from ratslam.pipeline.source import open_source
     from robot.sources.description import SourceDescription
+    from robot.sources.registry import SOURCES, SourceEntry
     from robot.sources.source import Sample, Source
     from robot.sources.source_info import SourceInfo
+    from robot.touch_source import TOUCH, TouchEntry
+    from tactile.base.config import Settings
     from tactile.base.errors import InputError
     from tactile.base.types import Observation, Odometry, observation
 
@@ -25,32 +32,76 @@ RATSLAM_PACKAGE = "ratslam"  # see tactile/__init__.py
 
 _MODULES = {
     "Action": "ratslam.core.types",
+    "BACKENDS": "ratslam.backends.registry",
     "Backend": "ratslam.core.backend",
+    "BackendEntry": "ratslam.backends.registry",
     "Estimate": "ratslam.core.types",
+    "Finding": "evaluation.metrics.metric",
     "Health": "ratslam.pipeline.estimate",
     "InputError": "tactile.base.errors",
+    "METRICS": "evaluation.metrics.registry",
     "Map": "ratslam.core.backend",
+    "Metric": "evaluation.metrics.metric",
+    "MetricEntry": "evaluation.metrics.registry",
     "Observation": "tactile.base.types",
     "Odometry": "tactile.base.types",
+    "PathMap": "ratslam.core.path_map",
     "PoseEstimate": "ratslam.pipeline.estimate",
     "Result": "ratslam.pipeline.result",
     "RunConfig": "ratslam.config.run_config",
+    "SOURCES": "robot.sources.registry",
     "Sample": "robot.sources.source",
+    "Sensors": "ratslam.backends.registry",
     "Session": "ratslam.core.session",
+    "Settings": "tactile.base.config",
     "Slam": "ratslam.pipeline.slam",
     "Source": "robot.sources.source",
     "SourceDescription": "robot.sources.description",
+    "SourceEntry": "robot.sources.registry",
     "SourceInfo": "robot.sources.source_info",
+    "TOUCH": "robot.touch_source",
+    "TouchEntry": "robot.touch_source",
     "load_config": "ratslam.config.run_config",
     "observation": "tactile.base.types",
     "open_source": "ratslam.pipeline.source",
     "run": "ratslam.pipeline.result",
 }
 __all__ = [
-    "Action", "Backend", "Estimate", "Health", "InputError", "Map", "Observation", "Odometry", "PoseEstimate",
-    "Result", "RunConfig", "Sample", "Session", "Slam", "Source", "SourceDescription", "SourceInfo",
-    "load_config", "observation", "open_source", "run",
-]  # fmt: skip
+    "BACKENDS",
+    "METRICS",
+    "SOURCES",
+    "TOUCH",
+    "Action",
+    "Backend",
+    "BackendEntry",
+    "Estimate",
+    "Finding",
+    "Health",
+    "InputError",
+    "Map",
+    "Metric",
+    "MetricEntry",
+    "Observation",
+    "Odometry",
+    "PathMap",
+    "PoseEstimate",
+    "Result",
+    "RunConfig",
+    "Sample",
+    "Sensors",
+    "Session",
+    "Settings",
+    "Slam",
+    "Source",
+    "SourceDescription",
+    "SourceEntry",
+    "SourceInfo",
+    "TouchEntry",
+    "load_config",
+    "observation",
+    "open_source",
+    "run",
+]
 
 if not TYPE_CHECKING:  # type checkers report names that do not exist
 

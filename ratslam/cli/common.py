@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import shtab
 
-from ratslam.config.packaged import find_config, packaged_configs
+from ratslam.config.packaged import packaged_configs
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -132,7 +132,7 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     """
     from ratslam.config.run_config import load_config
 
-    return load_config(find_config(arguments.config), arguments.set)
+    return load_config(arguments.config, arguments.set)
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:

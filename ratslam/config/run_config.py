@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
+from ratslam.config.packaged import find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin
 from ratslam.config.presets import PresetName
 from ratslam.config.renamed_keys import RENAMED
@@ -125,13 +126,15 @@ def load_config(
     """Reads a configuration file; its relative paths start at its folder.
 
     Args:
+        path: of the file, or the name of a packaged configuration.
         assignments: settings to replace, each `a.b=value`.
         source_required: whether a configuration without a source is an error; `ratslam.Slam` needs none.
 
     Raises:
         InputErrors: all errors in it, each with file, line and column.
     """
+    path = find_config(path)
     document = load(path, assignments)
     config = validate(document, RunConfig if source_required else LoopConfig)
     check_plugins(document, config)
-    return config.with_absolute_paths(Path(path).parent.resolve())
+    return config.with_absolute_paths(path.parent.resolve())

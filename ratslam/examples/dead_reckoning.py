@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+import ratslam
 from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors
 from ratslam.core.backend import Backend
 from ratslam.core.finite_values import finite_values
 from ratslam.core.path_map import PathMap
 from ratslam.core.types import Action, Estimate, Scalar
-from ratslam.examples import stand_in as ratslam
 from tactile.base.config import Settings
 from tactile.base.se2 import compose
 from tactile.base.types import Observation

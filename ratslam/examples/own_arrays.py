@@ -10,7 +10,7 @@ import hashlib
 import numpy as np
 from pydantic import PositiveInt
 
-from ratslam.examples import stand_in as ratslam
+import ratslam
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_velocities
 from robot.sources.registry import SOURCES, SourceEntry

@@ -7,10 +7,10 @@
 
 import numpy as np
 
+import ratslam
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric
 from evaluation.metrics.registry import METRICS, MetricEntry
 from evaluation.metrics.run_metrics import RunData
-from ratslam.examples import stand_in as ratslam
 from tactile.base.config import Settings
 from tactile.base.se2 import between
 

@@ -8,8 +8,9 @@
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
+import ratslam
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.examples import own_arrays
-from ratslam.examples import stand_in as ratslam
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH, TouchEntry
 from tactile.base.config import Settings
@@ -18,14 +19,13 @@ from tactile.base.types import Observation, Odometry, observation
 
 
 class Config(Settings):
-    frames: PositiveInt = 50
-    """Frames whose largest pressures make one view: a second at 50 Hz."""
-    contact: PositiveFloat = 0.05
-    """Pressure of a contact, as a share of full scale."""
+    frames: PositiveInt = 50  # their largest pressures make one view: a second at 50 Hz
+    contact: PositiveFloat = 0.05  # pressure of a contact, as a share of full scale
 
 
-class TaxelArray:
+class TaxelArray(Checkpointed):
     view_shape, whiskers = (3, 22, 1), 3 * 22
+    VALUES = ("count", "pose", "dt", "peak")  # remembered between readings
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -42,7 +42,8 @@ class TaxelArray:
         if self.count < self.config.frames:
             return None
         view = np.where(self.peak >= self.config.contact, self.peak, 0.0)
-        made = observation(Odometry(*self.pose, dt=self.dt), view, whiskers=self.whiskers)
+        dx, dy, turn = self.pose
+        made = observation(Odometry(dx, dy, turn, self.dt), view, whiskers=self.whiskers)
         self.clear()
         return made._replace(contact=view.reshape(-1) > 0)
 
