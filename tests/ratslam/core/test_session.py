@@ -11,14 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ratslam.backends.registry import Sensors
+from ratslam.core.path_map import PathMap
 from ratslam.core.session import CHUNK, Session, capacity_at
+from ratslam.examples import dead_reckoning
 from tactile.base.types import Odometry, observation
-from tests.ratslam.backends.dead_reckoning import DeadReckoning, PathMap
+
+BACKEND = dead_reckoning.ENTRY.build(dead_reckoning.Config(), Sensors((3, 6, 1)), np.dtype(np.float64))
 
 
 def test_float64_without_64_bit_types_is_refused():
     with jax.enable_x64(False), pytest.raises(ValueError, match="prepare_precision"):
-        Session(DeadReckoning())
+        Session(BACKEND)
 
 
 def test_importing_ratslam_changes_no_jax_setting():
@@ -31,7 +35,7 @@ def test_importing_ratslam_changes_no_jax_setting():
 
 
 def test_a_restarted_session_repeats_itself_without_compiling_again():
-    session = Session(DeadReckoning())
+    session = Session(BACKEND)
     walk = [observation(Odometry(0.1, 0.0, 0.1 * k, 0.1)) for k in range(20)]
     first = [step.pose for step in session.replay(walk)]
     session.restart()
@@ -47,10 +51,11 @@ class Restored(NamedTuple):
     rows: int
 
 
-class Table(DeadReckoning):
+class Table(dead_reckoning.DeadReckoning):
     """A memory of rows, one more at each step, to which its map restores merged ones."""
 
     def __init__(self, restored):
+        super().__init__(dead_reckoning.Config(), Sensors((3, 6, 1)), np.dtype(np.float64))
         self.restored, self.used, self.merged = restored, 0, []
 
     def init(self, key, capacity):
@@ -83,7 +88,7 @@ class RestoringMap(PathMap):
         self.rows = rows
 
     def merge(self):
-        return Restored(self.rows) if len(self.path) == CHUNK + 1 else None
+        return Restored(self.rows) if len(self.trajectory()) == CHUNK else None
 
 
 @pytest.mark.parametrize("rows", [3, 241, 242, 1000])

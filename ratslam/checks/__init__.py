@@ -1,0 +1,1 @@
+"""Conformance checks for registered backends, sources, touch front ends and metrics."""

@@ -1,0 +1,116 @@
+"""A source under test, and what its checks share."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from itertools import islice
+from typing import Any, NamedTuple
+
+from ratslam.checks.common import Violation
+from robot.sources.registry import SourceEntry
+from robot.sources.source import ClosedSource, Sample, Source
+from robot.touch_source import head_config_of, open_touch_source, report_config_of
+from tactile.base.plugins import PluginConfig
+from tactile.base.types import Observation
+from tactile.frontend import TouchConfig
+
+SAMPLES = 4096
+"""Samples of a source that are examined unless said otherwise."""
+
+
+class Reading(NamedTuple):
+    """One pass through a source.
+
+    Attributes:
+        source: as opened. samples: the first ones. copies: of each, made before the next one was read.
+        complete: whether there are no further samples. suppresses: what `__exit__` returned.
+    """
+
+    source: Source
+    samples: list[Sample]
+    copies: list[Sample]
+    complete: bool
+    suppresses: bool
+
+
+class SourceTrial:
+    """A source with settings, and what its checks share.
+
+    Args:
+        settings: an instance of the entry's `config_class`. frontend: for readings that are not observations.
+        most: samples to examine.
+    """
+
+    def __init__(
+        self, entry: SourceEntry, settings: Any, frontend: PluginConfig | None = None, most: int = SAMPLES
+    ) -> None:
+        self.entry, self.settings, self.frontend, self.most = entry, settings, frontend, most
+
+    @cached_property
+    def source(self) -> Source:
+        return self.entry.open(self.settings, None)
+
+    @cached_property
+    def reading(self) -> Reading:
+        """The first pass."""
+        return read(self.source, self.most)
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether it can be read again: a live robot has no digest."""
+        return self.source.digest != ""
+
+    @cached_property
+    def observing(self) -> Source:
+        """The samples of the first pass, through the front end that they need."""
+        stored = StoredSource(self.source, self.reading.samples)
+        config = TouchConfig(frontend=self.frontend)
+        heads = {
+            "head": head_config_of(stored.info, config.head),
+            "reports": report_config_of(stored.info, config.reports),
+        }
+        return open_touch_source(stored, config.model_copy(update=heads))
+
+    @cached_property
+    def observations(self) -> list[Observation]:
+        """Its observations.
+
+        Raises:
+            Violation: a reading is no observation, and no front end takes it.
+        """
+        found = [sample.reading for sample in self.observing]
+        for k, reading in enumerate(found):
+            if not isinstance(reading, Observation):
+                what = f"reading {k} is of type {type(reading).__name__}"
+                raise Violation(what, "Observation, or a front end (--touch NAME) that takes such readings")
+        return found
+
+
+def read(source: Source, most: int) -> Reading:
+    """Reads the first samples of a source and closes it."""
+    source.__enter__()
+    try:
+        samples, copies = [], []
+        iterator = iter(source)
+        for sample in islice(iterator, most):
+            samples.append(sample)
+            copies.append(copy.deepcopy(sample))
+        complete = len(samples) < most or next(iterator, None) is None
+    finally:
+        suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
+    return Reading(source, samples, copies, complete, suppresses)
+
+
+class StoredSource(ClosedSource):
+    """Samples that were read from a source, with its attributes."""
+
+    def __init__(self, source: Source, samples: Sequence[Sample]) -> None:
+        self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
+        self.view_shape, self.whiskers, self.info = source.view_shape, source.whiskers, source.info
+        self.length: int | None = len(samples)
+        self._samples = samples
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self._samples)
