@@ -35,9 +35,11 @@ VIOLATIONS = {
         ("ratslam.recall.filter", "ratslam.pose_graph"),
         ("ratslam.pipeline.run", "ratslam.experiments"),
         ("ratslam.live.session", "ratslam.experiments"),
+        ("ratslam.pipeline.run", "ratslam.checks"),
+        ("ratslam.checks.backend", "ratslam.live"),
         ("ratslam.planted", "ratslam.core.types"),
     ],
-    "only pipeline, live, config, experiments and cli know robot and evaluation": [
+    "only pipeline, live, config, experiments, checks and cli know robot and evaluation": [
         ("ratslam.core.session", "robot"),
         ("ratslam.backends.classic", "evaluation"),
     ],

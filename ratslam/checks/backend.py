@@ -77,9 +77,9 @@ def _kind(leaf: Any) -> str:
 
 def _state(trial: BackendTrial) -> str:
     before, after, *_ = trial.types
-    if jax.tree.structure(before) != jax.tree.structure(after):
-        found = f"{jax.tree.structure(before)} becomes {jax.tree.structure(after)}"
-        raise Violation(found, "the state's structure unchanged")
+    structures = [str(jax.tree.structure(state)) for state in (before, after)]
+    if structures[0] != structures[1]:
+        raise Violation(" becomes ".join(structures), "the state's structure unchanged")
     pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
     changes = [
         f"state{jax.tree_util.keystr(path)} is {_kind(old)} before a step and {_kind(new)} after it"

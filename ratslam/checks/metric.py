@@ -152,17 +152,15 @@ def _rare_runs(trial: MetricTrial) -> str:
     run = synthetic_run()
     half = run.truth[: len(run.time) // 2] if run.truth is not None else np.zeros((0, 3))
     unknown = np.full((len(run.time) - len(half), 3), np.nan)
-    none = np.zeros(0, int)
-    empty = {"created": none, "nodes": np.zeros((0, 3)), "links": np.zeros((0, 2), int)}
-    steps = {
-        name: getattr(run, name)[:1]
-        for name in ("time", "truth", "online", "final", "odometry", "experience")
-    }
-    first = run._replace(**steps, created=np.zeros(1, int), nodes=run.nodes[:1], links=empty["links"])
+    none, no_links = np.zeros(0, int), np.zeros((0, 2), int)
+    names = ("time", "truth", "online", "final", "odometry", "experience")
+    first: dict[str, Any] = {name: getattr(run, name)[:1] for name in names}
+    first |= {"created": np.zeros(1, int), "nodes": run.nodes[:1], "links": no_links}
+    empty: dict[str, Any] = {"created": none, "nodes": np.zeros((0, 3)), "links": no_links}
     rare = {
         "a run whose second half has no truth": run._replace(truth=np.concatenate([half, unknown])),
         "a run without experiences": run._replace(experience=np.full(len(run.time), -1), **empty),
-        "a run of one step": first,
+        "a run of one step": run._replace(**first),
     }
     for what, one in rare.items():
         result = trial.metric.compute(_data(one))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,9 @@ from ratslam.checks.common import (
     run_checks,
 )
 from ratslam.checks.observations import require_masks, require_shapes
-from ratslam.checks.source_trial import SAMPLES, SourceTrial, read
+from ratslam.checks.source_trial import SAMPLES, SourceTrial, is_recording, read
 from robot.sources.registry import SOURCES
-from robot.sources.source import Sample, Source, rate_of
+from robot.sources.source import Sample, rate_of
 from robot.sources.source_info import SourceInfo
 from robot.touch_source import TOUCH
 from tactile.base.config import Settings
@@ -87,7 +87,7 @@ def _attributes(trial: SourceTrial) -> str:
 
 
 def _is_count(value: Any, least: int = 0) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= least
 
 
 def _samples(trial: SourceTrial) -> str:
@@ -163,7 +163,7 @@ def _rate(trial: SourceTrial) -> str:
 
 def _digest(trial: SourceTrial) -> str:
     source = trial.source
-    if not trial.is_recording:
+    if not is_recording(source):
         found = f"no digest, but the length {source.length}"
         require(source.length is None, found, "sha256 (hex) of all input of a recording")
         return "a live source"
@@ -173,15 +173,12 @@ def _digest(trial: SourceTrial) -> str:
 
 
 def _repeats(trial: SourceTrial) -> str:
-    if not trial.is_recording:
+    if not is_recording(trial.source):
         return "a live source, read once"
     first = trial.reading.copies
-    again: list[tuple[str, Callable[[], Source]]] = [
-        ("two passes through one source", lambda: trial.source),
-        ("two openings", lambda: trial.entry.open(trial.settings, None)),
-    ]
-    for what, opened in again:
-        require_equal(first, read(opened(), trial.most).samples, f"the samples of {what}")
+    require_equal(first, trial.reading.again, "the samples of two passes")
+    other = read(trial.entry.open(trial.settings, None), trial.most)
+    require_equal(first, other.samples, "the samples of two openings")
     return ""
 
 

@@ -21,16 +21,17 @@ SAMPLES = 4096
 
 
 class Reading(NamedTuple):
-    """One pass through a source.
+    """What was read of an opened source.
 
     Attributes:
-        source: as opened. samples: the first ones. copies: of each, made before the next one was read.
+        samples: the first ones. copies: of each, made before the next one was read.
+        again: those of a second pass; none for a live source.
         complete: whether there are no further samples. suppresses: what `__exit__` returned.
     """
 
-    source: Source
     samples: list[Sample]
     copies: list[Sample]
+    again: list[Sample]
     complete: bool
     suppresses: bool
 
@@ -54,13 +55,8 @@ class SourceTrial:
 
     @cached_property
     def reading(self) -> Reading:
-        """The first pass."""
+        """What was read of the source."""
         return read(self.source, self.most)
-
-    @property
-    def is_recording(self) -> bool:
-        """Whether it can be read again: a live robot has no digest."""
-        return self.source.digest != ""
 
     @cached_property
     def observing(self) -> Source:
@@ -89,18 +85,25 @@ class SourceTrial:
 
 
 def read(source: Source, most: int) -> Reading:
-    """Reads the first samples of a source and closes it."""
+    """Reads the first samples of a source, of a recording twice, and closes it."""
     source.__enter__()
     try:
-        samples, copies = [], []
+        samples: list[Sample] = []
+        copies: list[Sample] = []
         iterator = iter(source)
         for sample in islice(iterator, most):
             samples.append(sample)
             copies.append(copy.deepcopy(sample))
         complete = len(samples) < most or next(iterator, None) is None
+        again = list(islice(source, most)) if is_recording(source) else []
     finally:
         suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
-    return Reading(source, samples, copies, complete, suppresses)
+    return Reading(samples, copies, again, complete, suppresses)
+
+
+def is_recording(source: Source) -> bool:
+    """Whether it can be read again: a live robot has no digest."""
+    return source.digest != ""
 
 
 class StoredSource(ClosedSource):
