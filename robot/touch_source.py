@@ -154,7 +154,8 @@ def observation_of(sample: Sample) -> Observation:
 
 
 def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
-    """The whiskers of a source projected to the floor; None for a source without whiskers.
+    """The whiskers of a source projected to the floor; None for a source without whiskers, and for a touch
+    sensor that is not the head of the configuration.
 
     Args:
         config: with the whiskers of the source.
@@ -163,7 +164,8 @@ def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | 
         return None
     if source.info.planar_whiskers is not None:
         return config.reports.feelers
-    return project_to_plane(ur10_head(config.head), MAZE_WALL_HEIGHT)
+    head = ur10_head(config.head)
+    return project_to_plane(head, MAZE_WALL_HEIGHT) if len(head.length) == source.whiskers else None
 
 
 def report_config_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFrontendConfig:

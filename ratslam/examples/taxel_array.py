@@ -42,8 +42,7 @@ class TaxelArray(Checkpointed):
         if self.count < self.config.frames:
             return None
         view = np.where(self.peak >= self.config.contact, self.peak, 0.0)
-        dx, dy, turn = self.pose
-        made = observation(Odometry(dx, dy, turn, self.dt), view, whiskers=self.whiskers)
+        made = observation(Odometry._make([*self.pose, self.dt]), view, whiskers=self.whiskers)
         self.clear()
         return made._replace(contact=view.reshape(-1) > 0)
 

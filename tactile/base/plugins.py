@@ -59,6 +59,10 @@ class Registry(Generic[Entry]):
             raise ValueError(f"the {self.noun} '{name}' is registered already")
         self._registered[name] = entry
 
+    def unregister(self, name: str) -> None:
+        """Removes an entry that was added to this process, if there is one of that name."""
+        self._registered.pop(name, None)
+
     def names(self) -> list[str]:
         """All names, built-in ones first; loads no package."""
         found = entry_points(group=self.group)
@@ -95,7 +99,7 @@ class Registry(Generic[Entry]):
                 where, f"{found} cannot be loaded: {cause}", cure="repair or remove it"
             ) from error
         if not isinstance(entry, self._kind):
-            raise InputError(where, f"{found} is a {type(entry).__name__}", f"a {self._kind.__name__}")
+            raise InputError(where, f"{found} is of type {type(entry).__name__}", self._kind.__name__)
         return entry
 
 

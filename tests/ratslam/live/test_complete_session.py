@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -114,8 +114,12 @@ def complete_session(host: str, folder: Path, *settings: str, longest: float, fr
     return directory
 
 
-def check_session(directory: Path, whisks: int) -> dict:
-    """The report of a session; checks that nothing was lost and that the replay is identical."""
+def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> dict:
+    """The report of a session; checks that nothing was lost and that the replay is identical.
+
+    Args:
+        same: files of the run directory to compare.
+    """
     report = json.loads((directory / "live.json").read_text())
     print(json.dumps(report, indent=1))
     assert report["outcome"] == "complete"
@@ -136,7 +140,7 @@ def check_session(directory: Path, whisks: int) -> dict:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]", "the replay loads what only live sessions need"
-    for name in SAME:
+    for name in same:
         assert (directory / name).read_bytes() == (again / name).read_bytes(), name
     assert len((directory / "steps.csv").read_text().splitlines()) == whisks + 1
     return report

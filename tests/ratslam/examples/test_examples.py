@@ -1,0 +1,44 @@
+"""The examples run as programs and print what they say."""
+
+from __future__ import annotations
+
+import ast
+import re
+import runpy
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import ratslam.examples
+from evaluation.metrics.registry import METRICS
+from ratslam.backends.registry import BACKENDS
+from robot.sources.registry import SOURCES
+from robot.touch_source import TOUCH
+
+NAMES = ("dead_reckoning", "own_arrays", "own_loop", "own_metric", "taxel_array")
+FOLDER = Path(ratslam.examples.__file__).parent
+
+
+@pytest.fixture
+def own_names() -> Iterator[None]:
+    """Forgets what the examples register: each runs as in a process of its own."""
+    yield
+    for registry, name in ((BACKENDS, "dead_reckoning"), (SOURCES, "arrays"), (TOUCH, "taxels")):
+        registry.unregister(name)
+    METRICS.unregister("way_home")
+
+
+@pytest.mark.usefixtures("own_names")
+@pytest.mark.parametrize("name", NAMES)
+def test_an_example_prints_what_its_docstring_says(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
+    said = re.findall(r"^    (.+)$", ast.get_docstring(ast.parse(text)) or "", re.MULTILINE)
+    assert len(said) == 1
+    runpy.run_module(f"ratslam.examples.{name}", run_name="__main__")
+    assert capsys.readouterr().out.splitlines() == said
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_example_is_short(name: str) -> None:
+    assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 60
