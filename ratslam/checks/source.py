@@ -25,6 +25,7 @@ from robot.sources.source import Sample, rate_of
 from robot.sources.source_info import SourceInfo
 from robot.touch_source import TOUCH
 from tactile.base.config import Settings
+from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
 
 ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
@@ -42,7 +43,8 @@ def check_source(
         most: samples to examine.
 
     Raises:
-        InputError: there is no such source or front end, its package is broken, or the settings do not fit.
+        InputError: there is no such source or front end, its package is broken, the settings do not fit, or
+            the source refuses them, for example because a file is missing.
     """
     entry = SOURCES.get(name, "check source")
     models: dict[str, Any] = {"settings": entry.config_class}
@@ -50,7 +52,14 @@ def check_source(
         models["touch"] = TOUCH.get(touch, "--touch").config_class
     settings = read_assignments(models, assignments)
     frontend = touch and PluginConfig(plugin=touch, settings=_as_data(settings["touch"]))
-    return run_checks(GROUPS, SourceTrial(entry, settings["settings"], frontend or None, most))
+    trial = SourceTrial(entry, settings["settings"], frontend or None, most)
+    try:
+        _ = trial.source
+    except InputError:
+        raise
+    except Exception:  # reported by a check
+        pass
+    return run_checks(GROUPS, trial)
 
 
 def _as_data(settings: Settings | None) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from ratslam.backends.registry import BACKENDS
 from ratslam.checks import backend, metric, source, touch
 from ratslam.cli import main
 from ratslam.examples import dead_reckoning
+from robot.recordings.formats import RecordingConfig, open_recording
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.registry import SOURCES, SourceEntry
 from robot.touch_source import TOUCH, TouchEntry
@@ -47,6 +48,8 @@ def parts(monkeypatch):
     monkeypatch.setitem(BACKENDS.builtin, "example", dead_reckoning.ENTRY)
     monkeypatch.setitem(BACKENDS.builtin, "broken", broken_backends.entry_of(broken_backends.FloatOutcome))
     monkeypatch.setitem(SOURCES.builtin, "head", SourceEntry(Seed, head))
+    monkeypatch.setitem(SOURCES.builtin, "file", SourceEntry(RecordingConfig, open_recording))
+    monkeypatch.setitem(SOURCES.builtin, "faulty", SourceEntry(NoSettings, lambda *_: 1 / 0))
     frontend = TouchEntry(NoSettings, lambda settings, info: Frontend(TouchConfig(), info.calibration))
     monkeypatch.setitem(TOUCH.builtin, "images", frontend)
     monkeypatch.setitem(METRICS.builtin, "steps", MetricEntry(Factor, steps))
@@ -95,6 +98,15 @@ def test_other_parts_pass(capsys, arguments, module):
     assert (code, lines[-1]) == (0, f"{arguments[1]}: {len(module.CHECKS)} checks, 0 failed")
 
 
+def test_a_source_that_cannot_be_opened_is_told_why(capsys):
+    code, lines, _ = check(capsys, "source", "faulty")
+    assert (code, lines[-1]) == (
+        1,
+        f"faulty: {len(source.CHECKS)} checks, 1 failed, {len(source.CHECKS) - 2} not run",
+    )
+    assert "ZeroDivisionError: division by zero at test_check_command.py" in lines[1]
+
+
 def test_settings_reach_the_part(capsys):
     _, lines, _ = check(capsys, "metric", "steps", "--set", "settings.factor=2")
     assert "ok    it computes with truth: 216" in lines
@@ -105,6 +117,8 @@ def test_settings_reach_the_part(capsys):
     [
         (["backend", "exampl"], ["'exampl'", "did you mean 'example'?"]),
         (["source", "no"], ["a source"]),
+        (["source", "file"], ["settings.file", "missing"]),
+        (["source", "file", "--set", "settings.file=none.npz"], ["none.npz"]),
         (["touch", "images", "--source", "no"], ["--source", "a source"]),
         (["metric", "steps", "--set", "settings.facto=2"], ["settings.facto", "did you mean 'factor'"]),
         (["metric", "steps", "--set", "settings.factor=two"], ["settings.factor", "'two'"]),
