@@ -204,7 +204,8 @@ def _single(trial: BackendTrial) -> str:
         if leaf.dtype == np.float64
     ]
     for name, record in (("estimate", steps[-1].estimate), ("evidence", steps[-1].evidence)):
-        wrong += [path for path, leaf in leaves(record, name) if leaf.dtype == np.float64]
+        # The map may complete the estimate with Python numbers.
+        wrong += [path for path, leaf in leaves(record, name) if getattr(leaf, "dtype", None) == np.float64]
     require(not wrong, f"float64 in {', '.join(wrong)} of a float32 session", "float32")
     return ""
 
