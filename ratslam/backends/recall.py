@@ -27,7 +27,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
-from ratslam.recall.config import fan_width
+from ratslam.recall.config import fan_width, sector_shifts
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
@@ -37,7 +37,6 @@ from ratslam.recall.observation_model import (
     view_likelihood,
 )
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
-from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
 HEALTH_RATE = 0.1
@@ -108,9 +107,6 @@ class RecallBackend(Backend):
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixel_layout(view_shape) if self.recall.sector_fov == "whiskers" else None
-        if self.pixels is None and config.keyframes.merge_stood:
-            found = f"{config.keyframes.merge_stood} without whiskers"
-            raise InputError("keyframes.merge_stood", found, "0: only on touch keyframes are merged")
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.window_levels = window_levels(config.pose_cells, self.dtype)
@@ -195,9 +191,13 @@ class RecallBackend(Backend):
         return jnp.where(view_fits >= 0, updated, health)
 
     def new_map(self) -> KeyframeMap:
-        """An empty keyframe map."""
+        """An empty keyframe map; keyframes of views and given ids are not merged, because their sequences are
+        judged by keyframe."""
+        keyframes = self.config.keyframes
+        if self.pixels is None:
+            keyframes = keyframes.model_copy(update={"merge_stood": 0})
         return KeyframeMap(
-            self.config.keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
+            keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
             closures=self.config.experience.closures, ablation=self.ablation,
         )  # fmt: skip
 
@@ -210,7 +210,8 @@ class RecallBackend(Backend):
         if self.labels:
             return LabelAppearance()
         if self.pixels is not None:
-            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalise)
+            half_turns = len(sector_shifts(self.recall)) > 1
+            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalise, half_turns)
         return ViewAppearance(self.size, fan_width(self.recall), self._normalise)
 
     def _normalise(self, view: np.ndarray) -> np.ndarray:

@@ -208,6 +208,7 @@ class WhiskerAppearance(Appearance):
 
     Args:
         temper: factor on the log-odds, see `RecallConfig`. normalise: the preprocessing of recall.
+        half_turns: whether images are also compared as seen in the opposite direction.
     """
 
     VALUES = ("_likeness",)
@@ -217,13 +218,15 @@ class WhiskerAppearance(Appearance):
         pixels: PixelLayout,
         temper: float,
         normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        half_turns: bool = True,
     ) -> None:
         self._pixels, self._temper, self._normalise = pixels, temper, normalise
+        self._angle = np.pi if half_turns else 0.0
         self._level = GrowableArray((len(pixels.group),), np.int64)
         self._likeness = NO_LIKENESS
 
     def metric(self) -> ViewMetric:
-        return ViewMetric(np.pi, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
+        return ViewMetric(self._angle, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         view = self._normalise(np.asarray(observation.view, float))

@@ -108,9 +108,9 @@ class KeyframeMapConfig(Settings):
     closure_cost_limit: PositiveFloat = 6.0
     """Largest chi-square of a single closure in the selection."""
     merge_stood: NonNegativeInt = 0
-    """Number of selections in a row that a sequence must stand before the keyframes it confirms are merged
-    with older ones at the same pose; 0: keyframes are not merged. On touch only, with `select_every` above
-    10."""
+    """Whiskers: number of selections in a row that a sequence must stand before the keyframes it confirms are
+    merged with older ones at the same pose; 0, without whiskers, and with `select_every` up to 10: keyframes
+    are not merged."""
     merge_newest: PositiveInt = 1000
     """Number of newest keyframes that are not merged."""
     solve_every: PositiveInt = 1

@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
 from ratslam.keyframes.appearance import (
     LOG_ODDS_INTERVAL,
     MIN_ERRORS,
@@ -326,3 +328,14 @@ def test_a_restored_appearance_continues_as_if_uninterrupted(kind, stop):
 def test_a_pixel_of_value_1_has_the_highest_level():
     frames = touched(np.ones((LOG_ODDS_INTERVAL, *SHAPE)))
     assert (frames.arrays()["level"] == HEIGHTS).all()
+
+
+@pytest.mark.parametrize(("columns", "angle"), [(6, np.pi), (22, np.pi), (5, 0.0)])
+def test_only_an_even_number_of_columns_is_compared_as_seen_from_behind(columns, angle):
+    config = RecallBackendConfig.model_validate({"recall": {"sector_fov": "whiskers"}})
+    assert RecallBackend(config, (4, columns, 1)).new_map().feedback().angle == angle
+
+
+def test_keyframes_of_views_are_not_merged():
+    config = RecallBackendConfig.model_validate({"keyframes": {"merge_stood": 4}})
+    assert RecallBackend(config, SHAPE).new_map().config.merge_stood == 0
