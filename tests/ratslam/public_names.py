@@ -64,3 +64,24 @@ class OwnBackend(ratslam.Backend):
         place = np.int32(-1)
         action = np.int32(ratslam.Action.NONE)
         return state, ratslam.Estimate(np.zeros(3), np.zeros(3), place, place, action, np.bool_(False)), ()
+
+
+class OwnSettings(ratslam.Settings):
+    """Settings of own parts."""
+
+    gain: float = 1.0
+
+
+def use_registries(
+    build: Callable[[OwnSettings, ratslam.Sensors, np.dtype[Any]], ratslam.Backend],
+    open_own: Callable[[OwnSettings, Any], ratslam.Source],
+    entry: ratslam.TouchEntry,
+) -> list[str]:
+    from ratslam.examples.dead_reckoning import Evidence, Outcome
+
+    ratslam.BACKENDS.register("own", ratslam.BackendEntry(OwnSettings, Evidence, Outcome, build))
+    ratslam.SOURCES.register("own", ratslam.SourceEntry(OwnSettings, open_own))
+    ratslam.TOUCH.register("own", entry)
+    metric = ratslam.Metric("own", "own", "m", "low", "Own", lambda data: ratslam.Finding(1.0))
+    ratslam.METRICS.register("own", ratslam.MetricEntry(OwnSettings, lambda settings: metric))
+    return [*ratslam.BACKENDS.names(), str(ratslam.PathMap().trajectory())]

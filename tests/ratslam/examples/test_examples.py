@@ -35,7 +35,7 @@ def test_an_example_prints_what_its_docstring_says(name: str, capsys: pytest.Cap
     text = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
     said = re.findall(r"^    (.+)$", ast.get_docstring(ast.parse(text)) or "", re.MULTILINE)
     assert len(said) == 1
-    runpy.run_module(f"ratslam.examples.{name}", run_name="__main__")
+    runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     assert capsys.readouterr().out.splitlines() == said
 
 
