@@ -77,9 +77,10 @@ def use_registries(
     open_own: Callable[[OwnSettings, Any], ratslam.Source],
     entry: ratslam.TouchEntry,
 ) -> list[str]:
-    from ratslam.examples.dead_reckoning import Evidence, Outcome
-
-    ratslam.BACKENDS.register("own", ratslam.BackendEntry(OwnSettings, Evidence, Outcome, build))
+    entries = ratslam.BACKENDS.get("classic", "backend")
+    ratslam.BACKENDS.register(
+        "own", ratslam.BackendEntry(OwnSettings, entries.evidence, entries.outcomes, build)
+    )
     ratslam.SOURCES.register("own", ratslam.SourceEntry(OwnSettings, open_own))
     ratslam.TOUCH.register("own", entry)
     metric = ratslam.Metric("own", "own", "m", "low", "Own", lambda data: ratslam.Finding(1.0))
