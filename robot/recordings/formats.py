@@ -92,17 +92,25 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     suffix = config.file.suffix.lower()
     if suffix in FORMATS:
         return FORMATS[suffix](config, warn)
-    registered = _registered_formats()
+    registered, broken = _registered_formats()
     if suffix not in registered:
         require_file(config.file)
         found = f"no reader for {config.file.suffix!r} files" if suffix else "a file without a suffix"
-        raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}")
+        cure = "; ".join(f"not asked: {error.found}" for error in broken)
+        raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}", cure)
     entry = registered[suffix]
     settings = read_settings(entry.config_class, {"file": str(config.file)}, "recording")
     return entry.open(settings, warn)
 
 
-def _registered_formats() -> dict[str, SourceEntry]:
-    """The registered sources that read files, by suffix."""
-    entries = [SOURCES.get(name, "recording.file") for name in SOURCES.names()]
-    return {suffix.lower(): entry for entry in entries for suffix in entry.suffixes}
+def _registered_formats() -> tuple[dict[str, SourceEntry], list[InputError]]:
+    """The registered sources that read files, by suffix, and the errors of those that cannot be loaded."""
+    formats, broken = dict[str, SourceEntry](), list[InputError]()
+    for name in SOURCES.names():
+        try:
+            entry = SOURCES.get(name, "recording.file")
+        except InputError as error:
+            broken.append(error)
+        else:
+            formats |= {suffix.lower(): entry for suffix in entry.suffixes}
+    return formats, broken

@@ -7,8 +7,10 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
@@ -24,8 +26,11 @@ from robot.recordings.csv_config import (
 from robot.recordings.formats import FORMATS, RecordingConfig, open_recording
 from robot.recordings.mcap_reader import record_source
 from robot.sources.input_files import read_bytes
+from robot.sources.registry import SOURCES, SourceEntry
 from robot.sources.source import Source
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tests.helpers.distributions import install
 
 ROOT = Path(__file__).parents[3]
 Refused = Callable[..., InputError]
@@ -168,3 +173,36 @@ def test_a_recording_of_13838_rows_opens_quickly(reference_data: Path, tmp_path:
     start = time.perf_counter()
     assert sum(1 for _ in open_recording(RecordingConfig(file=tmp_path / "copy.mcap"))) == 13_838
     assert time.perf_counter() - start < 4
+
+
+class DotsConfig(Settings):
+    """A made-up format: one metre ahead for each dot in the file."""
+
+    file: Path
+
+
+def open_dots(config: DotsConfig, warn: object) -> Any:
+    return SimpleNamespace(length=config.file.read_text().count("."))
+
+
+@pytest.fixture
+def dots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """A file of the made-up format, beside a package that cannot be loaded."""
+    SOURCES.register("dots", SourceEntry(DotsConfig, open_dots, (".dots",)))
+    install(tmp_path / "site", "broken", "import nothing_there", {"ratslam.sources:broken": "broken:ENTRY"})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    path = tmp_path / "walk.DOTS"
+    path.write_text("...")
+    yield path
+    SOURCES.unregister("dots")
+
+
+def test_a_registered_format_opens_by_its_suffix(dots: Path) -> None:
+    assert open_recording(RecordingConfig(file=dots)).length == 3
+
+
+def test_an_unknown_suffix_names_the_formats_and_the_broken_packages(dots: Path) -> None:
+    other = dots.with_suffix(".other")
+    other.write_text("?")
+    with pytest.raises(InputError, match=r"one of .*\.dots; not asked: the source 'broken' of broken 1\.0"):
+        open_recording(RecordingConfig(file=other))
