@@ -39,6 +39,9 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"pose_cells": {"cell_size": info.cell_size}})
     if info.labels_only:
         config = _fill(config, {"templates": {"source": "labels"}})
+    if _is_other_touch(config, source):
+        # Touch without whiskers around the robot: what it measures has no layout that is known here.
+        config = _fill(config, {"recall": {"sector_fov": "none"}})
     names = _choose_presets(config, source) if config.presets is None else config.presets
     for name in names:
         config = _fill(config, PRESETS[name])
@@ -56,9 +59,16 @@ def _choose_presets(config: RunConfig, source: Source) -> tuple[PresetName, ...]
     """The presets of a configuration that names none."""
     if config.backend == "grid":
         return ("arm",) if source.info.planar_whiskers is None else ("create",)
+    if _is_other_touch(config, source):
+        return ("touch",)
     recall = config.recall
     fov = recall.sector_fov if "sector_fov" in recall.model_fields_set else "whiskers"
     return ("touch",) if source.whiskers and fov == "whiskers" else ()
+
+
+def _is_other_touch(config: RunConfig, source: Source) -> bool:
+    """Whether the views are those of a registered touch sensor without whiskers."""
+    return config.touch.frontend is not None and not source.whiskers
 
 
 def _fill(settings: Any, values: dict[str, Any]) -> Any:

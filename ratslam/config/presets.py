@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-PresetName = Literal["touch", "arm_odometry", "arm", "create"]
-
-# Salman & Pearson 2016, III-C: errors independent in each sample, in pose cells of 5 cm.
-_ARM_ODOMETRY: dict[str, Any] = {
-    "noise": {"per_cell": 0.22, "heading_per_cell": 0.063, "heading_per_radian": 0.126},
-    "bias_sd": 0.001,
-    "turn_error_sd": 0.0,
-}
+PresetName = Literal["touch", "arm", "create"]
 
 PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
-    # Salman & Pearson 2016: the odometry of their arm. Many whisker images look alike, so a closure needs
-    # more evidence and all closure sequences are compared with each other. Weak sequences are selected from
-    # too, and novelty gives way to recall fast: else a robot that lost its place stays lost, because all that
-    # recall finds then is weak.
+    # Salman & Pearson 2016, III-C: the odometry of their arm, in pose cells of 5 cm; many whisker images look
+    # alike, so a closure needs more evidence and all closure sequences are compared with each other. Weak
+    # sequences are selected from too, and novelty gives way to recall fast: else a robot that lost its place
+    # stays lost, because all that recall finds then is weak.
     "touch": {
         "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
         "recall": {
@@ -28,7 +21,9 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "enter": 0.2,
         },
         "keyframes": {
-            **_ARM_ODOMETRY,
+            "noise": {"per_cell": 0.22, "heading_per_cell": 0.063, "heading_per_radian": 0.126},
+            "bias_sd": 0.001,
+            "turn_error_sd": 0.0,
             "min_score": 12.0,
             "max_distance": 60.0,
             "sequence_agreement": 0.2,
@@ -43,9 +38,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "place_heading": 0.17,
         },
     },
-    # Their arm with another sensor, such as a force-torque sensor: the defaults are those of wheels, and a
-    # map that trusts its odometry too much can be worse than odometry.
-    "arm_odometry": {"pose_cells": {"cell_size": 0.05}, "keyframes": _ARM_ODOMETRY},
     # Salman & Pearson 2016, III-C: an arm has no body on the floor, its odometry errors are independent in
     # each sample, and the walls are 12 mm thick.
     "arm": {

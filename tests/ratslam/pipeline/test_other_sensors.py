@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 
 from evaluation.metrics.metric import Quantity
-from ratslam.config.run_config import load_config
+from ratslam.config.completion import complete
+from ratslam.config.presets import PRESETS
+from ratslam.config.run_config import RunConfig, load_config
 from ratslam.examples import taxel_array
 from ratslam.pipeline.run import run
+from ratslam.pipeline.source import open_source
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 from tests.helpers import tactile_arrays
@@ -41,13 +44,14 @@ source:
    simulation:
 """
 WRENCH = """
-presets: [arm_odometry]
 touch: {frontend: {plugin: wrench}}
 source:
   plugin: wrench
   settings:
    simulation:
 """
+LIMIT = {"head of 4 x 5": 0.1, "3 x 22 taxels": 0.1, "wrench of 1 x 6": 0.7}
+"""Largest share of the odometry's Energy Metric after ten circuits."""
 SENSORS = {"head of 4 x 5": HEAD, "3 x 22 taxels": TAXELS, "wrench of 1 x 6": WRENCH}
 
 
@@ -91,6 +95,18 @@ def test_where_its_signal_is_lost_in_noise_odometry_remains(sensor: str, tmp_pat
     assert improvement(found) == pytest.approx(1.0, abs=0.05)
 
 
+def test_touch_without_whiskers_has_the_preset_for_touch_and_no_layout() -> None:
+    config = RunConfig.model_validate(
+        {"source": {"plugin": "wrench", "settings": {"simulation": {"path": {"circuits": "C"}}}},
+         "touch": {"frontend": {"plugin": "wrench"}}}
+    )  # fmt: skip
+    completed = complete(config, open_source(config))
+    assert completed.presets == ("touch",)
+    assert completed.recall.sector_fov == "none"
+    assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
+    assert complete(completed, open_source(config)) == completed
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seed", range(3))
@@ -99,4 +115,4 @@ def test_it_maps_ten_circuits(sensor: str, seed: int, tmp_path: Path) -> None:
     key = "simulation.seed" if sensor.startswith("head") else "source.settings.simulation.seed"
     found = scores(tmp_path, SENSORS[sensor] + SESSION, f"{key}={seed}")
     print(sensor, seed, found["energy_all"], found["ate_final"], found["map_doubt"])
-    assert improvement(found) < 0.1
+    assert improvement(found) < LIMIT[sensor]
