@@ -58,7 +58,7 @@ def test_the_wheel_has_every_file(wheel: Path) -> None:
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
         for path in (ROOT / package).rglob("*")
-        if path.is_file() and path.suffix != ".pyc"
+        if path.is_file() and path.parent.name != "__pycache__"
     }
     assert {f"{package}/py.typed" for package in PACKAGES} <= sources
     packaged = [*(ROOT / "configs").glob("*.yaml"), ROOT / "tests" / "golden" / "a_square3.npz"]
