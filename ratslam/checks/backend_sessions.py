@@ -114,10 +114,10 @@ def _checkpoint(trial: BackendTrial) -> str:
     return ""
 
 
-def _through_file(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _through_file(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
     """The arrays as a checkpoint file gives them back."""
     file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
+    np.savez(file, **arrays)
     file.seek(0)
     with np.load(file, allow_pickle=False) as found:
         return {name: found[name] for name in found.files}

@@ -168,8 +168,8 @@ class Slam:
             self._frontend.restore(with_prefix(arrays, "frontend/"))
 
     def _observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation | None:
-        if isinstance(reading, Observation):
-            return reading
+        if isinstance(reading, Observation) and self.config.touch.frontend is None:
+            return reading  # a registered front end may take observations
         if self._frontend is None:
             cure = "describe the whiskers in SourceInfo, with raw_whiskers=True"
             raise InputError("reading", f"a {type(reading).__name__}", "an Observation", cure)

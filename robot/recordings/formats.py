@@ -96,7 +96,7 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     if suffix not in registered:
         require_file(config.file)
         found = f"no reader for {config.file.suffix!r} files" if suffix else "a file without a suffix"
-        cure = "; ".join(f"not asked: {error.found}" for error in broken)
+        cure = "; ".join(error.found for error in broken)
         raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}", cure)
     entry = registered[suffix]
     settings = read_settings(entry.config_class, {"file": str(config.file)}, "recording")

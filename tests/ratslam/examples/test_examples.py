@@ -6,6 +6,7 @@ import ast
 import re
 import runpy
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 import ratslam.examples
 from evaluation.metrics.registry import METRICS
 from ratslam.backends.registry import BACKENDS
+from ratslam.examples import own_arrays, taxel_array
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 
@@ -42,3 +44,24 @@ def test_an_example_prints_what_its_docstring_says(name: str, capsys: pytest.Cap
 @pytest.mark.parametrize("name", NAMES)
 def test_an_example_is_short(name: str) -> None:
     assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 60
+
+
+@pytest.mark.usefixtures("own_names")
+def test_a_loop_reads_through_an_own_front_end(tmp_path: Path) -> None:
+    SOURCES.register("arrays", own_arrays.ENTRY)
+    TOUCH.register("taxels", taxel_array.ENTRY)
+    settings = ["simulation=null", "source.plugin=arrays", "source.settings.rate=50"]
+    config = ratslam.load_config("whisker_maze", [*settings, "touch.frontend.plugin=taxels"])
+    with ratslam.open_source(config) as source:
+        samples = list(islice(source, 130))
+    slam = ratslam.Slam(config)
+    for sample in samples[:70]:
+        slam.step(sample)
+    assert slam.steps == 1  # of 50 frames
+    slam.save(tmp_path / "half.npz")
+    again = ratslam.Slam.load(tmp_path / "half.npz")
+    for one in (slam, again):
+        for sample in samples[70:]:
+            one.step(sample)
+        assert one.steps == 2
+    assert (slam.estimate.pose == again.estimate.pose).all()

@@ -204,5 +204,7 @@ def test_a_registered_format_opens_by_its_suffix(dots: Path) -> None:
 def test_an_unknown_suffix_names_the_formats_and_the_broken_packages(dots: Path) -> None:
     other = dots.with_suffix(".other")
     other.write_text("?")
-    with pytest.raises(InputError, match=r"one of .*\.dots; not asked: the source 'broken' of broken 1\.0"):
+    with pytest.raises(
+        InputError, match=r"one of .*\.dots; the source 'broken' of broken 1\.0 cannot be loaded"
+    ):
         open_recording(RecordingConfig(file=other))
