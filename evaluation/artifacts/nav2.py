@@ -39,18 +39,19 @@ class Nav2Map(NamedTuple):
     resolution: float
 
 
-def write_nav2(folder: Path, grid: OccupancyGrid) -> None:
-    """Writes map.pgm (binary, 8 bits, dark is occupied) and map.yaml into a folder, each atomically."""
+def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
+    """Writes NAME.pgm (binary, 8 bits, dark is occupied) and NAME.yaml into a folder, each atomically."""
     check_grid(grid)
     free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
     pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN)).astype(np.uint8)
     height, width = pixel.shape
     image = f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].tobytes()
-    write_atomically(folder / "map.pgm", lambda path: path.write_bytes(image))
+    write_atomically(folder / f"{name}.pgm", lambda path: path.write_bytes(image))
+    file = yaml.safe_dump(f"{name}.pgm", width=1 << 30).splitlines()[0]
     x, y, cell = (_number(value) for value in (*grid.origin, grid.cell))
     write_text_atomically(
-        folder / "map.yaml",
-        f"image: map.pgm\nmode: trinary\nresolution: {cell}\norigin: [{x}, {y}, 0.0]\n"
+        folder / f"{name}.yaml",
+        f"image: {file}\nmode: trinary\nresolution: {cell}\norigin: [{x}, {y}, 0.0]\n"
         f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n",
     )
 

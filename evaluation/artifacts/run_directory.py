@@ -27,7 +27,7 @@ def read_run(path: Path) -> RunArrays:
     """
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
-    place = _column(path / "steps.csv", "place").astype(int)
+    place = read_column(path / "steps.csv", "place").astype(int)
     steps = min(len(online_time), len(odometry_time), len(place))
     if steps == 0:
         raise InputError(str(path), "a run without steps", "a run directory with results")
@@ -51,7 +51,7 @@ def read_run(path: Path) -> RunArrays:
         created=created,
         nodes=nodes,
         links=links,
-        online_error=_column(errors, "error") if errors.exists() else np.zeros(0),
+        online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
         doubt=_doubt(path / "health.json"),
     )
 
@@ -99,23 +99,35 @@ def read_closures(path: Path) -> np.ndarray:
     Raises:
         InputError: a line is malformed.
     """
+    pairs, verdicts = read_candidates(path)
+    return pairs[np.array(verdicts) == "accepted"]
+
+
+def read_candidates(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Reads all candidates for loop closures: the earlier and the later step [n, 2] of each, and its verdict
+    (accepted, open, undone); n is 0 without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
     file = path / "closures.csv"
     if not file.exists():
-        return np.zeros((0, 2), int)
-    joined = []
+        return np.zeros((0, 2), int), []
+    pairs, verdicts = [], []
     with file.open(encoding="utf-8", newline="") as lines:
         for row in (reader := csv.DictReader(lines)):
             try:
-                if row["verdict"] == "accepted":
-                    joined.append([int(row["match_step"]), int(row["step"])])
+                pairs.append([int(row["match_step"]), int(row["step"])])
+                verdicts.append(str(row["verdict"]))
             except (KeyError, TypeError, ValueError):
                 expected = "the columns step, match_step, verdict"
                 raise InputError(f"{file}:{reader.line_num}", "a malformed closure", expected) from None
     # A continued run counts from the first step of the run before it.
     saved = checkpoint_steps(path)
     skipped = max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
-    steps = np.array(joined, int).reshape(-1, 2) - skipped
-    return steps[(steps >= 0).all(axis=1)]
+    steps = np.array(pairs, int).reshape(-1, 2) - skipped
+    known = (steps >= 0).all(axis=1)
+    return steps[known], [verdict for verdict, here in zip(verdicts, known, strict=True) if here]
 
 
 def checkpoint_steps(path: Path) -> int:
@@ -132,8 +144,12 @@ def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
 
 
-def _column(path: Path, name: str) -> np.ndarray:
-    """A numeric column of a CSV file; an incomplete last line is dropped."""
+def read_column(path: Path, name: str) -> np.ndarray:
+    """A numeric column [n] of a CSV file of a run directory; an incomplete last line is dropped.
+
+    Raises:
+        InputError: no such file or column, or a cell that is not a number.
+    """
     if not path.exists():
         raise InputError(str(path), "no such file", "a file of a run directory")
     text = path.read_text(encoding="utf-8")

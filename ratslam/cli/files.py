@@ -1,9 +1,10 @@
-"""The commands around files and the program itself: recover, schema, version, completion."""
+"""The commands around files and the program itself: recover, export, schema, version, completion."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from ratslam.cli.common import Commands
@@ -17,6 +18,17 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     recover.add_argument("recording", type=Path, metavar="MCAP", help="the damaged recording")
     recover.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
+
+    export = commands.add(
+        "export", _export, "write a run as a standard file",
+        "export runs/square -o runs/square.mcap", "files",
+    )  # fmt: skip
+    export.add_argument("run", type=Path, metavar="RUN", help="the run directory")
+    export.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE",
+        help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
+        "experiences, .yaml nav2 map; a name without a suffix becomes a ROS 2 bag folder",
+    )  # fmt: skip
 
     schema = commands.add(
         "schema", _schema, "print the JSON schema of configurations, for editors",
@@ -39,6 +51,16 @@ def _recover(arguments: argparse.Namespace) -> int:
     report = recover(arguments.recording, arguments.output)
     lost = f"; the rest is lost: {report.reason}" if report.reason else ""
     print(f"{arguments.output}: {report.samples} samples{lost}")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from ratslam.export.formats import export_run
+
+    export_run(
+        arguments.run, arguments.output, lambda text: print(f"ratslam: warning: {text}", file=sys.stderr)
+    )
+    print(f"{arguments.output}: written")
     return 0
 
 

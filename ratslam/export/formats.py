@@ -1,0 +1,119 @@
+"""Exports a run; the suffix of the new file chooses the format."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from evaluation.artifacts.grid_npz import read_grid
+from evaluation.artifacts.nav2 import write_nav2
+from ratslam.export.ros_bag import write_bag, write_mcap
+from ratslam.export.ros_messages import RosMessages
+from ratslam.export.run_files import read_exported_run
+from ratslam.pose_graph.io import read_json
+from robot.recordings.mcap_writer import existing_error
+from tactile.base.atomic_write import write_atomically
+from tactile.base.errors import InputError
+
+Warn = Callable[[str], None]
+FORMATS = ".mcap, .tum, .g2o, .json, .graphml or .yaml, or a folder without a suffix for a ROS 2 bag"
+
+
+def export_run(directory: Path, output: Path, warn: Warn = lambda sentence: None) -> None:
+    """Writes the results of a run to a new file, whole or not at all.
+
+    Args:
+        directory: of the run. output: its suffix chooses the format; without one, the folder of a ROS 2 bag.
+        warn: called with a sentence about parts that the file lacks.
+
+    Raises:
+        InputError: the run lacks what the format holds, a file of it is malformed, the output exists or its
+            folder does not, or the format is unknown.
+    """
+    write = WRITERS.get(output.suffix.lower())
+    if write is None:
+        raise InputError(str(output), f"an unknown suffix {output.suffix!r}", FORMATS)
+    if not directory.is_dir():
+        raise InputError(str(directory), "no such folder", "a run directory")
+    if output.exists():
+        raise existing_error(output)
+    if not output.absolute().parent.is_dir():
+        raise InputError(str(output.parent), "no such folder", "a folder for the new file")
+    write(directory, output, warn)
+
+
+def _write_mcap(directory: Path, output: Path, warn: Warn) -> None:
+    ros = RosMessages()
+    exported = read_exported_run(directory, warn)
+    write_atomically(output, lambda path: write_mcap(path, exported, ros))
+
+
+def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
+    ros = RosMessages()
+    exported = read_exported_run(directory, warn)
+    parent = output.absolute().parent
+    with tempfile.TemporaryDirectory(prefix=".", dir=parent) as folder:
+        bag = Path(folder) / output.name
+        bag.mkdir()
+        write_bag(bag, output.name, exported, ros)
+        bag.rename(output)
+
+
+def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
+    """The final trajectory, of an interrupted run the online one."""
+    final = directory / "trajectory.tum"
+    _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
+
+
+def _write_g2o(directory: Path, output: Path, warn: Warn) -> None:
+    _copy(directory / "map.g2o", output, "a pose graph")
+
+
+def _write_json(directory: Path, output: Path, warn: Warn) -> None:
+    _copy(directory / "map.json", output, "a map of experiences")
+
+
+def _write_graphml(directory: Path, output: Path, warn: Warn) -> None:
+    import networkx  # slow to import
+
+    graph = read_json(_file(directory / "map.json", "a map of experiences"))
+    write_atomically(output, lambda path: networkx.write_graphml_xml(graph, path))
+
+
+def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
+    """map_server's YAML file, and beside it the image of the same name."""
+    grid = read_grid(_file(directory / "grid.npz", "an occupancy grid"))
+    image = output.with_suffix(".pgm")
+    if image.exists():
+        raise existing_error(image)
+    write_nav2(output.parent, grid, output.stem)
+
+
+WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
+    "": _write_bag,
+    ".mcap": _write_mcap,
+    ".tum": _write_tum,
+    ".g2o": _write_g2o,
+    ".json": _write_json,
+    ".graphml": _write_graphml,
+    ".yaml": _write_nav2,
+}
+
+
+def _copy(file: Path, output: Path, what: str) -> None:
+    _file(file, what)
+    write_atomically(output, lambda path: shutil.copyfile(file, path))
+
+
+def _file(file: Path, what: str) -> Path:
+    """The file of a run directory.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not file.exists():
+        cure = "`run --continue` ends an interrupted run; some methods have no such map"
+        raise InputError(str(file), "no such file", f"a run with {what}", cure)
+    return file

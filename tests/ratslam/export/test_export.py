@@ -1,0 +1,325 @@
+"""Exported files are read back by the tools that they are for."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import networkx
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from evaluation.artifacts.nav2 import read_nav2, write_nav2
+from evaluation.artifacts.run_directory import read_candidates, read_run
+from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
+from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.trajectory import align, read_tum
+from ratslam.cli import main
+from ratslam.export.formats import export_run
+from ratslam.pose_graph.io import read_g2o
+from tactile.base.errors import InputError
+from tactile.base.se2 import compose, wrap
+
+ROOT = Path(__file__).parents[3]
+GRID = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory):
+    """A finished run with closures, views, and a truth that is known at two of three steps."""
+    path = tmp_path_factory.mktemp("square") / "run"
+    assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(path)]) == 0
+    lines = (path / "truth.tum").read_text().splitlines(keepends=True)
+    (path / "truth.tum").write_text("".join(line for k, line in enumerate(lines) if k % 3))
+    return path
+
+
+@pytest.fixture
+def copy(square, tmp_path):
+    return Path(shutil.copytree(square, tmp_path / "copy"))
+
+
+@pytest.fixture(scope="module")
+def exported(square, tmp_path_factory):
+    """The run as an MCAP file."""
+    path = tmp_path_factory.mktemp("mcap") / "square.mcap"
+    assert main(["export", str(square), "-o", str(path)]) == 0
+    return path
+
+
+def messages(path):
+    """Messages of an MCAP file by topic, decoded by mcap-ros2-support: (time in ns, message)."""
+    found = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+def pose_of(pose):
+    """[3] x, y, heading of a Pose or Transform."""
+    place, turn = (
+        (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
+    )
+    return np.array([place.x, place.y, 2 * np.arctan2(turn.z, turn.w)])
+
+
+def path_of(found, name):
+    return np.array([pose_of(stamped.pose) for stamped in found[name][0][1].poses])
+
+
+def assert_same_poses(found, expected):
+    assert found.shape == expected.shape
+    difference = found - expected
+    difference[:, 2] = wrap(difference[:, 2])
+    assert np.abs(difference).max() < 1e-12
+
+
+def nanoseconds(stamp):
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def test_paths_and_poses_are_those_of_the_run(square, exported):
+    run, found = read_run(square), messages(exported)
+    assert_same_poses(path_of(found, "/path/map"), run.final)
+    assert_same_poses(path_of(found, "/path/odometry"), run.odometry)
+    known = np.isfinite(run.truth).all(axis=1)
+    assert 200 < known.sum() < len(known)
+    truth = path_of(found, "/path/truth")
+    back = compose(align(run.final[known], run.truth[known]), truth)
+    assert_same_poses(back, run.truth[known])
+    assert_same_poses(np.array([pose_of(m.pose.pose) for _, m in found["/pose"]]), run.online)
+    stamps = [round(float(t) * 10**9) for t in run.time]
+    assert [time for time, _ in found["/pose"]] == stamps
+    assert [nanoseconds(m.header.stamp) for _, m in found["/pose"]] == stamps
+    spread = np.genfromtxt(
+        square / "steps.csv", delimiter=",", names=True, usecols=("sd_x", "sd_y", "sd_heading")
+    )
+    covariance = np.array([m.pose.covariance for _, m in found["/pose"]]).reshape(-1, 6, 6)
+    for name, axis in (("sd_x", 0), ("sd_y", 1), ("sd_heading", 5)):
+        assert np.array_equal(covariance[:, axis, axis], spread[name] ** 2)
+
+
+def test_transforms_lead_from_the_map_over_the_odometry_to_the_online_pose(square, exported):
+    run, found = read_run(square), messages(exported)
+    chain = []
+    for (_, tf), (_, odometry) in zip(found["/tf"], found["/odom"], strict=True):
+        outer, inner = tf.transforms
+        frames = [(t.header.frame_id, t.child_frame_id) for t in (outer, inner)]
+        assert frames == [("map", "odom"), ("odom", "base_link")]
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+        assert np.array_equal(pose_of(inner.transform), pose_of(odometry.pose.pose))
+        chain.append(compose(pose_of(outer.transform), pose_of(inner.transform)))
+    assert_same_poses(np.array(chain), run.online)
+
+
+def test_twists_lead_from_each_odometry_pose_to_the_next(exported):
+    odometry = [m for _, m in messages(exported)["/odom"]]
+    pose = np.array([pose_of(m.pose.pose) for m in odometry])
+    twist = np.array(
+        [[m.twist.twist.linear.x, m.twist.twist.linear.y, m.twist.twist.angular.z] for m in odometry]
+    )
+    seconds = np.diff([nanoseconds(m.header.stamp) for m in odometry]) / 1e9
+    moved = compose(pose[:-1], twist[1:] * seconds[:, None])
+    assert np.abs(moved - pose[1:])[:, :2].max() < 1e-9
+
+
+def test_markers_show_the_graph_and_every_candidate_for_a_closure(square, exported):
+    ((_, array),) = messages(exported)["/markers"]
+    points = {marker.ns: len(marker.points) for marker in array.markers}
+    run = read_run(square)
+    pairs, verdicts = read_candidates(square)
+    assert len(pairs) == len(verdicts) > 100
+    expected = {"graph/experiences": len(run.nodes), "graph/links": 2 * len(run.links)}
+    expected |= {f"closures/{verdict}": 2 * verdicts.count(verdict) for verdict in set(verdicts)}
+    assert points == expected
+
+
+def test_views_are_those_of_the_recording(exported):
+    images = [m for _, m in messages(exported)["/view"]]
+    assert {(m.height, m.width, m.encoding, m.step) for m in images} == {(3, 6, "mono8", 6)}
+    recorded = np.load(ROOT / "tests" / "golden" / "a_square3.npz")["in_view"]
+    shown = np.array([list(m.data) for m in images]) / 255
+    assert np.abs(shown - recorded).max() <= 0.5 / 255 + 1e-9
+
+
+def test_whisker_images_and_the_grid_are_in_the_file(copy, tmp_path):
+    steps = len(read_run(copy).time)
+    pixels = np.random.default_rng(0).integers(0, 256, (steps, 3, 6))
+    views = WhiskerViews(pixels / 255, np.ones(pixels.shape, bool), np.zeros(6), np.ones(3), 0.1)
+    write_whisker_views(copy / "views.npz", views)
+    write_nav2(copy, GRID)
+    export_run(copy, tmp_path / "run.mcap")
+    found = messages(tmp_path / "run.mcap")
+    assert np.array_equal([list(m.data) for _, m in found["/view"]], pixels.reshape(steps, -1))
+    ((_, grid),) = found["/map"]
+    assert (grid.info.height, grid.info.width, grid.header.frame_id) == (2, 3, "map")
+    assert grid.info.resolution == pytest.approx(0.05)
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-1.25, 0.5)
+    assert list(grid.data) == [0, -1, 100, 0, -1, 100]
+
+
+def test_a_bag_is_read_by_rosbags(square, exported, tmp_path):
+    export_run(square, tmp_path / "bag")
+    assert sorted(path.name for path in (tmp_path / "bag").iterdir()) == ["bag_0.mcap", "metadata.yaml"]
+    assert (tmp_path / "bag" / "bag_0.mcap").read_bytes() == exported.read_bytes()
+    theirs = messages(exported)
+    with AnyReader([tmp_path / "bag"]) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections} == {t: len(m) for t, m in theirs.items()}
+        durability = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
+        assert {t for t, kept in durability.items() if kept == "TRANSIENT_LOCAL"} == {
+            "/path/map", "/path/odometry", "/path/truth", "/markers"
+        }  # fmt: skip
+        poses = []
+        for connection, stamp, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "/pose":
+                assert stamp == nanoseconds(message.header.stamp)
+                poses.append(pose_of(message.pose.pose))
+    assert_same_poses(np.array(poses), read_run(square).online)
+
+
+def test_rerun_loads_the_file(exported):
+    from rerun.chunk import McapReader
+
+    store = McapReader(exported).stream().collect()
+    rows = {}
+    for chunk in store.stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    found = messages(exported)
+    for topic in ("/odom", "/pose", "/view", "/path/map", "/markers"):
+        assert rows.get(topic, 0) >= len(found[topic]), topic
+    columns = {str(column) for column in store.schema().component_columns()}
+    assert any("/view:DepthImage:buffer" in column for column in columns)  # so it shows pictures in grey
+    assert any("/tf:Transform3D:translation" in column for column in columns)
+
+
+def test_equal_runs_give_equal_bytes(square, exported, tmp_path):
+    for suffix in ("mcap", "graphml"):
+        export_run(square, tmp_path / f"one.{suffix}")
+        export_run(square, tmp_path / f"two.{suffix}")
+        assert (tmp_path / f"one.{suffix}").read_bytes() == (tmp_path / f"two.{suffix}").read_bytes()
+    assert (tmp_path / "one.mcap").read_bytes() == exported.read_bytes()
+
+
+def test_a_trajectory_is_read_by_numpy_and_by_us(square, tmp_path):
+    export_run(square, tmp_path / "a.tum")
+    run = read_run(square)
+    assert np.array_equal(
+        np.loadtxt(tmp_path / "a.tum")[:, :3], np.column_stack([run.time, run.final[:, :2]])
+    )
+    assert np.array_equal(read_tum(tmp_path / "a.tum")[1], run.final)
+
+
+def test_a_pose_graph_is_read_by_us(square, tmp_path):
+    export_run(square, tmp_path / "a.g2o")
+    poses, edges = read_g2o(tmp_path / "a.g2o")
+    text = (square / "map.g2o").read_text()
+    assert (len(poses), len(edges.i)) == (text.count("VERTEX_SE2"), text.count("EDGE_SE2"))
+
+
+def test_a_pose_graph_is_read_by_gtsam(square, tmp_path):
+    gtsam = pytest.importorskip("gtsam", reason="of the extra [anchor]")
+    export_run(square, tmp_path / "a.g2o")
+    _, values = gtsam.readG2o(str(tmp_path / "a.g2o"), False)
+    assert values.size() == len(read_g2o(tmp_path / "a.g2o")[0])
+
+
+def test_experiences_are_read_by_networkx(square, tmp_path):
+    export_run(square, tmp_path / "a.json")
+    export_run(square, tmp_path / "a.graphml")
+    linked = networkx.node_link_graph(json.loads((tmp_path / "a.json").read_text()), edges="edges")
+    marked = networkx.read_graphml(tmp_path / "a.graphml", node_type=int)
+    assert len(linked) == len(read_run(square).nodes) > 0
+    assert dict(linked.nodes(data=True)) == dict(marked.nodes(data=True))
+    assert {(a, b): d for a, b, d in linked.edges(data=True)} == {
+        (a, b): d for a, b, d in marked.edges(data=True)
+    }
+
+
+def test_a_grid_is_read_as_nav2_reads_it(copy, tmp_path):
+    np.savez(copy / "grid.npz", **GRID._asdict())
+    export_run(copy, tmp_path / "hall: 1.yaml")
+    assert yaml.safe_load((tmp_path / "hall: 1.yaml").read_text())["image"] == "hall: 1.pgm"
+    assert read_nav2(tmp_path / "hall: 1.yaml").cell.tolist() == [[0, -1, 100], [0, -1, 100]]
+
+
+def test_a_killed_run_without_truth_is_exported(copy, tmp_path):
+    """Only the text files of a run directory stand, and its recording has been moved."""
+    kept = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "config.yaml", "manifest.json")
+    (copy / "truth.tum").write_text("")
+    for path in copy.iterdir():
+        if path.name not in kept:
+            path.unlink()
+    text = (copy / "config.yaml").read_text(encoding="utf-8")
+    (copy / "config.yaml").write_text(text.replace("a_square3.npz", "elsewhere.npz"), encoding="utf-8")
+    with (copy / "steps.csv").open("a", encoding="utf-8") as file:
+        file.write("1.0,3,no")  # a line that was cut off
+    said = []
+    export_run(copy, tmp_path / "run.mcap", said.append)
+    found = messages(tmp_path / "run.mcap")
+    assert set(found) == {"/path/map", "/path/odometry", "/tf", "/odom", "/pose"}
+    assert_same_poses(path_of(found, "/path/map"), read_run(copy).online)
+    (sentence,) = said
+    assert "no views" in sentence
+    assert "elsewhere.npz" in sentence
+    export_run(copy, tmp_path / "run.tum")
+    assert (tmp_path / "run.tum").read_bytes() == (copy / "online.tum").read_bytes()
+
+
+def test_the_path_of_a_doubted_map_is_the_final_trajectory(copy, tmp_path):
+    shutil.copyfile(copy / "odometry.tum", copy / "trajectory.tum")
+    export_run(copy, tmp_path / "run.mcap")
+    assert_same_poses(path_of(messages(tmp_path / "run.mcap"), "/path/map"), read_run(copy).odometry)
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        ("a.bag", "suffix '.bag'"),
+        ("missing/a.mcap", "no such folder"),
+        ("a.yaml", "occupancy grid"),
+        ("taken.mcap", "exists already"),
+    ],
+)
+def test_refusals(square, tmp_path, capsys, output, words):
+    (tmp_path / "taken.mcap").write_text("mine")
+    capsys.readouterr()
+    assert main(["export", str(square), "-o", str(tmp_path / output)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("ratslam: error: ") == 1
+    assert words in error
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.mcap"]
+    assert (tmp_path / "taken.mcap").read_text() == "mine"
+
+
+def test_no_run_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"nothing: no such folder"):
+        export_run(tmp_path / "nothing", tmp_path / "a.mcap")
+    with pytest.raises(InputError, match=r"online.tum: no such file"):
+        export_run(tmp_path, tmp_path / "a.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("time", ["-1.0", "2147483648.0"])
+def test_times_beyond_ros_stamps_are_refused(copy, tmp_path, time):
+    lines = (copy / "online.tum").read_text().splitlines(keepends=True)
+    lines[0] = " ".join([time, *lines[0].split(" ")[1:]])
+    (copy / "online.tum").write_text("".join(lines))
+    with pytest.raises(InputError, match="the range of ROS 2 stamps"):
+        export_run(copy, tmp_path / "a.mcap")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_missing_library_is_named(square, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(InputError, match=r"pip install 'ratslam\[ros\]'"):
+        export_run(square, tmp_path / "a.mcap")
