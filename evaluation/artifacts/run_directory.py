@@ -126,8 +126,8 @@ def read_candidates(path: Path) -> tuple[np.ndarray, list[str]]:
     saved = checkpoint_steps(path)
     skipped = max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
     steps = np.array(pairs, int).reshape(-1, 2) - skipped
-    known = (steps >= 0).all(axis=1)
-    return steps[known], [verdict for verdict, here in zip(verdicts, known, strict=True) if here]
+    known = np.flatnonzero((steps >= 0).all(axis=1))
+    return steps[known], [verdicts[k] for k in known]
 
 
 def checkpoint_steps(path: Path) -> int:

@@ -18,6 +18,7 @@ from jax import lax
 from ratslam.attractor import window
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.attractor.window import Window
+from ratslam.core.types import PoseCellActivity
 from tactile.base.types import Array
 
 SETTLED = 10
@@ -81,6 +82,21 @@ def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
 def to_full_torus(levels: tuple[Level, ...], activity: Activity) -> Array:
     """[K, N, N] the activity of the whole torus."""
     return block_at(levels, len(levels) - 1, activity, jnp.zeros(3, jnp.int32)).activity[0]
+
+
+def activity_sums(levels: tuple[Level, ...], activity: Activity) -> PoseCellActivity:
+    """The activity summed over the headings, and over x and y; on the host, without compiling."""
+    sizes = window.ring_sizes(levels[-1].window)
+    xy, heading = np.zeros(sizes[1::-1]), np.zeros(sizes[2])
+    block = activity.blocks[int(activity.level)]
+    for cells, origin in zip(np.asarray(block.activity), np.asarray(block.origin), strict=True):
+        at = [
+            (first + np.arange(size)) % ring
+            for first, size, ring in zip(origin[::-1], cells.shape, sizes[::-1], strict=True)
+        ]
+        np.add.at(xy, np.ix_(at[1], at[2]), cells.sum(axis=0))
+        np.add.at(heading, at[0], cells.sum(axis=(1, 2)))
+    return PoseCellActivity(xy, heading)
 
 
 def from_full_torus(levels: tuple[Level, ...], activity: Array) -> Activity:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ratslam.attractor import pose_cells
 from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import window_levels
+from ratslam.attractor.levels import activity_sums, window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import ClassicBackendConfig
 from ratslam.classic import places, view_templates
@@ -18,7 +18,7 @@ from ratslam.classic.places import Places
 from ratslam.classic.view_templates import Match, Templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
-from ratslam.core.types import Estimate, Scalar
+from ratslam.core.types import Estimate, PoseCellActivity, Scalar
 from tactile.base.se2 import wrap
 from tactile.base.types import Array, Observation
 
@@ -134,6 +134,9 @@ class ClassicBackend(Backend):
             memory.current, match.error, relative, energy, cells.pose, info.level, outcome
         )
         return ClassicState(cells, memory, world, relative), estimate, evidence
+
+    def activity(self, state: ClassicState) -> PoseCellActivity:
+        return activity_sums(self.window_levels, state.cells.activity)
 
     def new_map(self) -> ExperienceMap:
         """An empty experience map."""

@@ -12,13 +12,13 @@ from jax import lax
 
 from ratslam.attractor import pose_cells
 from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import window_levels
+from ratslam.attractor.levels import activity_sums, window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
-from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.keyframes.acceptance import Acceptance, AcceptByEvidence
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
@@ -189,6 +189,9 @@ class RecallBackend(Backend):
         """The running share of revisits whose view fits, after one more revisit."""
         updated = health + HEALTH_RATE * (view_fits.astype(self.dtype) - health)
         return jnp.where(view_fits >= 0, updated, health)
+
+    def activity(self, state: RecallState) -> PoseCellActivity:
+        return activity_sums(self.window_levels, state.cells.activity)
 
     def new_map(self) -> KeyframeMap:
         """An empty keyframe map; keyframes of views and given ids are not merged, because their sequences are

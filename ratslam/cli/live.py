@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
-from ratslam.cli.run import add_run_directory, run_directory
+from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
 from robot.drivers.process_priority import put_last
 from tactile.base.errors import InputError
 
@@ -33,6 +33,7 @@ def add_commands(commands: Commands) -> None:
         "--head", metavar="ADDRESS",
         help="usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulated head",
     )  # fmt: skip
+    add_rerun(live)
 
     emulate = commands.add(
         "emulate", _emulate, "emulate the arm's controller or the whisker head",
@@ -55,9 +56,9 @@ def _live(arguments: argparse.Namespace) -> int:
     from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
-    directory = run_directory(arguments)
+    directory, target = run_directory(arguments), open_target(arguments)
     with monitor() as start_monitor:
-        ended, card = run_live_session(config, directory, _print, armed=start_monitor)
+        ended, card = run_live_session(config, directory, _print, armed=start_monitor, view=target)
     if card is not None:
         print(render_scorecard(card))
         print(f"\n{render_health(card)}".rstrip())

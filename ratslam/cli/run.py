@@ -22,6 +22,8 @@ def add_commands(commands: Commands) -> None:
         "else from the first sample",
     )  # fmt: skip
 
+    add_rerun(run)
+
     simulate = commands.add(
         "simulate", _simulate, "write a simulated session to a recording",
         "simulate whisker_maze -o runs/session.mcap", "run",
@@ -40,6 +42,26 @@ def add_run_directory(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_rerun(parser: argparse.ArgumentParser) -> None:
+    """Adds the option for a live view."""
+    parser.add_argument(
+        "--rerun", nargs="?", const="127.0.0.1:9876", metavar="TARGET",
+        help="show the run in rerun: a new .rrd file, the address of a viewer on this machine (default "
+        "127.0.0.1:9876), or `start` to start one",
+    )  # fmt: skip
+
+
+def open_target(arguments: argparse.Namespace) -> str | None:
+    """The target of the live view, or None without one.
+
+    Raises:
+        InputError: it cannot be used.
+    """
+    from ratslam.viewer.target import prepare_target
+
+    return None if arguments.rerun is None else prepare_target(arguments.rerun)
+
+
 def run_directory(arguments: argparse.Namespace) -> Path:
     """The run directory: `-o`, or runs/CONFIG."""
     return arguments.output or Path("runs") / arguments.config.stem
@@ -50,9 +72,11 @@ def _run(arguments: argparse.Namespace) -> int:
     from evaluation.metrics import grid_score
     from evaluation.metrics.scorecard import render_health, render_scorecard
     from ratslam.pipeline.run import run
+    from ratslam.viewer.observer import open_viewer
 
-    directory = run_directory(arguments)
-    card, interrupted = run(read_config(arguments), directory, arguments.resume)
+    directory, config, target = run_directory(arguments), read_config(arguments), open_target(arguments)
+    with open_viewer(target) as observers:
+        card, interrupted = run(config, directory, arguments.resume, observers)
     print(render_scorecard(card))
     if (directory / "gridscore.json").exists():
         text = (directory / "gridscore.json").read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import jax
 import numpy as np
 
-from ratslam.core.types import Estimate
+from ratslam.core.types import Estimate, GridDrawing, PoseCellActivity
 from tactile.base.types import Array, Observation
 
 if TYPE_CHECKING:
@@ -83,6 +83,15 @@ class Map(Protocol):
         """[M, 2] pairs of steps joined by accepted loop closures: the later and the earlier."""
         return np.zeros((0, 2), int)
 
+    def judged_closures(self) -> np.ndarray:
+        """[n, 3] candidates for loop closures as judged so far: the earlier step, the later step, and 1 if
+        accepted, 0 if open, -1 if removed. Called while the map grows, so it must not optimise."""
+        return np.zeros((0, 3), int)
+
+    def grid(self) -> GridDrawing | None:
+        """The occupancy grid, of a map that is one."""
+        return None
+
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step: pieces are parts of the map that nothing connects, numbered from 0."""
         return np.zeros(len(self.trajectory()), int)
@@ -131,6 +140,10 @@ class Backend(Protocol):
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
         """One step; pure, so that it can be jitted, scanned and vmapped."""
+
+    def activity(self, state: State) -> PoseCellActivity | None:
+        """The activity of the pose cells, of a method that has them; must compile nothing."""
+        return None
 
     def new_map(self) -> Map:
         """An empty map."""

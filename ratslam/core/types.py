@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Annotated, NamedTuple
 
+import numpy as np
+
 from tactile.base.types import Array
 
 Scalar = Annotated[Array, "scalar"]
@@ -22,6 +24,30 @@ class Action(IntEnum):
     """A known place was reached by a new link."""
     SET = 3
     """A known place was reached by an existing link, or without a link (after an odometry break)."""
+
+
+class PoseCellActivity(NamedTuple):
+    """Sums of the activity of a pose-cell network, host arrays.
+
+    Attributes:
+        xy: [N, N] over the headings, rows are y. heading: [K] over x and y.
+    """
+
+    xy: np.ndarray
+    heading: np.ndarray
+
+
+class GridDrawing(NamedTuple):
+    """An occupancy grid.
+
+    Attributes:
+        probability: [H, W] of an obstacle, rows are y upwards. origin: [2] lower left corner, m.
+        cell: side of a cell, m.
+    """
+
+    probability: np.ndarray
+    origin: np.ndarray
+    cell: float
 
 
 class Estimate(NamedTuple):

@@ -40,7 +40,7 @@ class Topic(NamedTuple):
     """A topic in a file: its message type, and the number of its messages."""
 
     kind: str
-    count: int
+    messages: int
 
 
 def run_messages(exported: ExportedRun, ros: RosMessages) -> Iterator[Stamped]:
@@ -139,7 +139,7 @@ def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) 
     span = {
         "duration": {"nanoseconds": last - first},
         "starting_time": {"nanoseconds_since_epoch": first},
-        "message_count": sum(topic.count for topic in topics.values()),
+        "message_count": sum(topic.messages for topic in topics.values()),
     }
     information = {
         "version": 5,
@@ -153,7 +153,7 @@ def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) 
                     "serialization_format": "cdr",
                     "offered_qos_profiles": quality_of_service(name),
                 },
-                "message_count": topic.count,
+                "message_count": topic.messages,
             }
             for name, topic in topics.items()
         ],

@@ -58,14 +58,14 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
     steps = len(run.time)
     columns = [read_column(directory / "steps.csv", name)[:steps] for name in ("sd_x", "sd_y", "sd_heading")]
     pairs, verdicts = read_candidates(directory)
-    known = (pairs < steps).all(axis=1)
+    known = np.flatnonzero((pairs < steps).all(axis=1))
     return ExportedRun(
         stamps=ros_stamps(directory, run.time),
         run=run,
         spread=np.stack(columns, axis=1),
         truth=truth_in_map(run),
         candidates=pairs[known],
-        verdicts=[verdict for verdict, here in zip(verdicts, known, strict=True) if here],
+        verdicts=[verdicts[k] for k in known],
         grid=read_nav2(directory / "map.yaml") if (directory / "map.yaml").exists() else None,
         images=lambda: _images(directory, run.time, warn),
     )
@@ -85,7 +85,7 @@ def ros_stamps(directory: Path, time: np.ndarray) -> np.ndarray:
 
 
 def truth_in_map(run: RunArrays) -> np.ndarray | None:
-    """The true poses [N, 3] brought nearest to the final trajectory, NaN where unknown; None without truth."""
+    """The true poses [N, 3], moved as near as possible to the final trajectory; None without truth."""
     if run.truth is None:
         return None
     known = np.isfinite(run.truth).all(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import Estimate
+from ratslam.core.types import Estimate, GridDrawing
 from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Genealogy
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
@@ -56,13 +56,16 @@ class GridMap(Checkpointed, Map):
         """[S, S] probability of an obstacle in each cell; rows are y, columns x, the middle is the start."""
         return draw_occupancy(self.config, self.feelers, self.side, self.trajectory(), self._contact_log())
 
+    def grid(self) -> GridDrawing:
+        corner = np.full(2, -self.side * self.config.cell / 2)
+        return GridDrawing(self.occupancy(), corner, self.config.cell)
+
     def files(self) -> dict[str, Callable[[Path], None]]:
         """The map as arrays: probability [S, S], origin [2] m of its lower left corner, cell m."""
         return {"grid.npz": self._write}
 
     def _write(self, path: Path) -> None:
-        corner = np.full(2, -self.side * self.config.cell / 2)
-        np.savez_compressed(path, probability=self.occupancy(), origin=corner, cell=self.config.cell)
+        np.savez_compressed(path, **self.grid()._asdict())
 
     def _contact_log(self) -> ContactLog:
         contact, alive = np.moveaxis(self._flags.rows, 2, 0)

@@ -44,6 +44,7 @@ from tactile.base.types import Observation
 if TYPE_CHECKING:
     import networkx
 
+SIGN_OF_VERDICT = np.array([0, 1, -1])  # open, accepted, undone
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
 
@@ -136,6 +137,12 @@ class KeyframeMap(Checkpointed, Map):
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
         log = self.solution().log
         return self.keyframe_steps()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
+
+    def judged_closures(self) -> np.ndarray:
+        """[n, 3] see `Map`; candidates of merged keyframes are left out."""
+        table, step = self.log.table(), self.keyframe_steps()[self._graph.taken.rows]
+        signs = SIGN_OF_VERDICT[table[:, 7].astype(int)]
+        return np.column_stack([step[table[:, 1::-1].astype(int)], signs])
 
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step, see `ratslam.keyframes.pieces`."""

@@ -44,6 +44,7 @@ class MappingJob(NamedTuple):
             the calibration, which follows.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.
+        view: target of a live view, or None.
     """
 
     config: RunConfig
@@ -53,6 +54,7 @@ class MappingJob(NamedTuple):
     whiskers: int
     rate_hz: float
     extent_m: float
+    view: str | None = None
 
 
 class MappedSample(NamedTuple):
@@ -259,11 +261,12 @@ def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
     from ratslam.core.types import Action
     from ratslam.pipeline.runner import build_session, open_runner
+    from ratslam.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
     job = line.recv()
-    with PipeSource(job, line) as fed:
+    with PipeSource(job, line) as fed, open_viewer(job.view) as observers:
         config = complete(job.config, fed, job.extent_m)
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         session = build_session(config, source)
@@ -276,7 +279,7 @@ def _map(line: Connection) -> None:
         line.send(True)
         fed.calibrate()
         source = open_touch_source(fed, config.touch)
-        with open_runner(config, source, job.directory, session=session) as runner:
+        with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
             _redirect_stderr(job.directory / LOG)
             line.send(True)
             for number, sample in enumerate(source):

@@ -50,6 +50,7 @@ def run_live_session(
     log: Callable[[str], None],
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
+    view: str | None = None,
 ) -> tuple[Fault, Scorecard | None]:
     """Finds arm and head, compiles, tests both, calibrates, moves along the route, maps and scores.
 
@@ -59,6 +60,7 @@ def run_live_session(
         directory: the new run directory. log: called with each line of progress.
         mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
         armed: called with the directory when the session begins.
+        view: target of a live view, from `ratslam.viewer.target.prepare_target`; None for none.
 
     Returns:
         the outcome of the session with its finding, and the score of the map, if there is one.
@@ -76,7 +78,7 @@ def run_live_session(
     with urgent(), catch_interrupt("stopping the arm") as stopped, Mapper(mapping) as mapper:
         with Rig(config.live, config.touch.head, stopped) as rig:
             try:
-                job = mapping_job(config, path, directory)
+                job = mapping_job(config, path, directory)._replace(view=view)
                 _compile(rig, mapper, job, log)
                 calibration = _calibrate(rig, config, path, log)
                 _arm(rig, path, calibration, mapper, log)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -16,6 +16,7 @@ from tqdm import tqdm
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
+from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.runner import Runner, open_runner
 from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
@@ -25,11 +26,14 @@ from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
 
-def run(config: RunConfig, directory: Path, resume: Path | None = None) -> tuple[Scorecard, bool]:
+def run(
+    config: RunConfig, directory: Path, resume: Path | None = None, observers: Sequence[Observer] = ()
+) -> tuple[Scorecard, bool]:
     """Maps the source of a configuration and scores the result.
 
     Args:
         config: with absolute paths. directory: the new run directory. resume: checkpoint to continue from.
+        observers: are told of the progress.
 
     Returns:
         the scorecard, and whether Ctrl-C ended the run early; the results are then those up to that step.
@@ -40,7 +44,7 @@ def run(config: RunConfig, directory: Path, resume: Path | None = None) -> tuple
     """
     with (
         open_observations(config, _print) as (completed, source),
-        open_runner(completed, source, directory, resume) as runner,
+        open_runner(completed, source, directory, resume, observers=observers) as runner,
     ):
         interrupted = process_source(runner, source)
         return runner.finish(interrupted), interrupted

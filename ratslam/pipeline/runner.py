@@ -29,11 +29,14 @@ from ratslam.core.types import Action
 from ratslam.keyframes.config import FULL, Ablation
 from ratslam.pipeline.artifacts import WhiskerView, save_grid_map, save_whisker_views, save_world
 from ratslam.pipeline.online_error import OnlineErrorLog
+from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, planar_whiskers_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
+from tactile.base.types import Observation
+from tactile.whiskers.head_geometry import ur10_head
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
@@ -59,6 +62,7 @@ class Runner:
         manifest: dict[str, Any],
         session: Session,
         skipped: int,
+        observers: Sequence[Observer] = (),
     ) -> None:
         self.session, self.skipped = session, skipped
         self._config, self._source, self._directory, self._manifest = config, source, directory, manifest
@@ -67,6 +71,9 @@ class Runner:
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
         self._saved = session.steps
+        self._observers, self._schedule = observers, MapSchedule(session.steps)
+        for observer in observers:
+            observer.begin(_describe(config, source, session.steps))
 
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
@@ -87,6 +94,8 @@ class Runner:
         if self.session.steps - self._saved >= max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE):
             self._checkpoint()
             self._saved = self.session.steps
+        if self._observers:
+            self._report(samples, observations, steps, odometry)
         return steps
 
     def finish(self, interrupted: bool) -> Scorecard:
@@ -115,7 +124,35 @@ class Runner:
             directory.file(name, save)
         status = "interrupted" if interrupted else "complete"
         _write_manifest(directory, self._manifest | {"status": status, "steps": self.session.steps})
+        for observer in self._observers:
+            observer.finish(
+                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
+            )
         return card
+
+    def _report(
+        self,
+        samples: list[Sample],
+        observations: list[Observation],
+        steps: list[Step],
+        odometry: list[np.ndarray],
+    ) -> None:
+        """Tells the observers of these steps, and at the end of a chunk of the map."""
+        count = self.session.steps
+        rows = zip(samples, observations, steps, odometry, strict=True)
+        reports = [_step_report(count - len(steps) + k, *row) for k, row in enumerate(rows)]
+        report = None
+        if count % CHUNK == 0:
+            report = self._map_report()
+            if self._schedule.is_due(count):
+                made = self.session.map
+                report = report._replace(path=made.online_trajectory(), grid=made.grid())
+        for observer in self._observers:
+            observer.update(reports, report)
+
+    def _map_report(self) -> MapReport:
+        session = self.session
+        return MapReport(session.map.judged_closures(), session.backend.activity(session.state))
 
     def _checkpoint(self) -> None:
         arrays: dict[str, Any] = self.session.arrays() | {"digest": np.array(self._source.digest)}
@@ -129,6 +166,7 @@ def open_runner(
     directory: Path,
     resume: Path | None = None,
     session: Session | None = None,
+    observers: Sequence[Observer] = (),
 ) -> Iterator[Runner]:
     """A runner with a new run directory.
 
@@ -136,6 +174,7 @@ def open_runner(
         config: completed for the source. source: of observations. directory: its path.
         resume: checkpoint to restore the session from. session: one that `build_session` has made for them
             before; None makes it.
+        observers: are told of the progress; results are the same with and without.
 
     Raises:
         InputError: the relations, the checkpoint or the run directory cannot be used.
@@ -154,7 +193,7 @@ def open_runner(
         manifest = _manifest(config, text, source, resume)
         _write_manifest(files, manifest | {"status": "running"})
         save_world(source.info, files)
-        yield Runner(config, source, files, manifest, session, skip)
+        yield Runner(config, source, files, manifest, session, skip, observers)
 
 
 def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
@@ -179,6 +218,31 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
 def _known_rows(length: int | None) -> int:
     """Rows to reserve for a source of this length, 0 if they are not worth it: a step adds at most one."""
     return length if length is not None and length <= RESERVED else 0
+
+
+def _describe(config: RunConfig, source: Source, first: int) -> RunDescription:
+    head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
+    if head is not None and source.whiskers != len(head.length):
+        head = None
+    return RunDescription(source.name, config.backend, first, head, config.touch.image.tallest)
+
+
+def _step_report(
+    number: int, sample: Sample, observation: Observation, step: Step, odometry: np.ndarray
+) -> StepReport:
+    estimate = step.estimate
+    places = int(estimate.place), int(estimate.previous)
+    pose = np.asarray(step.pose, float)
+    return StepReport(
+        number,
+        float(sample.time),
+        observation,
+        odometry,
+        pose,
+        *places,
+        bool(estimate.lost),
+        float(step.doubt),
+    )
 
 
 def _lines(

@@ -1,0 +1,1 @@
+"""A live view of a run in rerun, in a process of its own."""

@@ -1,0 +1,208 @@
+"""Draws the progress of a run with rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.core.types import GridDrawing, PoseCellActivity
+from ratslam.pipeline.progress import MapReport, RunDescription, StepReport
+from ratslam.viewer.judgements import VERDICTS, VerdictLog
+from ratslam.viewer.layout import blueprint
+from ratslam.viewer.whisker_shapes import whisker_curves
+
+APPLICATION = "ratslam"
+GREY, BLUE, GREEN, RED, ORANGE = (128, 128, 128), (60, 120, 216), (30, 160, 60), (200, 30, 30), (230, 140, 30)
+COLOUR_OF_VERDICT = {1: GREEN, 0: ORANGE, -1: RED}
+STEP, TIME = "step", "session_time"
+"""Timelines: number of the step, and s since the first one."""
+
+
+def open_recording(target: str) -> Any:
+    """A rerun recording that goes to a file or to a viewer (`ratslam.viewer.target`)."""
+    import rerun
+
+    if target.endswith(".rrd"):
+        recording = rerun.RecordingStream(APPLICATION, recording_id=Path(target).stem)
+        recording.save(target, default_blueprint=blueprint())
+    else:
+        recording = rerun.RecordingStream(APPLICATION)
+        recording.connect_grpc(f"rerun+http://{target}/proxy", default_blueprint=blueprint())
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    return recording
+
+
+class Drawing:
+    """Draws into a recording. Of steps that were dropped only gaps are seen.
+
+    Args:
+        recording: a `rerun.RecordingStream`.
+    """
+
+    def __init__(self, recording: Any) -> None:
+        import rerun
+
+        self._rr, self._recording = rerun, recording
+        self._run = RunDescription("", "", 0)
+        self._start: float | None = None
+        self._path = np.zeros((0, 3))  # of all steps in the map: as last reported, then online
+        self._reported = 0  # steps whose path was reported
+        self._steps: list[StepReport] = []
+        self._place_step: dict[int, int] = {}
+        self._links: set[tuple[int, int]] = set()
+        self._verdicts = VerdictLog()
+
+    def begin(self, run: RunDescription) -> None:
+        """Draws what does not change."""
+        self._run = run
+        self._recording.send_recording_name(run.name)
+        self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        arrow = self._rr.Arrows3D(vectors=[[0.15, 0.0, 0.0]], colors=[BLUE])
+        self._log("world/robot/heading", arrow, static=True)
+        for name, colour in (("doubt", RED), ("lost", ORANGE)):
+            self._log(f"health/{name}", self._rr.SeriesLines(colors=[colour], names=[name]), static=True)
+        if run.head is not None:
+            self._log("world/robot/head/bases", self._rr.Points3D(run.head.base, radii=0.003), static=True)
+
+    def update(self, steps: Sequence[StepReport], map: MapReport | None) -> None:
+        """Draws steps, and the map after them."""
+        for step in steps:
+            self._draw_step(step)
+        if map is not None:
+            self._draw_map(map)
+
+    def finish(self, map: MapReport) -> None:
+        """Draws the final map."""
+        if self._steps:
+            self._draw_map(map)
+
+    def _log(self, name: str, *parts: Any, static: bool = False) -> None:
+        self._recording.log(name, *parts, static=static)
+
+    def _draw_step(self, step: StepReport) -> None:
+        self._start = step.time if self._start is None else self._start
+        self._recording.set_time(STEP, sequence=step.number)
+        self._recording.set_time(TIME, duration=step.time - self._start)
+        self._note(step)
+        turn = self._rr.RotationAxisAngle([0, 0, 1], radians=float(step.pose[2]))
+        place = [*step.pose[:2], 0.0]
+        self._log("world/robot", self._rr.Transform3D(translation=place, rotation_axis_angle=turn))
+        if np.isfinite(step.doubt):
+            self._log("health/doubt", self._rr.Scalars(step.doubt))
+        self._log("health/lost", self._rr.Scalars(float(step.lost)))
+        observation = step.observation
+        if observation.view_seen and observation.view.size:
+            self._draw_view(observation.view)
+        if self._run.head is not None:
+            self._draw_whiskers(observation)
+
+    def _note(self, step: StepReport) -> None:
+        """Remembers path, place and link of a step; steps that were dropped get its pose."""
+        self._steps.append(step)
+        missing = step.number + 1 - len(self._path)
+        self._path = np.concatenate([self._path, np.repeat(step.pose[None], max(0, missing), axis=0)])
+        self._path[step.number] = step.pose
+        if step.place >= 0:
+            self._place_step.setdefault(step.place, step.number)
+            if step.previous >= 0 and step.previous != step.place:
+                self._links.add((step.previous, step.place))
+
+    def _draw_view(self, view: np.ndarray) -> None:
+        pixels = np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
+        shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
+        self._log("view", self._rr.Image(shown))
+
+    def _draw_whiskers(self, observation: Any) -> None:
+        head = self._run.head
+        assert head is not None
+        touching = observation.contact & observation.alive
+        height = self._run.tallest * observation.view[..., 0].reshape(-1)
+        colours = np.where(touching[:, None], ORANGE, np.where(observation.alive[:, None], BLUE, GREY))
+        curves = whisker_curves(head, touching, observation.point, height)
+        strips = self._rr.LineStrips3D(list(curves), colors=colours.astype(np.uint8), radii=0.0015)
+        self._log("world/robot/head/whiskers", strips)
+        tips = self._rr.Points3D(curves[touching, -1], colors=[ORANGE], radii=0.004)
+        self._log("world/robot/head/contacts", tips)
+
+    def _draw_map(self, map: MapReport) -> None:
+        if map.activity is not None:
+            self._draw_activity(map.activity)
+        if map.path is not None:
+            self._draw_whole_path(map.path)
+        recent = [step for step in self._steps if step.number >= self._reported - 1]
+        self._draw_strip("odometry/recent", np.array([step.odometry for step in recent]), GREY)
+        self._draw_strip("online/recent", np.array([step.pose for step in recent]), BLUE)
+        self._draw_experiences()
+        self._draw_closures(map.closures)
+        if map.grid is not None:
+            self._draw_grid(map.grid)
+
+    def _draw_whole_path(self, path: np.ndarray) -> None:
+        self._path, self._reported = np.array(path), len(path)
+        self._draw_strip("odometry", np.array([step.odometry for step in self._steps]), GREY)
+        self._draw_strip("online", np.array([step.pose for step in self._steps]), BLUE)
+        self._draw_strip("path", path, GREEN)
+
+    def _draw_strip(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
+        if len(poses) > 1:
+            strip = self._rr.LineStrips3D(
+                [_on_floor(poses)], colors=[colour], radii=self._rr.Radius.ui_points(1.5)
+            )
+            self._log(f"world/{name}", strip)
+
+    def _draw_experiences(self) -> None:
+        places = _on_floor(self._path[list(self._place_step.values())])
+        if not len(places):
+            return
+        points = self._rr.Radius.ui_points
+        self._log("world/experiences", self._rr.Points3D(places, colors=[BLUE], radii=points(3.0)))
+        known = [(a, b) for a, b in sorted(self._links) if a in self._place_step]
+        ends = np.array([[self._place_step[a], self._place_step[b]] for a, b in known], int).reshape(-1, 2)
+        strips = list(_on_floor(self._path[ends.ravel()]).reshape(-1, 2, 3))
+        self._log("world/links", self._rr.LineStrips3D(strips, colors=[GREY], radii=points(1.0)))
+
+    def _draw_closures(self, closures: np.ndarray) -> None:
+        for judgement in self._verdicts.changes(closures):
+            text = f"step {judgement.later} with step {judgement.earlier}: {judgement.verdict}"
+            self._log("judgements", self._rr.TextLog(text))
+        known = closures[(closures[:, :2] < len(self._path)).all(axis=1)]
+        for sign, name in VERDICTS.items():
+            ends = known[known[:, 2] == sign, :2]
+            strips = list(_on_floor(self._path[ends.ravel()]).reshape(-1, 2, 3))
+            lines = self._rr.LineStrips3D(
+                strips, colors=[COLOUR_OF_VERDICT[sign]], radii=self._rr.Radius.ui_points(1.0)
+            )
+            self._log(f"world/closures/{name}", lines)
+
+    def _draw_activity(self, activity: PoseCellActivity) -> None:
+        # Rows of an image count downwards, y upwards.
+        picture = activity.xy[::-1].astype(np.float32)
+        colours = self._rr.components.Colormap.Viridis
+        self._log("pose_cells/activity", self._rr.DepthImage(picture, colormap=colours))
+        self._log("pose_cells/heading", self._rr.BarChart(activity.heading))
+
+    def _draw_grid(self, grid: GridDrawing) -> None:
+        cells = np.rint(100 * grid.probability).astype(np.uint8)[::-1]
+        height, width = cells.shape
+        picture = self._rr.components.ImageFormat(
+            width=width, height=height, color_model="L", channel_datatype="U8"
+        )
+        self._log(
+            "world/grid",
+            self._rr.GridMap(
+                data=np.ascontiguousarray(cells).tobytes(),
+                format=picture,
+                cell_size=grid.cell,
+                translation=[*grid.origin, -0.001],
+                colormap=self._rr.components.Colormap.RvizMap,
+            ),
+        )
+
+
+def _on_floor(poses: np.ndarray) -> np.ndarray:
+    """Points [n, 3] of poses [n, 3] at height 0."""
+    return np.column_stack([poses[:, :2], np.zeros(len(poses))]) if len(poses) else np.zeros((0, 3))
