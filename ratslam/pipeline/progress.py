@@ -25,7 +25,7 @@ class RunDescription(NamedTuple):
     Attributes:
         name: of its source. backend: by name. first: number of its first step, above 0 for a continued run.
         head: the whisker head whose images the views are, or None. tallest: obstacle height of brightness 1
-            in them, m.
+            in them, m. pose_cells: whether the method has them.
     """
 
     name: str
@@ -33,6 +33,7 @@ class RunDescription(NamedTuple):
     first: int
     head: Head | None = None
     tallest: float = 1.0
+    pose_cells: bool = False
 
 
 class StepReport(NamedTuple):

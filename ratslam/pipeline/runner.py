@@ -73,7 +73,7 @@ class Runner:
         self._saved = session.steps
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
-            observer.begin(_describe(config, source, session.steps))
+            observer.begin(_describe(config, source, session))
 
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
@@ -220,11 +220,13 @@ def _known_rows(length: int | None) -> int:
     return length if length is not None and length <= RESERVED else 0
 
 
-def _describe(config: RunConfig, source: Source, first: int) -> RunDescription:
+def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
     head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
     if head is not None and source.whiskers != len(head.length):
         head = None
-    return RunDescription(source.name, config.backend, first, head, config.touch.image.tallest)
+    cells = session.backend.activity(session.state) is not None
+    tallest = config.touch.image.tallest
+    return RunDescription(source.name, config.backend, session.steps, head, tallest, cells)
 
 
 def _step_report(

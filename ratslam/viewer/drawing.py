@@ -27,10 +27,10 @@ def open_recording(target: str) -> Any:
 
     if target.endswith(".rrd"):
         recording = rerun.RecordingStream(APPLICATION, recording_id=Path(target).stem)
-        recording.save(target, default_blueprint=blueprint())
+        recording.save(target)
     else:
         recording = rerun.RecordingStream(APPLICATION)
-        recording.connect_grpc(f"rerun+http://{target}/proxy", default_blueprint=blueprint())
+        recording.connect_grpc(f"rerun+http://{target}/proxy")
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
@@ -60,6 +60,7 @@ class Drawing:
         """Draws what does not change."""
         self._run = run
         self._recording.send_recording_name(run.name)
+        self._recording.send_blueprint(blueprint(run))
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         arrow = self._rr.Arrows3D(vectors=[[0.15, 0.0, 0.0]], colors=[BLUE])
         self._log("world/robot/heading", arrow, static=True)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from ratslam.pipeline.progress import RunDescription
 
-def blueprint() -> Any:
-    """The map on the left; pose cells, view, whiskers and health on the right."""
+
+def blueprint(run: RunDescription) -> Any:
+    """The map and the loop closures on the left; on the right what the run has of pose cells, view and
+    whiskers, and its health."""
     import rerun.blueprint as rrb
 
     left = rrb.Vertical(
@@ -14,17 +17,16 @@ def blueprint() -> Any:
         rrb.TextLogView(origin="judgements", name="loop closures"),
         row_shares=[4, 1],
     )
-    right = rrb.Vertical(
-        rrb.Horizontal(
-            rrb.Spatial2DView(origin="pose_cells/activity", name="pose cells, x and y"),
-            rrb.BarChartView(origin="pose_cells/heading", name="pose cells, heading"),
-        ),
-        rrb.Horizontal(
-            rrb.Spatial2DView(origin="view", name="view"),
-            rrb.Spatial3DView(origin="world/robot/head", name="whiskers", line_grid=False),
-        ),
-        rrb.TimeSeriesView(origin="health", name="health"),
+    cells = rrb.Horizontal(
+        rrb.Spatial2DView(origin="pose_cells/activity", name="pose cells, x and y"),
+        rrb.BarChartView(origin="pose_cells/heading", name="pose cells, heading"),
     )
+    view: Any = rrb.Spatial2DView(origin="view", name="view")
+    if run.head is not None:
+        whiskers = rrb.Spatial3DView(origin="world/robot/head", name="whiskers", line_grid=False)
+        view = rrb.Horizontal(view, whiskers)
+    health = rrb.TimeSeriesView(origin="health", name="health")
+    right = rrb.Vertical(*([cells] if run.pose_cells else []), view, health)
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[3, 2]),
         rrb.TimePanel(timeline="step", state="collapsed"),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import os
+import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -86,7 +89,8 @@ def _start_viewer() -> None:
     due = time.monotonic() + START_TIMEOUT
     while not _answers(host, port):
         if viewer.poll() is not None or time.monotonic() > due:
-            viewer.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # with the process that it starts in turn
             cure = "without a screen, `--rerun FILE.rrd` keeps the view for later"
             raise InputError(f"--rerun {START}", "the viewer did not start", "a screen", cure)
         time.sleep(0.1)
