@@ -54,13 +54,10 @@ def run_live_session(
 ) -> tuple[Fault, Scorecard | None]:
     """Finds arm and head, compiles, tests both, calibrates, moves along the route, maps and scores.
 
-    The arm is started after the compilation, which takes this machine's processors for up to a minute.
-
     Args:
         directory: the new run directory. log: called with each line of progress.
         mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
-        armed: called with the directory when the session begins.
-        view: target of a live view, from `ratslam.viewer.target.prepare_target`; None for none.
+        armed: called with the directory when the session begins. view: target of a live view, or None.
 
     Returns:
         the outcome of the session with its finding, and the score of the map, if there is one.
@@ -141,7 +138,8 @@ def open_recorder(job: MappingJob, calibration: Calibration) -> LiveRecorder:
 
 
 def _compile(rig: Rig, mapper: Mapper, job: MappingJob, log: Callable[[str], None]) -> None:
-    """Finds both devices, then waits until the mapper has compiled, before the arm is started."""
+    """Finds both devices, then waits until the mapper has compiled, before the arm is started: compiling takes
+    this machine's processors for up to a minute."""
     for line in find_devices(rig):
         log(line)
     log("mapper: compiling")

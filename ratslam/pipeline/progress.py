@@ -76,7 +76,7 @@ class Observer(Protocol):
     """Is told of the progress of a run. It must neither raise nor wait: the run would do so too."""
 
     def begin(self, run: RunDescription) -> None:
-        """The run begins."""
+        """The run begins, after its directory is made."""
 
     def update(self, steps: Sequence[StepReport], map: MapReport | None) -> None:
         """Steps were mapped; the map is reported at the end of a chunk."""

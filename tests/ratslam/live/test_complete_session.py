@@ -74,11 +74,19 @@ def _begun(session: subprocess.Popen, log: Path) -> bool:
     return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", output))
 
 
-def complete_session(host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0) -> Path:
+def complete_session(
+    host: str,
+    folder: Path,
+    *settings: str,
+    longest: float,
+    freeze: float = 0.0,
+    options: Sequence[str] = (),
+) -> Path:
     """The run directory of a session that completes, on emulators of its own.
 
     Args:
         longest: s that it may take. freeze: s for which its mapper is stopped on the way.
+        options: more of `live`.
     """
     given = [word for setting in settings for word in ("--set", setting)]
     directory = folder / "live"
@@ -89,7 +97,7 @@ def complete_session(host: str, folder: Path, *settings: str, longest: float, fr
         command = [sys.executable, "-m", "ratslam", "live", CONFIG, "--ur-host", host, "--head", host]
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(
-                [*command, "-o", str(directory), *given], cwd=ROOT, stdout=log, stderr=log
+                [*command, "-o", str(directory), *given, *options], cwd=ROOT, stdout=log, stderr=log
             )
             raise_priority(process.pid)
             try:
@@ -147,11 +155,26 @@ def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> d
 
 
 def test_twenty_whisks_and_their_replay(loopback: str, tmp_path: Path) -> None:
-    """The mapper is stopped for a while: images dropped live are dropped in the replay too."""
+    """The mapper is stopped for a while: images dropped live are dropped in the replay too. A view changes
+    nothing."""
     settings = [*PATIENT, "live.whisks=20", "live.plan.whisking.rate=2", "live.budget=3"]
     settings += ["live.plan.calibration.min_duration=2"]
-    report = check_session(complete_session(loopback, tmp_path, *settings, longest=280, freeze=4.5), 20)
+    view = tmp_path / "view.rrd"
+    directory = complete_session(
+        loopback, tmp_path, *settings, longest=280, freeze=4.5, options=["--rerun", str(view)]
+    )
+    report = check_session(directory, 20)  # the replay has no view
     assert 1 <= report["dropped"] < 20
+    assert shown_steps(view) == 20
+
+
+def shown_steps(view: Path) -> int:
+    """Number of robot poses in the file of a live view."""
+    from rerun.chunk import RrdReader
+
+    chunks = RrdReader(view).stream().collect().stream()
+    robot = [chunk for chunk in chunks if chunk.entity_path == "/world/robot" and not chunk.is_static]
+    return sum(chunk.num_rows for chunk in robot)
 
 
 @pytest.mark.soak
