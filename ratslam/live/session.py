@@ -138,8 +138,8 @@ def open_recorder(job: MappingJob, calibration: Calibration) -> LiveRecorder:
 
 
 def _compile(rig: Rig, mapper: Mapper, job: MappingJob, log: Callable[[str], None]) -> None:
-    """Finds both devices, then waits until the mapper has compiled, before the arm is started: compiling takes
-    this machine's processors for up to a minute."""
+    """Finds both devices, then waits until the mapper has compiled, before the arm is started: compiling
+    takes this machine's processors for up to a minute."""
     for line in find_devices(rig):
         log(line)
     log("mapper: compiling")

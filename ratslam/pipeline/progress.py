@@ -23,14 +23,13 @@ class RunDescription(NamedTuple):
     """A run, at its beginning.
 
     Attributes:
-        name: of its source. backend: by name. first: number of its first step, above 0 for a continued run.
+        name: of its source. backend: by name.
         head: the whisker head whose images the views are, or None. tallest: obstacle height of brightness 1
             in them, m. pose_cells: whether the method has them.
     """
 
     name: str
     backend: str
-    first: int
     head: Head | None = None
     tallest: float = 1.0
     pose_cells: bool = False

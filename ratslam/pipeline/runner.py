@@ -226,7 +226,7 @@ def _describe(config: RunConfig, source: Source, session: Session) -> RunDescrip
         head = None
     cells = session.backend.activity(session.state) is not None
     tallest = config.touch.image.tallest
-    return RunDescription(source.name, config.backend, session.steps, head, tallest, cells)
+    return RunDescription(source.name, config.backend, head, tallest, cells)
 
 
 def _step_report(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import GridDrawing, PoseCellActivity
 from ratslam.pipeline.progress import MapReport, RunDescription, StepReport
 from ratslam.viewer.judgements import VERDICTS, VerdictLog
@@ -47,11 +48,12 @@ class Drawing:
         import rerun
 
         self._rr, self._recording = rerun, recording
-        self._run = RunDescription("", "", 0)
+        self._run = RunDescription("", "")
         self._start: float | None = None
-        self._path = np.zeros((0, 3))  # of all steps in the map: as last reported, then online
-        self._reported = 0  # steps whose path was reported
-        self._steps: list[StepReport] = []
+        self._path = GrowableArray((3,), np.float64)  # of all steps: as last reported, then online
+        self._odometry = GrowableArray((3,), np.float64)  # of the steps drawn
+        self._online = GrowableArray((3,), np.float64)  # of the same
+        self._whole = 0  # number of steps drawn when the whole path was
         self._place_step: dict[int, int] = {}
         self._links: set[tuple[int, int]] = set()
         self._verdicts = VerdictLog()
@@ -59,7 +61,7 @@ class Drawing:
     def begin(self, run: RunDescription) -> None:
         """Draws what does not change."""
         self._run = run
-        self._recording.send_recording_name(run.name)
+        self._recording.send_recording_name(f"{run.name}, {run.backend}")
         self._recording.send_blueprint(blueprint(run))
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         arrow = self._rr.Arrows3D(vectors=[[0.15, 0.0, 0.0]], colors=[BLUE])
@@ -78,7 +80,7 @@ class Drawing:
 
     def finish(self, map: MapReport) -> None:
         """Draws the final map."""
-        if self._steps:
+        if len(self._online.rows):
             self._draw_map(map)
 
     def _log(self, name: str, *parts: Any, static: bool = False) -> None:
@@ -103,10 +105,10 @@ class Drawing:
 
     def _note(self, step: StepReport) -> None:
         """Remembers path, place and link of a step; steps that were dropped get its pose."""
-        self._steps.append(step)
-        missing = step.number + 1 - len(self._path)
-        self._path = np.concatenate([self._path, np.repeat(step.pose[None], max(0, missing), axis=0)])
-        self._path[step.number] = step.pose
+        self._odometry.append(step.odometry)
+        self._online.append(step.pose)
+        for _ in range(len(self._path.rows), step.number + 1):
+            self._path.append(step.pose)
         if step.place >= 0:
             self._place_step.setdefault(step.place, step.number)
             if step.previous >= 0 and step.previous != step.place:
@@ -134,18 +136,19 @@ class Drawing:
             self._draw_activity(map.activity)
         if map.path is not None:
             self._draw_whole_path(map.path)
-        recent = [step for step in self._steps if step.number >= self._reported - 1]
-        self._draw_strip("odometry/recent", np.array([step.odometry for step in recent]), GREY)
-        self._draw_strip("online/recent", np.array([step.pose for step in recent]), BLUE)
+        recent = slice(max(0, self._whole - 1), None)
+        self._draw_strip("odometry/recent", self._odometry.rows[recent], GREY)
+        self._draw_strip("online/recent", self._online.rows[recent], BLUE)
         self._draw_experiences()
         self._draw_closures(map.closures)
         if map.grid is not None:
             self._draw_grid(map.grid)
 
     def _draw_whole_path(self, path: np.ndarray) -> None:
-        self._path, self._reported = np.array(path), len(path)
-        self._draw_strip("odometry", np.array([step.odometry for step in self._steps]), GREY)
-        self._draw_strip("online", np.array([step.pose for step in self._steps]), BLUE)
+        self._path.replace(np.array(path))
+        self._whole = len(self._online.rows)
+        self._draw_strip("odometry", self._odometry.rows, GREY)
+        self._draw_strip("online", self._online.rows, BLUE)
         self._draw_strip("path", path, GREEN)
 
     def _draw_strip(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
@@ -156,24 +159,24 @@ class Drawing:
             self._log(f"world/{name}", strip)
 
     def _draw_experiences(self) -> None:
-        places = _on_floor(self._path[list(self._place_step.values())])
+        places = _on_floor(self._path.rows[list(self._place_step.values())])
         if not len(places):
             return
         points = self._rr.Radius.ui_points
         self._log("world/experiences", self._rr.Points3D(places, colors=[BLUE], radii=points(3.0)))
         known = [(a, b) for a, b in sorted(self._links) if a in self._place_step]
         ends = np.array([[self._place_step[a], self._place_step[b]] for a, b in known], int).reshape(-1, 2)
-        strips = list(_on_floor(self._path[ends.ravel()]).reshape(-1, 2, 3))
+        strips = list(_on_floor(self._path.rows[ends.ravel()]).reshape(-1, 2, 3))
         self._log("world/links", self._rr.LineStrips3D(strips, colors=[GREY], radii=points(1.0)))
 
     def _draw_closures(self, closures: np.ndarray) -> None:
         for judgement in self._verdicts.changes(closures):
             text = f"step {judgement.later} with step {judgement.earlier}: {judgement.verdict}"
             self._log("judgements", self._rr.TextLog(text))
-        known = closures[(closures[:, :2] < len(self._path)).all(axis=1)]
+        known = closures[(closures[:, :2] < len(self._path.rows)).all(axis=1)]
         for sign, name in VERDICTS.items():
             ends = known[known[:, 2] == sign, :2]
-            strips = list(_on_floor(self._path[ends.ravel()]).reshape(-1, 2, 3))
+            strips = list(_on_floor(self._path.rows[ends.ravel()]).reshape(-1, 2, 3))
             lines = self._rr.LineStrips3D(
                 strips, colors=[COLOUR_OF_VERDICT[sign]], radii=self._rr.Radius.ui_points(1.0)
             )
