@@ -21,6 +21,8 @@ START = "start"
 """The word that starts a viewer at `VIEWER`."""
 START_TIMEOUT = 20.0
 """Time limit of the start of a viewer, s."""
+SETTLING = 1.5
+"""Time after its first answer in which a viewer without a screen ends, s."""
 EXPECTED = f"an .rrd file, a loopback address such as {VIEWER}, or `{START}`"
 
 
@@ -87,7 +89,10 @@ def _start_viewer() -> None:
     quiet = subprocess.DEVNULL
     viewer = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     due = time.monotonic() + START_TIMEOUT
-    while not _answers(host, port):
+    answered: float | None = None
+    while answered is None or time.monotonic() < answered + SETTLING:
+        if answered is None and _answers(host, port):
+            answered = time.monotonic()
         if viewer.poll() is not None or time.monotonic() > due:
             with suppress(ProcessLookupError):
                 os.killpg(viewer.pid, signal.SIGKILL)  # with the process that it starts in turn
