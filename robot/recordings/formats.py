@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from robot.recordings.camera.image_view import ImageViewConfig
+from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
 from robot.sources.input_files import require_file
@@ -22,6 +24,10 @@ class RecordingConfig(Settings):
     """The recording: `.mcap` (written by ratslam), `.npz` (reference trace) or `.csv` (odometry)."""
     table: CsvConfig = CsvConfig()
     """Columns of a `.csv` recording."""
+    image: ImageViewConfig = ImageViewConfig()
+    """How images become views."""
+    visual_odometry: VisualOdometryConfig | None = None
+    """Odometry from the images of a recording that has no other."""
     limits: UnitLimits = DEFAULT_LIMITS
     """Limits of the unit check, beyond which a recording is refused."""
 

@@ -1,0 +1,1 @@
+"""Cameras: grey frames to views and visual odometry, and video files."""
