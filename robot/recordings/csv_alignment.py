@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from robot.recordings.alignment import interpolated_poses, nearest_rows, range_errors, range_pixels
 from robot.recordings.csv_config import LabelColumns, PairColumns, TruthColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
 from robot.recordings.unit_check import UnitLimits, heading_errors
 from tactile.base.errors import InputError
-
-RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
 
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
 
@@ -43,26 +42,12 @@ def align_views(
     else:
         values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
         errors = nonfinite_errors(values, what, place)
-        errors += _range_errors(values, part.max_range, what, place, file.path)
-        groups = np.minimum(values, part.max_range).reshape(len(values), pixels, -1)
-        values = groups.mean(axis=2) / part.max_range
+        typical = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+        lowest, key = values.min(axis=1), "table.views.max_range"
+        errors += range_errors(lowest, typical, part.max_range, what, place, str(file.path), key)
+        values = range_pixels(values, pixels, part.max_range)
     rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
     return rows, values.reshape(-1, *shape), errors + faults
-
-
-def _range_errors(
-    values: np.ndarray, reach: float, what: str, place: RowName, path: Path
-) -> list[InputError]:
-    errors = []
-    negative = (values < 0).any(axis=1)
-    if negative.any():
-        row = int(negative.argmax())
-        errors.append(InputError(place(row), f"{what} is {values[row].min()}", "ranges of 0 m or more"))
-    typical = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
-    if typical > RANGE_UNIT_FACTOR * reach:
-        cure = "divide by 1000 if they are millimetres, else raise table.views.max_range"
-        errors.append(InputError(str(path), f"half of the ranges are over {typical:.4g} m", "metres", cure))
-    return errors
 
 
 def align_labels(
@@ -101,7 +86,7 @@ def _labels_of_file(base: CsvFile, file: CsvFile, part: PairColumns, time: np.nd
     if errors:
         return later, later, errors
     moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = _nearest_rows(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    rows, errors = _each_nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
     return rows, ids, errors
 
 
@@ -151,13 +136,8 @@ def align_truth(
     errors += file.faults(part.time) + clock_errors(moments, part.time, file.place)
     if errors:
         return np.full((len(time), 3), np.nan), errors
-    truth[:, 2] = np.unwrap(truth[:, 2])
-    known = (moments[0] <= time) & (time <= moments[-1])
-    if not known.any():
-        found = f"{part.time} is {moments[0]} to {moments[-1]} s, the odometry's {time[0]} to {time[-1]}"
-        errors.append(InputError(str(file.path), found, "times that overlap", "bring both to one clock"))
-    at = np.column_stack([np.interp(time, moments, column) for column in truth.T])
-    return np.where(known[:, None], at, np.nan), errors
+    truth, faults = interpolated_poses(time, moments, truth, part.time, str(file.path))
+    return truth, errors + faults
 
 
 def _match_rows(
@@ -169,7 +149,7 @@ def _match_rows(
     moments = file.column(name)[there]
     place = _place(file, there)
     errors = nonfinite_errors(moments, name, place) + clock_errors(moments, name, place)
-    return (there, errors) if errors else _nearest_rows(moments, time, tolerance, place)
+    return (there, errors) if errors else _each_nearest(moments, time, tolerance, place)
 
 
 def _place(file: CsvFile, there: np.ndarray) -> RowName:
@@ -177,26 +157,24 @@ def _place(file: CsvFile, there: np.ndarray) -> RowName:
     return lambda row: file.place(int(there[row]))
 
 
-def _nearest_rows(
+def _each_nearest(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
 ) -> tuple[np.ndarray, list[InputError]]:
-    """The odometry row nearest in time to each of the times [M], at most the tolerance away."""
-    steps = np.diff(time)
-    if not (steps > 0).all():
+    """The odometry row nearest in time to each of the times [M], at most the tolerance away; each once."""
+    found = nearest_rows(moments, time, tolerance)
+    if found is None:
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
-    rows = np.searchsorted(time[:-1] + steps / 2, moments)
-    reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
-    away = np.abs(time[rows] - moments)
+    rows, away, reach = found
     errors = []
     far = away > reach
     if far.any():
         i = int(far.argmax())
-        found = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
+        text = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
         cure = "raise tolerance, or bring both to one clock"
-        errors.append(InputError(place(i), found, f"at most {reach:.4g} s", cure))
+        errors.append(InputError(place(i), text, f"at most {reach:.4g} s", cure))
     twice = np.flatnonzero(np.diff(rows) == 0)
     if len(twice) and not errors:
         i = int(twice[0]) + 1
-        found = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
-        errors.append(InputError(place(i), found, "one for each odometry row", "thin them out"))
+        text = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
+        errors.append(InputError(place(i), text, "one for each odometry row", "thin them out"))
     return rows, errors

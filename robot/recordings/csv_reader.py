@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from robot.recordings.alignment import RecordingRows
 from robot.recordings.csv_alignment import align_labels, align_truth, align_views
 from robot.recordings.csv_config import CsvConfig, PoseColumns, VelocityColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
 from robot.recordings.sanity_checks import clock_errors
-from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, heading_errors, unit_errors
+from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits, heading_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
-from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 
 ODOMETRY = ("pose", "velocity", "motion")
@@ -35,39 +35,23 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
     raise_errors(_absences(base, files, config))
 
     time = base.column(config.time)
-    everywhere = np.ones(len(time), bool)
     errors = base.faults(config.time) + clock_errors(time, config.time, base.place)
     motion, faults = _motion(base, time, config, limits)
-    errors += faults
-    shape = (config.rows, config.columns, 1)
-    pictures, seen = np.zeros((len(time), *shape)), np.zeros(len(time), bool)
-    label, truth = np.full(len(time), -1, np.int32), None
+    recording = RecordingRows(time, motion, (config.rows, config.columns, 1), errors=errors + faults)
     if config.views is not None:
-        rows, values, faults = align_views(base, files, config.views, time, shape)
-        errors += faults
+        rows, values, faults = align_views(base, files, config.views, time, recording.shape)
+        recording.errors += faults
         if not faults:
-            pictures[rows], seen[rows] = values, True
+            recording.views[rows], recording.seen[rows] = values, True
     if config.labels is not None or config.pairs is not None:
         rows, values, faults = align_labels(base, files, config.labels, config.pairs, time)
-        errors += faults
+        recording.errors += faults
         if not faults:
-            label[rows] = values
+            recording.label[rows] = values
     if config.truth is not None:
-        truth, faults = align_truth(base, files, config.truth, time, limits)
-        errors += faults
-    raise_errors(errors + unit_errors(MotionTrack(time, everywhere, motion, truth), str(path), limits))
-    return InMemorySource(
-        name=path.stem,
-        digest=digest_of_files(list(files.values())),
-        time=time,
-        motion=motion,
-        moved=everywhere,
-        views=pictures,
-        seen=seen,
-        label=label,
-        truth=truth,
-        info=SourceInfo(labels_only=bool((label >= 0).any()) and not seen.any()),
-    )
+        recording.truth, faults = align_truth(base, files, config.truth, time, limits)
+        recording.errors += faults
+    return recording.source(path.stem, digest_of_files(list(files.values())), str(path), limits)
 
 
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:

@@ -1,0 +1,155 @@
+"""Views and truth of any file or topic, assigned to the rows of the odometry, and the source that results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.recordings.sanity_checks import RowName
+from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import raise_errors
+from robot.sources.source_info import SourceInfo
+from tactile.base.errors import InputError
+
+RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
+
+
+class NearestRows(NamedTuple):
+    """Odometry rows of M values.
+
+    Attributes:
+        rows: [M] the row nearest in time. away: [M] s from it. reach: s, how far a value may be away.
+    """
+
+    rows: np.ndarray
+    away: np.ndarray
+    reach: float
+
+
+@dataclass(eq=False)
+class RecordingRows:
+    """Rows of a recording while it is put together; N rows of odometry.
+
+    Attributes:
+        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
+        shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
+        errors: found so far. views, seen, label, truth: as in `InMemorySource`.
+    """
+
+    time: np.ndarray
+    motion: np.ndarray
+    shape: tuple[int, int, int]
+    whiskers: int = 0
+    errors: list[InputError] = field(default_factory=list)
+    truth: np.ndarray | None = None
+    views: np.ndarray = field(init=False)
+    seen: np.ndarray = field(init=False)
+    label: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        rows = len(self.time)
+        self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
+        self.label = np.full(rows, -1, np.int32)
+
+    def source(self, name: str, digest: str, where: str, limits: UnitLimits) -> InMemorySource:
+        """The recording as a `Source`, after the unit check.
+
+        Raises:
+            InputError: rows have errors, or the units are impossible.
+        """
+        everywhere = np.ones(len(self.time), bool)
+        track = MotionTrack(self.time, everywhere, self.motion, self.truth)
+        raise_errors(self.errors + unit_errors(track, where, limits))
+        return InMemorySource(
+            name=name,
+            digest=digest,
+            time=self.time,
+            motion=self.motion,
+            moved=everywhere,
+            views=self.views,
+            seen=self.seen,
+            label=self.label,
+            truth=self.truth,
+            info=SourceInfo(labels_only=bool((self.label >= 0).any()) and not self.seen.any()),
+            alive=np.ones(self.whiskers, bool),
+        )
+
+
+def range_pixels(
+    ranges: np.ndarray, pixels: int, max_range: float, measured: np.ndarray | None = None
+) -> np.ndarray:
+    """Pixels [M, P] of laser ranges [M, B] m, B a multiple of P: mean of min(range, max_range) / max_range
+    over equal groups of consecutive beams.
+
+    Args:
+        measured: [M, B] bool, the beams that count (default: all); a group without any is 1: nothing is seen.
+    """
+    measured = np.ones(ranges.shape, bool) if measured is None else measured
+    near = np.where(measured, np.minimum(ranges, max_range), 0.0).reshape(len(ranges), pixels, -1)
+    count = measured.reshape(near.shape).sum(axis=2)
+    mean = near.sum(axis=2) / np.maximum(count, 1)
+    return np.where(count > 0, mean, max_range) / max_range
+
+
+def range_errors(
+    lowest: np.ndarray, typical: float, max_range: float, what: str, place: RowName, where: str, key: str
+) -> list[InputError]:
+    """Errors of ranges that cannot be in metres.
+
+    Args:
+        lowest: [M] smallest range of each view, m. typical: median of all. key: setting of `max_range`.
+    """
+    errors = []
+    negative = lowest < 0
+    if negative.any():
+        row = int(negative.argmax())
+        errors.append(InputError(place(row), f"{what} is {lowest[row]}", "ranges of 0 m or more"))
+    if typical > RANGE_UNIT_FACTOR * max_range:
+        cure = f"divide by 1000 if they are millimetres, else raise {key}"
+        errors.append(InputError(where, f"half of the ranges are over {typical:.4g} m", "metres", cure))
+    return errors
+
+
+def nearest_rows(moments: np.ndarray, time: np.ndarray, tolerance: float | None) -> NearestRows | None:
+    """The odometry row nearest in time to each of the times [M] s.
+
+    Args:
+        time: [N] s of the odometry. tolerance: how far a value may be away, s; None: the median step.
+
+    Returns:
+        None if the odometry's times do not increase, which is an error of its own.
+    """
+    steps = np.diff(time)
+    if not (steps > 0).all():
+        return None
+    rows = np.searchsorted(time[:-1] + steps / 2, moments)
+    reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
+    return NearestRows(rows, np.abs(time[rows] - moments), reach)
+
+
+def interpolated_poses(
+    time: np.ndarray, moments: np.ndarray, poses: np.ndarray, what: str, where: str
+) -> tuple[np.ndarray, list[InputError]]:
+    """Poses [N, 3] at the times [N] s, NaN outside the time span of the given ones.
+
+    Args:
+        moments: [M] s, increasing. poses: [M, 3] (x m, y m, heading rad), wrapped or not.
+        what: name of the moments, for errors.
+    """
+    columns = [poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])]
+    known = (moments[0] <= time) & (time <= moments[-1])
+    errors = []
+    if not known.any():
+        errors.append(no_overlap_error(moments, time, what, where))
+    at = np.column_stack([np.interp(time, moments, column) for column in columns])
+    return np.where(known[:, None], at, np.nan), errors
+
+
+def no_overlap_error(moments: Sequence[float], time: Sequence[float], what: str, where: str) -> InputError:
+    """The error for times [M] s that have none of the odometry's [N] s among them."""
+    found = f"{what} is {moments[0]} to {moments[-1]} s, the odometry's {time[0]} to {time[-1]}"
+    return InputError(where, found, "times that overlap", "bring both to one clock")
