@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -149,7 +148,7 @@ def interpolated_poses(
     return np.where(known[:, None], at, np.nan), errors
 
 
-def no_overlap_error(moments: Sequence[float], time: Sequence[float], what: str, where: str) -> InputError:
+def no_overlap_error(moments: np.ndarray, time: np.ndarray, what: str, where: str) -> InputError:
     """The error for times [M] s that have none of the odometry's [N] s among them."""
     found = f"{what} is {moments[0]} to {moments[-1]} s, the odometry's {time[0]} to {time[-1]}"
     return InputError(where, found, "times that overlap", "bring both to one clock")

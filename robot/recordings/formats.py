@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from robot.recordings.bags.config import TopicsConfig
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
@@ -21,9 +22,12 @@ class RecordingConfig(Settings):
     """A recording to run on."""
 
     file: Path
-    """The recording: `.mcap` (written by ratslam), `.npz` (reference trace) or `.csv` (odometry)."""
+    """The recording: `.mcap` (written by ratslam), `.npz` (reference trace), `.csv` (odometry) or a bag:
+    `.bag`, `.db3`, `.mcap` or a folder."""
     table: CsvConfig = CsvConfig()
     """Columns of a `.csv` recording."""
+    topics: TopicsConfig | None = None
+    """Topics of a bag."""
     image: ImageViewConfig = ImageViewConfig()
     """How images become views."""
     visual_odometry: VisualOdometryConfig | None = None
@@ -63,8 +67,24 @@ def _companion(recording: Path, folder: Path, file: Path) -> Path:
 
 def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:
     from robot.recordings.mcap_reader import Recording
+    from robot.recordings.mcap_scanner import is_foreign
 
+    if is_foreign(config.file):
+        return _open_bag(config, warn)
     return Recording(config.file, config.limits, warn)
+
+
+def _open_bag(config: RecordingConfig, warn: Warn) -> Source:
+    from robot.recordings.bags.reader import read_bag
+
+    return read_bag(
+        config.file,
+        config.topics or TopicsConfig(),
+        config.limits,
+        warn,
+        image=config.image,
+        visual_odometry=config.visual_odometry,
+    )
 
 
 def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
@@ -83,11 +103,14 @@ FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
     ".mcap": _open_mcap,
     ".npz": _open_npz,
     ".csv": _open_csv,
+    ".bag": _open_bag,
+    ".db3": _open_bag,
 }
 
 
 def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
-    """Open a recording, in the format of its suffix, and check all of it.
+    """Open a recording, in the format of its suffix, and check all of it. A folder, and every recording with
+    `topics`, is a bag.
 
     Args:
         warn: called with one sentence if only a part of the recording is readable.
@@ -96,6 +119,8 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
         InputError: the file is missing, its format is unknown, or it has errors.
     """
     suffix = config.file.suffix.lower()
+    if config.topics is not None or (config.file / "metadata.yaml").is_file():
+        return _open_bag(config, warn)
     if suffix in FORMATS:
         return FORMATS[suffix](config, warn)
     registered, broken = _registered_formats()

@@ -14,7 +14,8 @@ from zlib import crc32
 
 import numpy as np
 from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Message, Metadata, Schema, Statistics
+from mcap.records import Channel, Chunk, Message, Metadata, Schema, Statistics
+from mcap.stream_reader import StreamReader
 
 from robot.drivers.head.cycle_assembly import FrameWindow, assemble_cycle, empty_frames
 from robot.drivers.head.decoder import Frames
@@ -75,6 +76,23 @@ class RecordingDescription(NamedTuple):
         if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MAX_NUMBERS:
             raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
         return found
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether an MCAP file was written by another program: without our metadata before the first message.
+    False for anything else, such as files that do not exist or are damaged there."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            for record in StreamReader(file, emit_chunks=True).records:
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    return False
+                if isinstance(record, (Chunk, Message)):
+                    return True
+    except (OSError, *DAMAGE_ERRORS):
+        return False
+    return True
 
 
 def metadata_checksum(data: Mapping[str, str]) -> str:

@@ -105,12 +105,12 @@ def test_a_file_without_permission_is_refused(
 
 
 def test_an_unknown_format_is_refused(tmp_path: Path, refused: Refused) -> None:
-    for name, piece in (("run.bag", "no reader for '.bag' files"), ("run", "a file without a suffix")):
+    for name, piece in (("run.pcap", "no reader for '.pcap' files"), ("run", "a file without a suffix")):
         (tmp_path / name).write_text("x")
         refused(
             lambda name=name: open_recording(RecordingConfig(file=tmp_path / name)),
             piece,
-            ".mcap, .npz, .csv",
+            ".mcap, .npz, .csv, .bag, .db3",
         )
 
 

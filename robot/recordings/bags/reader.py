@@ -1,0 +1,175 @@
+"""Bags as sources: odometry, views or touch, and truth, each from a topic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from robot.recordings.alignment import (
+    RecordingRows,
+    interpolated_poses,
+    nearest_rows,
+    no_overlap_error,
+)
+from robot.recordings.bags.bag import Bag, bag_digest
+from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
+from robot.recordings.bags.images import IMAGES
+from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
+from robot.recordings.bags.stamps import Report, Series
+from robot.recordings.bags.touch import read_touch
+from robot.recordings.bags.views import KEY, read_image_views, read_range_views
+from robot.recordings.camera.image_view import ImageViewConfig
+from robot.recordings.camera.visual_odometry import VisualOdometryConfig
+from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import missing_error, raise_errors
+from robot.sources.registry import Warn
+from tactile.base.errors import InputError
+
+NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
+
+
+def read_bag(
+    path: Path,
+    config: TopicsConfig,
+    limits: UnitLimits = DEFAULT_LIMITS,
+    warn: Warn = None,
+    *,
+    image: ImageViewConfig | None = None,
+    visual_odometry: VisualOdometryConfig | None = None,
+) -> InMemorySource:
+    """A bag as a `Source`: one sample for each odometry message, or for each view.
+
+    Args:
+        warn: called with one sentence for every message that is left out, gap and jump.
+        image: how images become views. visual_odometry: for a bag of images without odometry.
+
+    Raises:
+        InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
+    """
+    report = warn or (lambda sentence: None)
+    with Bag(path) as bag:
+        config = with_preset(bag, config)
+        _check_roles(bag, config, visual_odometry)
+        images = image or ImageViewConfig()
+        odometry, views = _read_steps(bag, config, limits, images, visual_odometry, report)
+        truth = None if config.truth is None else read_poses(bag, config.truth, config.clock, report)
+    found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
+    raise_errors(list(dict.fromkeys(found)))
+    if views is not None and config.samples == "views":
+        odometry, views = _sample_views(odometry, views, report)
+    shape, whiskers = NO_VIEWS, 0
+    if views is not None:
+        rows, columns = views.values.shape[1:3]
+        shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
+    recording = RecordingRows(odometry.time, odometry.motion, shape, whiskers)
+    if views is not None:
+        part = config.views or config.touch
+        _place_views(recording, views, part.tolerance if part else None, report)
+    if truth is not None:
+        given = truth.time, truth.values, "time", truth.where
+        recording.truth, faults = interpolated_poses(odometry.time, *given)
+        recording.errors += faults
+    return recording.source(path.stem, bag_digest(path), str(path), limits)
+
+
+def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
+    """The topics, with those of OpenRatSLAM where only their root is given.
+
+    Raises:
+        InputError: the bag has none of these.
+    """
+    if config.openratslam is None:
+        return config
+    root = f"/{config.openratslam.strip('/')}"
+    wheels, image = f"{root}/odom", f"{root}/camera/image"
+    images = [name for name in (image, f"{image}/compressed") if name in bag.topics]
+    if wheels not in bag.topics and not images:
+        key = "recording.topics.openratslam"
+        raise missing_error(str(bag.path), "topic", wheels, list(bag.topics), key)
+    found: dict[str, OdometryTopic | ViewsTopic] = {}
+    if config.odometry is None and wheels in bag.topics:
+        found["odometry"] = OdometryTopic(topic=wheels, use="twist")
+    if config.views is None and config.touch is None and images:
+        found["views"] = ViewsTopic(topic=images[0])
+    return config.model_copy(update=found)
+
+
+def _check_roles(bag: Bag, config: TopicsConfig, visual_odometry: VisualOdometryConfig | None) -> None:
+    if config.views is not None and config.touch is not None:
+        raise InputError("recording.topics", "both views and touch", "one of them")
+    if config.odometry is None and (visual_odometry is None or config.views is None):
+        expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
+        cure = f"the bag has {', '.join(f'{topic.name} ({topic.kind})' for topic in bag.topics.values())}"
+        raise InputError("recording.topics", "no odometry", expected, cure)
+
+
+def _read_steps(
+    bag: Bag,
+    config: TopicsConfig,
+    limits: UnitLimits,
+    image: ImageViewConfig,
+    visual_odometry: VisualOdometryConfig | None,
+    report: Report,
+) -> tuple[BagOdometry, Series | None]:
+    """The odometry, and the views or touch readings if there are any."""
+    clock, odometry = config.clock, None
+    if config.odometry is not None:
+        odometry = read_odometry(bag, config.odometry, clock, limits, report)
+    if config.views is not None and (topic := bag.topic(config.views.topic, KEY)).kind in IMAGES:
+        wanted = None if odometry is not None else visual_odometry
+        views, motion = read_image_views(bag, topic, image, wanted, clock, report)
+        if odometry is not None:
+            return odometry, views
+        assert motion is not None
+        return BagOdometry(views.time, motion, views.where, "", views.errors), views
+    if odometry is None:
+        raise InputError("recording.visual_odometry", "views without images", "images, or topics.odometry")
+    if config.views is not None:
+        body = config.body or odometry.body
+        return odometry, read_range_views(bag, config.views, body, clock, report)
+    return odometry, None if config.touch is None else read_touch(bag, config.touch, clock, report)
+
+
+def _sample_views(odometry: BagOdometry, views: Series, report: Report) -> tuple[BagOdometry, Series]:
+    """Odometry at the times of the views, and the views within the odometry."""
+    inside, motion = motion_at(views.time, odometry.time, odometry.motion)
+    if not inside.any():
+        raise no_overlap_error(views.time, odometry.time, "time", views.where)
+    _report_unused(views, ~inside, "outside the times of the odometry", report)
+    views = views._replace(
+        time=views.time[inside], values=views.values[inside], numbers=views.numbers[inside]
+    )
+    return odometry._replace(time=views.time, motion=motion), views
+
+
+def _place_views(recording: RecordingRows, views: Series, tolerance: float | None, report: Report) -> None:
+    """Gives each view to the nearest sample; of several for one sample the nearest is used."""
+    found = nearest_rows(views.time, recording.time, tolerance)
+    assert found is not None  # the clock is checked
+    near = found.away <= found.reach
+    if not near.any():
+        recording.errors.append(no_overlap_error(views.time, recording.time, "time", views.where))
+        return
+    _report_unused(views, ~near, f"over {found.reach:.3g} s away from every sample", report)
+    order = np.lexsort([found.away, found.rows])
+    order = order[near[order]]
+    first = np.concatenate([[True], np.diff(found.rows[order]) > 0])
+    use = np.sort(order[first])
+    beaten = near.copy()
+    beaten[use] = False
+    _report_unused(
+        views,
+        beaten,
+        "farther from their sample than another (or set recording.topics.samples: views)",
+        report,
+    )
+    recording.views[found.rows[use]], recording.seen[found.rows[use]] = views.values[use], True
+
+
+def _report_unused(views: Series, unused: np.ndarray, why: str, report: Report) -> None:
+    if unused.any():
+        first = float(views.time[int(unused.argmax())])
+        count = f"{int(unused.sum())} of {len(unused)} views, the first at {first:.3f} s"
+        report(f"{views.where}: {count}, are {why}; they are left out")

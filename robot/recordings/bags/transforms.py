@@ -1,0 +1,188 @@
+"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import compress
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.recordings.bags.bag import Bag
+from robot.recordings.bags.motions import pose_in_plane, yaw_of
+from robot.recordings.bags.stamps import (
+    Clock,
+    Report,
+    Series,
+    in_seconds,
+    nanoseconds,
+    read_messages,
+    usable_stamps,
+)
+from robot.sources.input_files import missing_error
+from tactile.base.errors import InputError
+
+STATIC, MOVING = "/tf_static", "/tf"
+KIND = "tf2_msgs/msg/TFMessage"
+
+
+class Link(NamedTuple):
+    """The transforms from a frame to a child frame, N of them; one is enough for a fixed link.
+
+    Attributes:
+        stamps: ns. shifts: (x, y, z) m. turns: quaternions (x, y, z, w). numbers: message of each.
+    """
+
+    stamps: list[int]
+    shifts: list[tuple[float, float, float]]
+    turns: list[tuple[float, float, float, float]]
+    numbers: list[int]
+
+
+Links = dict[tuple[str, str], Link]
+
+
+class Mount(NamedTuple):
+    """Where a sensor sits in the frame of the robot.
+
+    Attributes:
+        rotation: [3, 3] from the frame of the sensor. position: [3] m.
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+def read_links(bag: Bag, name: str, clock: Clock) -> Links:
+    """All links on a topic; of fixed links (`/tf_static`) the last transform."""
+    links: Links = {}
+    if name not in bag.topics or not bag.topics[name].total:
+        return links
+    topic = bag.topics[name]
+    if topic.kind not in (KIND, "tf/msg/tfMessage"):
+        raise InputError(f"{bag.path}, {name}", f"messages of type {topic.kind}", KIND)
+    for number, received, content in read_messages(bag, topic._replace(kind=KIND), "bag"):
+        for each in content.transforms:
+            frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+            move, turn = each.transform.translation, each.transform.rotation
+            pose_in_plane(move, turn, f"{bag.path}, {name} message {number}, {frames[0]} to {frames[1]}")
+            link = links.setdefault(frames, Link([], [], [], []))
+            if name == STATIC:
+                for part in link:
+                    part.clear()
+            link.stamps.append(nanoseconds(each.header.stamp) if clock == "header" else received)
+            link.shifts.append((float(move.x), float(move.y), float(move.z)))
+            link.turns.append((float(turn.x), float(turn.y), float(turn.z), float(turn.w)))
+            link.numbers.append(number)
+    return links
+
+
+def chain_between(links: Links, parent: str, child: str) -> list[tuple[tuple[str, str], bool]] | None:
+    """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
+    neighbours: dict[str, list[tuple[str, tuple[str, str], bool]]] = {}
+    for upper, lower in links:
+        neighbours.setdefault(upper, []).append((lower, (upper, lower), True))
+        neighbours.setdefault(lower, []).append((upper, (upper, lower), False))
+    before: dict[str, tuple[str, tuple[str, str], bool]] = {}
+    queue = deque([parent])
+    while queue and child not in before:
+        frame = queue.popleft()
+        for other, link, down in neighbours.get(frame, []):
+            if other not in before and other != parent:
+                before[other] = frame, link, down
+                queue.append(other)
+    if child not in before:
+        return None
+    chain, frame = [], child
+    while frame != parent:
+        frame, link, down = before[frame]
+        chain.append((link, down))
+    return chain[::-1]
+
+
+def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
+    """The mount of a sensor's frame on a robot's; None if the bag does not say. Links that only /tf has are
+    taken as they are at first."""
+    body, sensor = body.lstrip("/"), sensor.lstrip("/")
+    if body == sensor:
+        return Mount(np.eye(3), np.zeros(3))
+    links = read_links(bag, STATIC, clock)
+    chain = chain_between(links, body, sensor)
+    if chain is None:
+        links = read_links(bag, MOVING, clock) | links
+        chain = chain_between(links, body, sensor)
+    if chain is None:
+        return None
+    whole = np.eye(4)
+    for frames, down in chain:
+        whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
+    return Mount(whole[:3, :3], whole[:3, 3])
+
+
+def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Report) -> Series:
+    """Poses [M, 3] of a frame in another, at the times of the moving link with most transforms; the other
+    moving links are interpolated.
+
+    Raises:
+        InputError: the frames do not exist, are not connected or do not move.
+    """
+    parent, child = (frame.lstrip("/") for frame in frames)
+    links = read_links(bag, MOVING, clock) | read_links(bag, STATIC, clock)
+    there = sorted({frame for pair in links for frame in pair})
+    for frame in (parent, child):
+        if frame not in there:
+            raise missing_error(f"{bag.path}, {MOVING}", "frame", frame, there)
+    where = f"{bag.path}, {MOVING} {parent} to {child}"
+    chain = chain_between(links, parent, child)
+    if chain is None:
+        raise InputError(where, "frames that are not connected", f"a chain of links in {MOVING} or {STATIC}")
+    moving = [pair for pair, _ in chain if len(links[pair].stamps) > 1]
+    if not moving:
+        raise InputError(where, "frames that never move", "a link with several transforms")
+    times, errors = dict[tuple[str, str], np.ndarray](), list[InputError]()
+    for pair in moving:
+        place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
+        use, faults = usable_stamps(links[pair].stamps, place, clock, report)
+        links[pair] = _chosen(links[pair], use)
+        times[pair] = in_seconds(links[pair].stamps)
+        errors += faults
+    lead = max(moving, key=lambda pair: len(times[pair]))
+    moments, numbers = times[lead], np.array(links[lead].numbers)
+    if errors:
+        return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
+    if len(chain) == 1 and chain[0][1]:
+        shifts = np.array(links[lead].shifts)
+        values = np.column_stack([shifts[:, :2], [yaw_of(*turn) for turn in links[lead].turns]])
+        return Series(where, moments, values, numbers, [])
+    start, end = max(times[pair][0] for pair in moving), min(times[pair][-1] for pair in moving)
+    inside = (start <= moments) & (moments <= end)
+    if not inside.any():
+        raise InputError(where, "links without common time", "transforms of all links at the same time")
+    moments = moments[inside]
+    whole = np.broadcast_to(np.eye(4), (len(moments), 4, 4))
+    for pair, down in chain:
+        whole = whole @ _matrices(links[pair], times.get(pair, np.zeros(1)), moments, down)
+    values = np.column_stack([whole[:, 0, 3], whole[:, 1, 3], np.arctan2(whole[:, 1, 0], whole[:, 0, 0])])
+    return Series(where, moments, values, numbers[inside], [])
+
+
+def _chosen(link: Link, use: np.ndarray) -> Link:
+    """The transforms that are used: [N] bool."""
+    stamps, shifts, turns, numbers = link
+    shifts, turns = list(compress(shifts, use)), list(compress(turns, use))
+    return Link(list(compress(stamps, use)), shifts, turns, list(compress(numbers, use)))
+
+
+def _matrices(link: Link, time: np.ndarray, moments: np.ndarray, down: bool) -> np.ndarray:
+    """[M, 4, 4] transforms of a link at the moments [M] s, interpolated; inverted if followed upwards."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    found = np.zeros((len(moments), 4, 4))
+    found[:, 3, 3] = 1.0
+    turns, shifts = Rotation.from_quat(link.turns), np.array(link.shifts)
+    if len(link.stamps) == 1:
+        found[:, :3, :3], found[:, :3, 3] = turns[0].as_matrix(), shifts[0]
+    else:
+        found[:, :3, :3] = Slerp(time, turns)(moments).as_matrix()
+        found[:, :3, 3] = np.column_stack([np.interp(moments, time, axis) for axis in shifts.T])
+    return found if down else np.linalg.inv(found)
