@@ -11,7 +11,7 @@ from robot.recordings.alignment import range_errors
 from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.config import ViewsTopic
 from robot.recordings.bags.images import IMAGES, grey_image
-from robot.recordings.bags.scans import CLOUD, SCAN, RangeView, cloud_view, scan_limits, scan_view
+from robot.recordings.bags.scans import CLOUD, SCAN, RangeView, cloud_view, is_ring, scan_limits, scan_view
 from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_messages
 from robot.recordings.bags.transforms import Mount, mount_of
 from robot.recordings.camera.image_view import ImageViewConfig
@@ -51,7 +51,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
     mount, reach, empty = None, config.max_range, 0
     for number, stamp, content in read_messages(bag, topic, clock):
         place = f"{where}, message {number}"
-        mount = mount or _mount(bag, config, body, content.header.frame_id, clock, report)
+        mount = mount or _mount(bag, config, body, content, clock, report)
         reach = reach or _reach(topic, content, place)
         view = _range_view(topic, content, mount, config, reach, place)
         if view is None:
@@ -109,16 +109,19 @@ def _range_view(
     return cloud_view(content, mount, config.heights, pixels, reach, place)
 
 
-def _mount(bag: Bag, config: ViewsTopic, body: str, sensor: str, clock: Clock, report: Report) -> Mount:
+def _mount(bag: Bag, config: ViewsTopic, body: str, content: Any, clock: Clock, report: Report) -> Mount:
+    """The mount of the sensor of a message; that of a whole ring must be known or is reported."""
     if config.yaw is not None:
         c, s = np.cos(config.yaw), np.sin(config.yaw)
         return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    sensor = content.header.frame_id
     mount = mount_of(bag, body, sensor, clock) if body and sensor else None
     if mount is not None:
         return mount
-    frames = f"from {body or 'the robot'} to {sensor or 'the sensor'}"
-    cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
-    report(f"{bag.path}: no transform {frames} in /tf_static; {cure}")
+    if not hasattr(content, "ranges") or is_ring(content):
+        frames = f"from {body or 'the robot'} to {sensor or 'the sensor'}"
+        cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
+        report(f"{bag.path}: no transform {frames} in /tf_static; {cure}")
     return Mount(np.eye(3), np.zeros(3))
 
 
