@@ -45,7 +45,7 @@ def intel(data: Path, folder: Path) -> RealBag:
 
 
 def create(data: Path, folder: Path) -> RealBag:
-    """A Create in a walled lab: poses by its wheels, nine depth rays from right to left, overhead truth."""
+    """A Create in a walled lab: poses by its wheels, nine depth rays from left to right, overhead truth."""
     log, depth = read_csv(data / "create_lab_odometry.csv"), read_csv(data / "create_lab_depth.csv")
     camera = read_csv(data / "create_lab_truth.csv")
     distance, turn = log.column("distance"), log.column("turn")
@@ -53,7 +53,7 @@ def create(data: Path, folder: Path) -> RealBag:
     rays, _ = depth.block("d")
     step = np.deg2rad(7.5)
     scans = [
-        scan(time, row[::-1], -4 * step, step)
+        scan(time, row, 4 * step, -step)
         for time, row in zip(_stamps(data / "create_lab_depth.csv"), rays, strict=True)
     ]
     truth = np.column_stack([camera.column(name) for name in ("x", "y", "heading")])

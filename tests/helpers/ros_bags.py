@@ -16,6 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 for store in (ROS1, ROS2):
     store.register(get_types_from_msg("float32 energy\nstring note", "lab_msgs/msg/Custom"))
+for early in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+    ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", early))
 
 KINDS = {
     "ros1": ("run.bag", None),

@@ -16,6 +16,8 @@ from tactile.base.errors import InputError
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
+TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
+"""Types of /tf, of ROS 2 and 1 and of early ROS 1."""
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins with 00
 
 
@@ -50,7 +52,7 @@ class Bag:
         files = bag_files(path)
         try:
             from rosbags import rosbag1, rosbag2
-            from rosbags.typesys import Stores, get_typestore
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError:
             raise InputError("rosbags", "not installed", "", "pip install 'ratslam[ros]'") from None
         first = files[0].suffix == ".bag"
@@ -60,6 +62,8 @@ class Bag:
                 reader.open()
                 self._stack.callback(reader.close)
             self._store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+            for kind in TRANSFORMS - self._store.fielddefs.keys():
+                self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
             self._decode = self._store.deserialize_ros1 if first else self._store.deserialize_cdr
             self._readers, self._first = readers, first
             self.topics = self._list_topics()
@@ -99,23 +103,40 @@ class Bag:
         Raises:
             InputError: the bag is damaged, or the topic's type is unknown or defined differently.
         """
-        where = f"{self.path}, {topic.name}"
+        self._check_type(topic)
+        with damage_errors(self.path):
+            for time, raw in self._raw(topic):
+                yield time, self._decode(_plain(raw), topic.kind)
+
+    def receipts(self, topic: Topic) -> Iterator[int]:
+        """The times of receipt, ns, of the messages of a topic of any type.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        with damage_errors(self.path):
+            for time, _ in self._raw(topic):
+                yield time
+
+    def _raw(self, topic: Topic) -> Iterator[tuple[int, Any]]:
         parts = []
         for reader in self._readers:
             chosen = [each for each in reader.connections if each.topic == topic.name]
             if chosen:
-                self._check_type(topic, chosen, where)
                 parts.append(reader.messages(chosen))
-        with damage_errors(self.path):
-            for _, time, raw in merge(*parts, key=lambda entry: entry[1]):
-                yield int(time), self._decode(_plain(raw), topic.kind)
+        for _, time, raw in merge(*parts, key=lambda entry: entry[1]):
+            if not 0 <= time < 1 << 63:
+                raise ValueError(f"a message received at {time} ns")
+            yield int(time), raw
 
-    def _check_type(self, topic: Topic, connections: list[Any], where: str) -> None:
+    def _check_type(self, topic: Topic) -> None:
+        where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
             raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
         if self._first:
             digest = self._store.generate_msgdef(topic.kind)[1]
-            if any(each.digest not in (digest, "*") for each in connections):
+            connections = (each for reader in self._readers for each in reader.connections)
+            if any(each.topic == topic.name and each.digest not in (digest, "*") for each in connections):
                 raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
 
     def __enter__(self) -> Self:

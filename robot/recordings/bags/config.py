@@ -65,9 +65,9 @@ class ViewsTopic(Topic):
     rows: PositiveInt = 3
     """R, rows of a view of ranges."""
     columns: PositiveInt = 6
-    """C, columns of a view of ranges; its R x C sectors are filled row by row, counter-clockwise."""
+    """C, columns of a view of ranges; its R x C sectors are filled row by row."""
     max_range: PositiveFloat | None = None
-    """Range that becomes 1, m; null: `range_max` of the first scan. Point clouds need it."""
+    """Range that becomes 1, m; null: `range_max` of the first scan, at most 8 m."""
     yaw: float | None = None
     """Direction of the sensor in the frame of the robot, rad, counter-clockwise; null: from /tf_static."""
     heights: tuple[float, float] = (0.1, 1.0)

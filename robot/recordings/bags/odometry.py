@@ -88,6 +88,8 @@ def motion_at(moments: np.ndarray, time: np.ndarray, motion: np.ndarray) -> tupl
         inside: [M] bool, moments within the odometry. motion: [I, 4] between these.
     """
     inside = (time[0] <= moments) & (moments <= time[-1])
+    if not inside.any():
+        return inside, np.zeros((0, 4))
     path = integrate(motion[:, :3])
     path[:, 2] = np.unwrap(path[:, 2])
     at = [np.interp(moments[inside], time, column) for column in path.T]

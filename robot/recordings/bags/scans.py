@@ -34,10 +34,10 @@ class RangeView(NamedTuple):
 
 
 def scan_view(message: Any, mount: Mount, pixels: int, max_range: float, where: str) -> RangeView | None:
-    """The sectors of a LaserScan, counter-clockwise; None if no beam was measured.
+    """The sectors of a LaserScan; None if no beam was measured.
 
-    A whole ring is cut by the direction of its beams in the frame of the robot; the first sector begins
-    behind it. Any other scan is a fan, cut into groups of consecutive beams from its right end on.
+    A whole ring is cut by the direction of its beams in the frame of the robot, counter-clockwise from behind
+    it. Any other scan is a fan, cut into groups of consecutive beams in the order of the message.
 
     Raises:
         InputError: the angles are not numbers, or there are fewer beams than pixels.
@@ -56,8 +56,6 @@ def scan_view(message: Any, mount: Mount, pixels: int, max_range: float, where: 
         turn = (np.arctan2(ahead[1], ahead[0]) + np.pi) / (2 * np.pi)  # from behind, of a whole turn
         sector = np.minimum((turn % 1.0 * pixels).astype(int), pixels - 1)
         return _view(ranges, measured, sector, pixels, max_range)
-    if (step < 0) != (mount.rotation[2, 2] < 0):
-        ranges, measured = ranges[::-1], measured[::-1]
     return _fan_view(ranges, measured, pixels, max_range)
 
 
@@ -108,6 +106,8 @@ def cloud_points(message: Any, where: str) -> np.ndarray:
     data = np.asarray(message.data, np.uint8)
     step, row, height, width = message.point_step, message.row_step, message.height, message.width
     try:
+        if height * width * step > len(data):
+            raise ValueError("too few")
         kinds = [order + POINT_TYPES[fields[name].datatype] for name in "xyz"]
         offsets = [fields[name].offset for name in "xyz"]
         kind = np.dtype({"names": list("xyz"), "formats": kinds, "offsets": offsets, "itemsize": step})
@@ -124,7 +124,7 @@ def _fan_view(ranges: np.ndarray, measured: np.ndarray, pixels: int, max_range: 
     if not measured.any():
         return None
     values = range_pixels(ranges[None], pixels, max_range, measured[None])[0]
-    return RangeView(values, *_extent(ranges[measured]))
+    return RangeView(values, *_extent(ranges[measured], max_range))
 
 
 def _view(
@@ -137,8 +137,10 @@ def _view(
     total = np.bincount(sector[measured], near, pixels)
     count = np.bincount(sector[measured], minlength=pixels)
     values = np.where(count > 0, total / np.maximum(count, 1) / max_range, 1.0)
-    return RangeView(np.minimum(values, 1.0), *_extent(ranges[measured]))
+    return RangeView(np.minimum(values, 1.0), *_extent(ranges[measured], max_range))
 
 
-def _extent(ranges: np.ndarray) -> tuple[float, float]:
+def _extent(ranges: np.ndarray, max_range: float) -> tuple[float, float]:
+    """The smallest and the median range, m, where nothing in range counts as `max_range`."""
+    ranges = np.where(np.isinf(ranges), max_range, ranges)
     return float(ranges.min()), float(np.median(ranges))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import Bag
+from robot.recordings.bags.bag import TRANSFORMS, Bag
 from robot.recordings.bags.motions import pose_in_plane, yaw_of
 from robot.recordings.bags.stamps import (
     Clock,
@@ -23,7 +23,6 @@ from robot.sources.input_files import missing_error
 from tactile.base.errors import InputError
 
 STATIC, MOVING = "/tf_static", "/tf"
-KIND = "tf2_msgs/msg/TFMessage"
 
 
 class Link(NamedTuple):
@@ -59,9 +58,9 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
     if name not in bag.topics or not bag.topics[name].total:
         return links
     topic = bag.topics[name]
-    if topic.kind not in (KIND, "tf/msg/tfMessage"):
-        raise InputError(f"{bag.path}, {name}", f"messages of type {topic.kind}", KIND)
-    for number, received, content in read_messages(bag, topic._replace(kind=KIND), "bag"):
+    if topic.kind not in TRANSFORMS:
+        raise InputError(f"{bag.path}, {name}", f"messages of type {topic.kind}", f"{sorted(TRANSFORMS)[-1]}")
+    for number, received, content in read_messages(bag, topic, "bag"):
         for each in content.transforms:
             frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
             move, turn = each.transform.translation, each.transform.rotation

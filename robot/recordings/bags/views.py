@@ -20,6 +20,7 @@ from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from tactile.base.errors import InputError
 
 KEY = "recording.topics.views"
+LONGEST = 8.0  # m: of indoor scans, most show something nearer
 
 
 class BagImages(NamedTuple):
@@ -52,7 +53,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
     for number, stamp, content in read_messages(bag, topic, clock):
         place = f"{where}, message {number}"
         mount = mount or _mount(bag, config, body, content, clock, report)
-        reach = reach or _reach(topic, content, place)
+        reach = reach or _reach(content)
         view = _range_view(topic, content, mount, config, reach, place)
         if view is None:
             empty += 1
@@ -64,11 +65,16 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         report(f"{where}: {empty} of {topic.total} messages have no measured range and are no views")
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
     series = as_series(where, numbers, stamps, pixels, clock, report)
-    lowest, typical = np.array([view.lowest for view in found]), np.median([view.typical for view in found])
+    lowest, typical = (np.array([getattr(view, name) for view in found]) for name in ("lowest", "typical"))
     errors = range_errors(
-        lowest, float(typical), reach or 1.0, "a range", lambda i: f"{where}, message {numbers[i]}", where,
+        lowest,
+        float(np.median(typical)),
+        reach or LONGEST,
+        "a range",
+        lambda row: f"{where}, message {numbers[row]}",
+        where,
         f"{KEY}.max_range",
-    )  # fmt: skip
+    )
     return series._replace(errors=series.errors + errors)
 
 
@@ -125,8 +131,6 @@ def _mount(bag: Bag, config: ViewsTopic, body: str, content: Any, clock: Clock, 
     return Mount(np.eye(3), np.zeros(3))
 
 
-def _reach(topic: Topic, content: Any, place: str) -> float:
-    high = scan_limits(content)[1] if topic.kind == SCAN else np.inf
-    if not np.isfinite(high):
-        raise InputError(place, "no largest range", "one in m", f"set {KEY}.max_range")
-    return high
+def _reach(content: Any) -> float:
+    """The range that becomes 1 where none is given, m."""
+    return min(scan_limits(content)[1], LONGEST) if hasattr(content, "ranges") else LONGEST

@@ -1,0 +1,113 @@
+"""Settings that read a bag, from its description."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robot.recordings.bags.description import (
+    BagDescription,
+    MotionShape,
+    ScanShape,
+    Times,
+    TopicDescription,
+    ValueShape,
+)
+from robot.recordings.bags.images import IMAGES
+from robot.recordings.bags.motions import ODOMETRY
+from robot.recordings.bags.scans import CLOUD, SCAN
+from robot.recordings.bags.touch import JOINTS
+
+TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
+"""Names of topics and frames with true poses."""
+ROOTS, BODIES = ("odom",), ("base_link", "base_footprint")
+"""Frames whose link in /tf is odometry."""
+LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
+SECTORS = 18  # of a view by default
+FASTER = 1.2  # times the odometry's rate: views beyond are the samples
+
+
+def suggested_topics(bag: BagDescription) -> dict[str, Any]:
+    """`recording.topics` that read the bag; {} if it has neither odometry nor images."""
+    truth = _first(bag, "truth", [topic for topic in bag.topics if TRUE.search(topic.name)])
+    odometry, wheels = _odometry(bag, truth)
+    views = _views(bag)
+    touch = None if views is not None else _touch(bag)
+    found: dict[str, Any] = {}
+    if odometry is not None:
+        found["odometry"] = odometry
+    elif views is None or views[0].kind not in IMAGES:
+        return {}
+    seen = views or touch
+    if seen is not None:
+        found["views" if views else "touch"] = seen[1]
+    if truth is not None:
+        found["truth"] = truth.name
+    used = [topic for topic in (wheels, seen and seen[0], truth) if topic is not None]
+    if not _headers_serve(used):
+        found["clock"] = "bag"
+    if (
+        seen is not None
+        and wheels is not None
+        and seen[0].received.rate_hz > FASTER * wheels.received.rate_hz
+    ):
+        found["samples"] = "views"
+    return found
+
+
+def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any, TopicDescription | None]:
+    """The setting, and the topic that it names."""
+    others = [topic for topic in bag.topics if topic != truth]
+    best = _first(bag, "odometry", [topic for topic in others if topic.kind == ODOMETRY])
+    best = best or _first(bag, "odometry", others)
+    if best is None:
+        for link in bag.links:
+            if not link.fixed and link.total > 1 and link.parent in ROOTS and link.child in BODIES:
+                return {"tf": [link.parent, link.child]}, None
+        return None, None
+    shape = best.shape
+    still = isinstance(shape, MotionShape) and not shape.pose_path > LEAST_PATH
+    if best.kind == ODOMETRY and isinstance(shape, MotionShape) and still and shape.twist_path > LEAST_PATH:
+        return {"topic": best.name, "use": "twist"}, best
+    return best.name, best
+
+
+def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
+    for kinds in ((SCAN,), (CLOUD,), IMAGES):
+        topic = _first(bag, "views", [topic for topic in bag.topics if topic.kind in kinds])
+        if topic is not None:
+            shape = topic.shape
+            if isinstance(shape, ScanShape) and shape.beams < SECTORS:
+                return topic, {"topic": topic.name, "rows": 1, "columns": shape.beams}
+            return topic, topic.name
+    return None
+
+
+def _touch(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
+    topic = _first(bag, "touch", [topic for topic in bag.topics if topic.kind != JOINTS])
+    if topic is None or not isinstance(topic.shape, ValueShape):
+        return None
+    low, high = topic.shape.low, topic.shape.high
+    if (low >= 0 and high <= 1) or not low < high:
+        return topic, topic.name
+    return topic, {"topic": topic.name, "low": low, "high": high}
+
+
+def _first(bag: BagDescription, role: str, topics: Sequence[TopicDescription]) -> TopicDescription | None:
+    """The readable topic with most messages that can serve as this."""
+    able = [topic for topic in topics if role in topic.roles and topic.shape is not None]
+    return max(able, key=lambda topic: topic.total, default=None)
+
+
+def _headers_serve(topics: Sequence[TopicDescription]) -> bool:
+    """Whether the stamps in the headers are in order and on one clock."""
+    stamped = [topic.stamped for topic in topics if topic.stamped is not None]
+    if not all(times.in_order for times in stamped):
+        return False
+    clocks: list[Times] = [topic.stamped or topic.received for topic in topics]
+    return not clocks or bool(
+        np.max([times.first for times in clocks]) <= np.min([times.last for times in clocks])
+    )

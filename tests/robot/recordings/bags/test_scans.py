@@ -1,0 +1,149 @@
+"""Sectors of scans and clouds: which beams count, where the first sector is, and how a sensor is mounted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robot.recordings.bags.scans import cloud_view, scan_view
+from robot.recordings.bags.transforms import Mount
+from tactile.base.errors import InputError
+from tests.helpers.ros_bags import ROS2, built, scan
+
+AHEAD = Mount(np.eye(3), np.zeros(3))
+ROLLED = Mount(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # upside down
+Refused = Callable[..., InputError]
+
+
+def turned(yaw: float) -> Mount:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+
+
+def message(ranges: Any, first: float, step: float, **fields: Any) -> Any:
+    return built(ROS2, "sensor_msgs/msg/LaserScan", scan(0, ranges, first, step, **fields).fields)
+
+
+def sectors(content: Any, pixels: int, mount: Mount = AHEAD, max_range: float = 4.0) -> list[float] | None:
+    view = scan_view(content, mount, pixels, max_range, "here")
+    return None if view is None else view.pixels.tolist()
+
+
+def test_a_fan_keeps_groups_of_consecutive_beams() -> None:
+    assert sectors(message([1, 3, 2, 2, 8, 0], -0.5, 0.2), 3) == [0.5, 0.5, 0.5]
+    assert sectors(message([1, 1, 1, 2, 2], -0.5, 0.2), 2) == [0.25, 0.5]  # 3 and 2 beams
+
+
+def test_a_fan_keeps_the_order_of_its_beams() -> None:
+    for first, step, mount in ((-0.2, 0.2, AHEAD), (0.2, -0.2, AHEAD), (-0.2, 0.2, ROLLED)):
+        assert sectors(message([1, 2, 3], first, step), 3, mount) == [0.25, 0.5, 0.75]
+
+
+def test_a_ring_runs_counter_clockwise() -> None:
+    """Also of a scan that runs clockwise."""
+    step = 2 * np.pi / 8
+    assert sectors(message([1, 2, 2, 3, 3, 4, 4, 1], step / 2, -step), 4) == [0.75, 0.5, 0.25, 1.0]
+
+
+@pytest.mark.parametrize("first", [0.0, -np.pi])
+@pytest.mark.parametrize("yaw", [0.0, 0.5 * np.pi, np.pi])
+def test_a_ring_begins_behind_the_robot(first: float, yaw: float) -> None:
+    """Something near is a little to the right of behind, another thing ahead on the left."""
+    step = 2 * np.pi / 360
+    angles = first + step * np.arange(360) + yaw  # in the frame of the robot
+    direction = (angles + np.pi) % (2 * np.pi)
+    ranges = np.where(direction < np.deg2rad(45), 1.0, 4.0)
+    ranges[(direction > np.deg2rad(181)) & (direction < np.deg2rad(224))] = 2.0
+    found = sectors(message(ranges, first, step), 8, turned(yaw))
+    assert found == pytest.approx([0.25, 1, 1, 1, 0.5, 1, 1, 1], abs=0.05)
+
+
+def test_a_ring_of_a_sensor_upside_down_is_turned_over() -> None:
+    step = 2 * np.pi / 360
+    ranges = np.full(360, 4.0)
+    ranges[1:90] = 1.0  # to the left of its axis, hence to the right of the robot
+    assert sectors(message(ranges, 0.0, step), 4, ROLLED) == pytest.approx([1, 0.25, 1, 1], abs=0.02)
+
+
+def test_beams_without_a_measurement_do_not_count() -> None:
+    """NaN, -inf and below range_min; +inf and beyond range_max mean that nothing is there."""
+    fan = message([np.nan, 1, -np.inf, 2, 0.05, 3, np.inf, 2, 90, 2], -0.5, 0.1, range_min=0.1)
+    assert sectors(fan, 5) == pytest.approx([0.25, 0.5, 0.75, 0.75, 0.75])
+    assert sectors(message([0, 1, 0, 3], -0.5, 0.1), 2) == [0.125, 0.375]  # 0 is a range if range_min is 0
+    assert sectors(message([0, 0, 1, 3], -0.5, 0.1, range_min=0.1), 2) == [1.0, 0.5]  # a sector without any
+    assert sectors(message([0, 0, np.nan, 0], -0.5, 0.1, range_min=0.1), 2) is None
+    assert sectors(message([np.inf] * 4, -0.5, 0.1), 2) == [1.0, 1.0]
+    step = 2 * np.pi / 8
+    ring = message([np.nan, 1, 0.05, 2, np.inf, 4, 90, 4], -np.pi + step / 2, step, range_min=0.1)
+    assert sectors(ring, 4) == pytest.approx([0.25, 0.5, 1.0, 1.0])
+
+
+def test_limits_that_cannot_be_meant_are_ignored() -> None:
+    assert sectors(message([1, 3], -0.5, 0.1, range_max=0.0), 2) == [0.25, 0.75]
+
+
+def test_angles_that_are_no_numbers_are_refused(refused: Refused) -> None:
+    refused(lambda: sectors(message([1, 3], np.nan, 0.1), 2), "here", "angle_min is nan", "angles in rad")
+    refused(lambda: sectors(message([1, 3], 0.0, 0.0), 2), "angle_increment 0.0")
+    refused(lambda: sectors(message([1, 3], 0.0, 0.1), 3), "2 beams", "each of 3 sectors")
+
+
+def cloud(points: np.ndarray, order: str = "<", **fields: Any) -> Any:
+    """A cloud of float32 x, y, z with a gap of four bytes, as lidar drivers write it."""
+    kind = np.dtype(
+        {"names": ["x", "y", "z"], "formats": [f"{order}f4"] * 3, "offsets": [0, 4, 8], "itemsize": 16}
+    )
+    rows = np.zeros(len(points), kind)
+    for axis, column in zip("xyz", points.T, strict=True):
+        rows[axis] = column
+    named = [
+        {"name": axis, "offset": 4 * index, "datatype": 7, "count": 1} for index, axis in enumerate("xyz")
+    ]
+    given = {
+        "height": 1,
+        "width": len(points),
+        "fields": named,
+        "is_bigendian": int(order == ">"),
+        "point_step": 16,
+        "row_step": 16 * len(points),
+        "data": np.frombuffer(rows.tobytes(), np.uint8),
+    }
+    return built(ROS2, "sensor_msgs/msg/PointCloud2", given | fields)
+
+
+POINTS = np.array([[-1, -0.01, 0.5], [-3, -0.02, 0.5], [2, 0.5, 0.5], [0.1, 0.1, -0.2], [np.nan, 0, 0.5]])
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_cloud_is_the_nearest_point_of_each_degree(order: str) -> None:
+    view = cloud_view(cloud(POINTS, order), AHEAD, (0.1, 1.0), 360, 4.0, "here")
+    assert view is not None
+    near = {0: 1.0 / 4, 180 + int(np.rad2deg(np.arctan2(0.5, 2))): np.hypot(2, 0.5) / 4}
+    assert {int(i): view.pixels[i] for i in np.flatnonzero(view.pixels < 1)} == pytest.approx(near, rel=1e-4)
+
+
+def test_a_cloud_is_seen_from_the_robot() -> None:
+    """Mounted 0.3 m high, to the left: its x axis is the robot's y axis."""
+    mount = Mount(turned(np.pi / 2).rotation, np.array([0.0, 0.0, 0.3]))
+    view = cloud_view(
+        cloud(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, -0.25]])), mount, (0.1, 1.0), 4, 4.0, "here"
+    )
+    assert view is not None
+    assert np.flatnonzero(view.pixels < 1).tolist() == [3]
+    assert view.lowest == pytest.approx(1.0)
+
+
+def test_a_damaged_cloud_is_refused(refused: Refused) -> None:
+    def read(content: Any) -> Any:
+        return cloud_view(content, AHEAD, (0.1, 1.0), 4, 4.0, "here")
+
+    refused(lambda: read(cloud(POINTS, fields=[])), "here", "a cloud of no fields", "fields x, y and z")
+    refused(lambda: read(cloud(POINTS, width=50)), "1 x 50 points", "data that fit")
+    odd = [
+        {"name": axis, "offset": 4 * index, "datatype": 99, "count": 1} for index, axis in enumerate("xyz")
+    ]
+    refused(lambda: read(cloud(POINTS, fields=odd)), "data that fit")
+    assert read(cloud(np.full((3, 3), np.nan))) is None
