@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from ratslam.examples import taxel_array
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses, from_velocities
+from robot.touch_source import TOUCH, open_touch_source
+from tactile.base.errors import InputError
+from tactile.frontend import TouchConfig
 from tests.helpers.ros_bags import (
     KINDS,
     Entry,
@@ -39,12 +46,18 @@ def read(tmp_path: Path) -> Read:
     """Writes messages to a bag and reads it; warnings are appended to `told`, else they fail."""
 
     def call(
-        entries: Sequence[Entry], kind: str = "mcap", told: list[str] | None = None, **topics: Any
+        entries: Sequence[Entry],
+        kind: str = "mcap",
+        told: list[str] | None = None,
+        recording: dict[str, Any] | None = None,
+        **topics: Any,
     ) -> InMemorySource:
         folder = tmp_path / kind
         folder.mkdir()
         path = write_bag(folder, kind, entries)
-        config = RecordingConfig.model_validate({"file": path, "topics": {"odometry": "/odom"} | topics})
+        config = RecordingConfig.model_validate(
+            {"file": path, "topics": {"odometry": "/odom"} | topics} | (recording or {})
+        )
         source = open_recording(config, pytest.fail if told is None else told.append)
         assert isinstance(source, InMemorySource)
         return source
@@ -219,3 +232,57 @@ def test_the_topics_of_openratslam_are_a_preset(read: Read) -> None:
     assert source.motion[5, 0] == pytest.approx(0.05)
     assert source.view_shape == (12, 60, 1)
     assert source.views[5] == pytest.approx(0.2)
+
+
+def panorama(row: int) -> np.ndarray:
+    """[24, 120] what a camera sees after turning by 6 degrees to the left in each step."""
+    scene = np.random.default_rng(1).integers(0, 255, 120, dtype=np.uint8)
+    return np.tile(np.roll(scene, 2 * row), (24, 1))
+
+
+@pytest.mark.parametrize("stored", ["ros1", "mcap"])
+def test_a_camera_alone_gives_views_and_odometry(stored: str, read: Read) -> None:
+    """Compressed images, as OpenRatSLAM's users record them."""
+
+    def fields(row: int) -> dict[str, Any]:
+        file = io.BytesIO()
+        Image.fromarray(panorama(row)).save(file, "PNG")
+        return {"format": "png", "data": np.frombuffer(file.getvalue(), np.uint8)}
+
+    source = read(
+        stamped("sensor_msgs/msg/CompressedImage", fields),
+        stored,
+        recording={"visual_odometry": {"fov_deg": 360}, "image": {"rows": 2, "columns": 12}},
+        odometry=None,
+        views="/topic",
+    )
+    assert (source.length, source.view_shape) == (12, (2, 12, 1))
+    assert np.array_equal(source.time, SECONDS)
+    assert np.rad2deg(source.motion[1:, 2]) == pytest.approx(6.0)
+    blocks = panorama(3).reshape(2, 12, 12, 10).mean(axis=(1, 3)) / 255
+    assert source.views[3, :, :, 0] == pytest.approx(blocks)
+
+
+def test_touch_can_be_turned_into_views_by_a_front_end(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The taxel array of the examples: the largest pressures of several readings make one view."""
+    monkeypatch.setitem(TOUCH.builtin, "taxels", taxel_array.ENTRY)
+    skin = [
+        Entry("/skin", "std_msgs/msg/Float32MultiArray", time + row, {"data": np.full(66, 0.1 + 0.01 * row)})
+        for row, time in enumerate(range(START, TIMES[-1], STEP // 5))
+    ]
+    entries = sorted([*WHEELS, *skin], key=lambda entry: entry.time)
+    source = read(entries, touch={"topic": "/skin", "rows": 3, "columns": 22}, samples="views")
+    frontend = {"plugin": "taxels", "settings": {"frames": 10}}
+    made = list(open_touch_source(source, TouchConfig.model_validate({"frontend": frontend})))
+    assert [float(sample.reading.view.max()) for sample in made] == pytest.approx(
+        [0.19, 0.29, 0.39, 0.49, 0.59]
+    )
+    assert sum(float(sample.reading.odometry.dtheta) for sample in made) == pytest.approx(
+        0.05 * 9.8, abs=1e-3
+    )
+
+
+def test_a_missing_library_is_named(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(InputError, match=r"rosbags: not installed; pip install 'ratslam\[ros\]'"):
+        read(WHEELS)
