@@ -125,4 +125,5 @@ class TopicsConfig(Settings):
     """What makes a sample: each odometry message, with the nearest view; or each view (or touch reading),
     with the odometry interpolated to its time, for views faster than the odometry."""
     body: str | None = None
-    """Frame of the robot, in which sensors are mounted; null: the child frame of the odometry."""
+    """Frame of the robot, in which sensors are mounted; null: the child frame of the odometry, else
+    base_link or base_footprint."""

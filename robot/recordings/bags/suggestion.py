@@ -20,11 +20,12 @@ from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.motions import ODOMETRY
 from robot.recordings.bags.scans import CLOUD, SCAN
 from robot.recordings.bags.touch import JOINTS
+from robot.recordings.bags.transforms import BODIES
 
 TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
 """Names of topics and frames with true poses."""
-ROOTS, BODIES = ("odom",), ("base_link", "base_footprint")
-"""Frames whose link in /tf is odometry."""
+ROOT = "odom"
+"""Frame whose link to the robot in /tf is odometry."""
 LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
 SECTORS = 18  # of a view by default
 FASTER = 1.2  # times the odometry's rate: views beyond are the samples
@@ -65,7 +66,7 @@ def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any,
     best = best or _first(bag, "odometry", others)
     if best is None:
         for link in bag.links:
-            if not link.fixed and link.total > 1 and link.parent in ROOTS and link.child in BODIES:
+            if not link.fixed and link.total > 1 and link.parent == ROOT and link.child in BODIES:
                 return {"tf": [link.parent, link.child]}, None
         return None, None
     shape = best.shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from itertools import compress
 from typing import NamedTuple
 
@@ -23,6 +24,8 @@ from robot.sources.input_files import missing_error
 from tactile.base.errors import InputError
 
 STATIC, MOVING = "/tf_static", "/tf"
+BODIES = ("base_link", "base_footprint")
+"""Usual names of the robot's frame."""
 
 
 class Link(NamedTuple):
@@ -39,6 +42,7 @@ class Link(NamedTuple):
 
 
 Links = dict[tuple[str, str], Link]
+Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
 
 
 class Mount(NamedTuple):
@@ -53,30 +57,33 @@ class Mount(NamedTuple):
 
 
 def read_links(bag: Bag, name: str, clock: Clock) -> Links:
-    """All links on a topic; of fixed links (`/tf_static`) the last transform."""
+    """All links on /tf or /tf_static, in any namespace; of fixed links (`/tf_static`) the last transform.
+
+    Raises:
+        InputError: the bag is damaged, or a rotation is 0.
+    """
     links: Links = {}
-    if name not in bag.topics or not bag.topics[name].total:
-        return links
-    topic = bag.topics[name]
-    if topic.kind not in TRANSFORMS:
-        raise InputError(f"{bag.path}, {name}", f"messages of type {topic.kind}", f"{sorted(TRANSFORMS)[-1]}")
-    for number, received, content in read_messages(bag, topic, "bag"):
-        for each in content.transforms:
-            frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-            move, turn = each.transform.translation, each.transform.rotation
-            pose_in_plane(move, turn, f"{bag.path}, {name} message {number}, {frames[0]} to {frames[1]}")
-            link = links.setdefault(frames, Link([], [], [], []))
-            if name == STATIC:
-                for part in link:
-                    part.clear()
-            link.stamps.append(nanoseconds(each.header.stamp) if clock == "header" else received)
-            link.shifts.append((float(move.x), float(move.y), float(move.z)))
-            link.turns.append((float(turn.x), float(turn.y), float(turn.z), float(turn.w)))
-            link.numbers.append(number)
+    for topic in bag.topics.values():
+        if topic.kind not in TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
+            continue
+        where = f"{bag.path}, {topic.name}"
+        for number, received, content in read_messages(bag, topic, "bag"):
+            for each in content.transforms:
+                frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+                move, turn = each.transform.translation, each.transform.rotation
+                pose_in_plane(move, turn, f"{where}, message {number}, {frames[0]} to {frames[1]}")
+                link = links.setdefault(frames, Link([], [], [], []))
+                if name == STATIC:
+                    for part in link:
+                        part.clear()
+                link.stamps.append(nanoseconds(each.header.stamp) if clock == "header" else received)
+                link.shifts.append((float(move.x), float(move.y), float(move.z)))
+                link.turns.append((float(turn.x), float(turn.y), float(turn.z), float(turn.w)))
+                link.numbers.append(number)
     return links
 
 
-def chain_between(links: Links, parent: str, child: str) -> list[tuple[tuple[str, str], bool]] | None:
+def chain_between(links: Links, parent: str, child: str) -> Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
     neighbours: dict[str, list[tuple[str, tuple[str, str], bool]]] = {}
     for upper, lower in links:
@@ -101,21 +108,30 @@ def chain_between(links: Links, parent: str, child: str) -> list[tuple[tuple[str
 
 def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     """The mount of a sensor's frame on a robot's; None if the bag does not say. Links that only /tf has are
-    taken as they are at first."""
-    body, sensor = body.lstrip("/"), sensor.lstrip("/")
-    if body == sensor:
+    taken as they are at first.
+
+    Args:
+        body: frame of the robot; '': the first of `BODIES` that leads to the sensor.
+    """
+    bodies, sensor = (body.lstrip("/"),) if body else BODIES, sensor.lstrip("/")
+    if sensor in bodies:
         return Mount(np.eye(3), np.zeros(3))
     links = read_links(bag, STATIC, clock)
-    chain = chain_between(links, body, sensor)
+    chain = _first_chain(links, bodies, sensor)
     if chain is None:
         links = read_links(bag, MOVING, clock) | links
-        chain = chain_between(links, body, sensor)
+        chain = _first_chain(links, bodies, sensor)
     if chain is None:
         return None
     whole = np.eye(4)
     for frames, down in chain:
         whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
     return Mount(whole[:3, :3], whole[:3, 3])
+
+
+def _first_chain(links: Links, bodies: Sequence[str], sensor: str) -> Chain | None:
+    chains = (chain_between(links, body, sensor) for body in bodies)
+    return next((chain for chain in chains if chain is not None), None)
 
 
 def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Report) -> Series:

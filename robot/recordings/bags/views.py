@@ -121,7 +121,7 @@ def _mount(bag: Bag, config: ViewsTopic, body: str, content: Any, clock: Clock, 
         c, s = np.cos(config.yaw), np.sin(config.yaw)
         return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     sensor = content.header.frame_id
-    mount = mount_of(bag, body, sensor, clock) if body and sensor else None
+    mount = mount_of(bag, body, sensor, clock) if sensor else None
     if mount is not None:
         return mount
     if not hasattr(content, "ranges") or is_ring(content):

@@ -1,7 +1,7 @@
 """Views from images: a crop of the grey image, reduced by block means to a few values in 0..1.
 
-The first step of a view template (Ball et al. 2013, section 3). Normalisation of the values is the second step,
-which `templates` of a run does for every kind of view.
+The first step of a view template (Ball et al. 2013, section 3). The second, normalisation of the values, is
+done by `templates` of a run for every kind of view.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Crop(Settings):
 
 
 class ImageViewConfig(Settings):
-    """How an image becomes a view; `templates.normalise_mean` and `templates.patch` normalise its exposure."""
+    """How an image becomes a view; its exposure is normalised by `templates`, as that of every view."""
 
     crop: Crop = Crop()
     """The part of the image that is seen; leave out the robot itself and featureless floor and sky."""
@@ -57,8 +57,8 @@ def cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
 def image_view(config: ImageViewConfig, grey: np.ndarray, where: str = "image") -> np.ndarray:
     """The view [R, C, 1] of an image [H, W] uint8: block means of the crop, 0 black to 1 white.
 
-    Where rows or columns do not divide the crop, blocks differ by one pixel; every pixel counts once. Sums are
-    of integers, hence exact.
+    Where rows or columns do not divide the crop, blocks differ by one pixel; every pixel counts once. Sums
+    are of integers, hence exact.
 
     Raises:
         InputError: the crop is not a part of the image, or has fewer pixels than the view along one axis.

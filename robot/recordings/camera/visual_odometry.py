@@ -1,8 +1,9 @@
 """Odometry from a camera alone, by the change of two intensity profiles.
 
-A profile is the mean of each column of a crop, divided by the profile's mean, so that exposure cancels out. The
-shift between consecutive profiles is the turn; what differs after the best shift is the way (Milford & Wyeth
-2008). Nothing fixes the scale of the way: its unit is the VO metre, `scaling` of them for a difference of 1.
+A profile is the mean of each column of a crop, divided by the profile's mean, so that exposure cancels out.
+The shift between consecutive profiles is the turn; what differs after the best shift is the distance
+(Milford & Wyeth 2008). Nothing fixes the scale of distances: they are in VO metres, `scaling` of them for a
+difference of 1.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from tactile.base.config import Settings
 
 
 class VisualOdometryConfig(Settings):
-    """Visual odometry, for recordings with images and without odometry. Distances are in VO metres, whose length
-    is unknown unless `scaling` was calibrated."""
+    """Visual odometry, for recordings with images and without odometry. Its distances are in VO metres, of
+    unknown length unless `scaling` was calibrated."""
 
     fov_deg: float = Field(gt=0, le=360)
     """Horizontal field of view of the whole image, degrees; 360: a panorama, whose columns form a ring."""

@@ -286,3 +286,29 @@ def test_a_missing_library_is_named(read: Read, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(InputError, match=r"rosbags: not installed; pip install 'ratslam\[ros\]'"):
         read(WHEELS)
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("topic", ["/tf_static", "/robot/tf_static", "/tf"])
+def test_a_ring_is_mounted_by_the_frames(named: bool, topic: str, read: Read) -> None:
+    """A laser that looks to the left, on a plate on the robot; something near is on its axis."""
+    wheels = [entry._replace(fields=dict(entry.fields)) for entry in WHEELS]
+    for entry in wheels:
+        entry.fields["child_frame_id"] = "/base_link" if named else ""
+    step = 2 * np.pi / 360
+    ranges = np.full(360, 4.0)
+    ranges[140:220] = 1.0
+    scans = [scan(time, ranges, -np.pi, step) for time in TIMES]
+    links = tf(
+        START,
+        transform(START, "base_link", "plate", 0.1, 0.0, quaternion(np.pi / 4)),
+        transform(START, "plate", "laser", 0.1, 0.0, quaternion(np.pi / 4)),
+        topic=topic,
+    )
+    entries = sorted([links, *wheels, *scans], key=lambda entry: entry.time)
+    view = {"topic": "/scan", "rows": 1, "columns": 4, "max_range": 4.0}
+    assert np.flatnonzero(read(entries, views=view).views[3].ravel() < 0.9).tolist() == [2, 3]
+    told: list[str] = []
+    other = read(entries, "ros1", told, views=view, body="somewhere")
+    assert np.flatnonzero(other.views[3].ravel() < 0.9).tolist() == [1, 2]
+    assert "no transform from somewhere to laser" in told[0]
