@@ -124,10 +124,13 @@ class Bag:
             chosen = [each for each in reader.connections if each.topic == topic.name]
             if chosen:
                 parts.append(reader.messages(chosen))
+        time = None
         for _, time, raw in merge(*parts, key=lambda entry: entry[1]):
             if not 0 <= time < 1 << 63:
                 raise ValueError(f"a message received at {time} ns")
             yield int(time), raw
+        if time is None:
+            raise ValueError(f"{topic.total} messages of {topic.name} are listed, and none is there")
 
     def _check_type(self, topic: Topic) -> None:
         where = f"{self.path}, {topic.name}"

@@ -27,9 +27,9 @@ class Topic(Settings):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        schema = handler.resolve_ref_schema(handler(core))
-        schema["type"] = ["object", "string"]
-        return handler(core)
+        schema = handler(core)
+        handler.resolve_ref_schema(schema)["type"] = ["object", "string"]
+        return schema
 
 
 class PoseTopic(Topic):

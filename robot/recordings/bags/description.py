@@ -163,6 +163,7 @@ class BagDescription(NamedTuple):
     links: tuple[FrameLink, ...]
 
 
+@np.errstate(all="ignore")  # numbers may be any
 def describe_bag(path: Path) -> BagDescription:
     """Reads the whole bag; faults of a single topic are described, not raised.
 

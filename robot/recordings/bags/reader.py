@@ -30,6 +30,7 @@ from tactile.base.errors import InputError
 NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
 
 
+@np.errstate(all="ignore")  # what is no number, or far too large, is reported
 def read_bag(
     path: Path,
     config: TopicsConfig,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from ratslam.__main__ import main
+from robot.recordings.bags.description import describe_bag
+from robot.recordings.bags.suggestion import suggested_topics
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.source import Source
 from tactile.base.errors import InputError
@@ -226,12 +229,14 @@ FUZZED = ("ros1", "ros1-bz2", "ros1-lz4", "sqlite3", "mcap", "mcap-storage")
 def test_damaged_bags_are_refused_or_read(
     kind: str, rounds: int, tmp_path: Path, little_memory: None
 ) -> None:
-    """Whatever is read is a recording; most damage is found."""
+    """Whatever is read is a recording; most damage is found. Descriptions are made or refused alike."""
     path = written(tmp_path, kind)
     file = path if path.is_file() else next(each for each in path.iterdir() if each.suffix != ".yaml")
     content, random, read = file.read_bytes(), np.random.default_rng(len(kind)), 0
     for _ in range(rounds):
         file.write_bytes(damaged(content, random))
+        with suppress(InputError):
+            suggested_topics(describe_bag(path))
         try:
             source = opened(path)
         except InputError:

@@ -46,6 +46,7 @@ def trajectory(name: str, out: Path, recording: dict[str, Any]) -> np.ndarray:
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_maps_are_those_of_the_table_to_the_bit(
     name: str, reference_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
