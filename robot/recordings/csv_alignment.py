@@ -86,7 +86,7 @@ def _labels_of_file(base: CsvFile, file: CsvFile, part: PairColumns, time: np.nd
     if errors:
         return later, later, errors
     moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = _each_nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    rows, errors = each_nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
     return rows, ids, errors
 
 
@@ -120,18 +120,21 @@ def labels_from_pairs(
 
 
 def align_truth(
-    base: CsvFile, files: Mapping[Path, CsvFile], part: TruthColumns, time: np.ndarray, limits: UnitLimits
+    file: CsvFile, part: TruthColumns, time: np.ndarray, limits: UnitLimits, same_rows: bool
 ) -> tuple[np.ndarray, list[InputError]]:
-    """True poses [N, 3] at the odometry rows, NaN outside the time span of the truth."""
-    file = files[part.file or base.path]
+    """True poses [N, 3] at times [N] s, NaN outside the time span of the truth.
+
+    Args:
+        file: that of the truth. same_rows: its rows are those of `time`.
+    """
     names = (part.x, part.y, part.heading)
     errors = file.faults(*names)
     truth = np.column_stack([file.column(name) for name in names])
-    moments = time if file is base else file.column(part.time)
+    moments = time if same_rows else file.column(part.time)
     if faults := heading_errors(truth[:, 2], moments, part.heading, str(file.path), limits):
         errors += faults
         truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would report it again
-    if file is base:
+    if same_rows:
         return truth, errors
     errors += file.faults(part.time) + clock_errors(moments, part.time, file.place)
     if errors:
@@ -149,7 +152,7 @@ def _match_rows(
     moments = file.column(name)[there]
     place = _place(file, there)
     errors = nonfinite_errors(moments, name, place) + clock_errors(moments, name, place)
-    return (there, errors) if errors else _each_nearest(moments, time, tolerance, place)
+    return (there, errors) if errors else each_nearest(moments, time, tolerance, place)
 
 
 def _place(file: CsvFile, there: np.ndarray) -> RowName:
@@ -157,10 +160,15 @@ def _place(file: CsvFile, there: np.ndarray) -> RowName:
     return lambda row: file.place(int(there[row]))
 
 
-def _each_nearest(
+def each_nearest(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
 ) -> tuple[np.ndarray, list[InputError]]:
-    """The odometry row nearest in time to each of the times [M], at most the tolerance away; each once."""
+    """The odometry row nearest in time to each of the times [M], at most the tolerance away; each once.
+
+    Args:
+        moments: [M] s, increasing. time: [N] s, of the odometry rows. tolerance: s; None: the median step.
+        place: names a row of `moments` in errors.
+    """
     found = nearest_rows(moments, time, tolerance)
     if found is None:
         return np.zeros(len(moments), int), []  # the error of the clock is already reported

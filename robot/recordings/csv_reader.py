@@ -49,7 +49,8 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
         if not faults:
             recording.label[rows] = values
     if config.truth is not None:
-        recording.truth, faults = align_truth(base, files, config.truth, time, limits)
+        file = files[config.truth.file or path]
+        recording.truth, faults = align_truth(file, config.truth, time, limits, file is base)
         recording.errors += faults
     return recording.source(path.stem, digest_of_files(list(files.values())), str(path), limits)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from robot.recordings.bags.config import TopicsConfig
 from robot.recordings.camera.image_view import ImageViewConfig
+from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
+from robot.recordings.camera.video import VideoConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
@@ -22,12 +24,14 @@ class RecordingConfig(Settings):
     """A recording to run on."""
 
     file: Path
-    """The recording: `.mcap` (written by ratslam), `.npz` (reference trace), `.csv` (odometry) or a bag:
-    `.bag`, `.db3`, `.mcap` or a folder."""
+    """The recording: `.mcap` (of ratslam), `.npz` (reference trace), `.csv` (odometry), a bag (`.bag`,
+    `.db3`, `.mcap`, a folder) or a video (`.mp4`, `.avi`, `.mkv`, `.mov`, `.webm`)."""
     table: CsvConfig = CsvConfig()
-    """Columns of a `.csv` recording."""
+    """Columns of a `.csv` recording, or of the odometry and truth beside a video."""
     topics: TopicsConfig | None = None
     """Topics of a bag."""
+    video: VideoConfig = VideoConfig()
+    """Times and odometry of a video."""
     image: ImageViewConfig = ImageViewConfig()
     """How images become views."""
     visual_odometry: VisualOdometryConfig | None = None
@@ -38,8 +42,8 @@ class RecordingConfig(Settings):
     def resolved(self, folder: Path) -> RecordingConfig:
         """A copy with absolute paths; relative ones start at `folder`.
 
-        One `*` in the file name of a part of the table stands for the beginning of the recording's file name:
-        beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
+        One `*` in the file name of a part of the table or of the video stands for the beginning of the
+        recording's file name: beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
         """
         recording = folder / self.file
         parts = {
@@ -47,8 +51,13 @@ class RecordingConfig(Settings):
             for key in ("views", "labels", "pairs", "truth")
             if (part := getattr(self.table, key)) is not None and part.file is not None
         }
-        table = self.table.model_copy(update=parts)
-        return self.model_copy(update={"file": recording, "table": table})
+        beside = {
+            key: _companion(recording, folder, file)
+            for key in ("stamps", "odometry")
+            if (file := getattr(self.video, key)) is not None
+        }
+        table, video = self.table.model_copy(update=parts), self.video.model_copy(update=beside)
+        return self.model_copy(update={"file": recording, "table": table, "video": video})
 
 
 def _companion(recording: Path, folder: Path, file: Path) -> Path:
@@ -99,12 +108,19 @@ def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
     return read_csv_recording(config.file, config.table, config.limits)
 
 
+def _open_video(config: RecordingConfig, warn: Warn) -> Source:
+    from robot.recordings.camera.video_recording import read_video
+
+    return read_video(config, warn)
+
+
 FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
     ".mcap": _open_mcap,
     ".npz": _open_npz,
     ".csv": _open_csv,
     ".bag": _open_bag,
     ".db3": _open_bag,
+    **dict.fromkeys(VIDEO_SUFFIXES, _open_video),
 }
 
 

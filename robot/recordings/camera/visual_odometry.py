@@ -22,11 +22,13 @@ class VisualOdometryConfig(Settings):
     unknown length unless `scaling` was calibrated."""
 
     fov_deg: float = Field(gt=0, le=360)
-    """Horizontal field of view of the whole image, degrees; 360: a panorama, whose columns form a ring."""
+    """Horizontal field of view of the whole image, degrees, taken as equal angles for all columns; 360: a
+    panorama, whose columns form a ring."""
     rotation: Crop = Crop()
-    """The part of the image from which turns are found: far things, such as the horizon."""
+    """The part of the image from which turns are found. Best are far things straight ahead: what passes at
+    the sides moves against the turn or with it."""
     translation: Crop = Crop()
-    """The part of the image from which distances are found: near things, such as the ground."""
+    """The part of the image from which distances are found: near things, at the sides and on the ground."""
     scaling: PositiveFloat = 1.0
     """Distance for a mean profile difference of 1, VO metres."""
     max_speed: PositiveFloat = 5.0
@@ -35,18 +37,19 @@ class VisualOdometryConfig(Settings):
     """Largest turn rate, degrees/s: shifts between frames are searched up to this rate."""
 
 
-class Profiles(NamedTuple):
-    """The intensity profiles of a frame.
+class Profile(NamedTuple):
+    """Intensities [w] with mean 1 of the columns of a crop, and whether the columns form a ring."""
 
-    Attributes:
-        rotation: [w] profile of the rotation crop. translation: [v] of the translation crop.
-        pixel_angle: rad by one column. ring: the columns form a ring.
-    """
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    pixel_angle: float
+    values: np.ndarray
     ring: bool
+
+
+class Profiles(NamedTuple):
+    """The two profiles of a frame, and the angle of one column, rad."""
+
+    rotation: Profile
+    translation: Profile
+    pixel_angle: float
 
 
 def profiles(config: VisualOdometryConfig, grey: np.ndarray, where: str = "image") -> Profiles:
@@ -55,43 +58,54 @@ def profiles(config: VisualOdometryConfig, grey: np.ndarray, where: str = "image
     Raises:
         InputError: a crop is not a part of the image.
     """
-    width = grey.shape[1]
-    rotation = cropped(config.rotation, grey, where, "visual_odometry.rotation")
-    translation = cropped(config.translation, grey, where, "visual_odometry.translation")
-    ring = config.fov_deg == 360 and rotation.shape[1] == translation.shape[1] == width
-    return Profiles(_profile(rotation), _profile(translation), np.deg2rad(config.fov_deg) / width, ring)
+    rotation = _profile(config, "rotation", grey, where)
+    translation = _profile(config, "translation", grey, where)
+    return Profiles(rotation, translation, float(np.deg2rad(config.fov_deg)) / grey.shape[1])
 
 
 def motion_between(
     config: VisualOdometryConfig, before: Profiles, after: Profiles, dt: float
 ) -> tuple[float, float]:
     """Distance (VO metres) and turn (rad, counter-clockwise) between two frames that lie `dt` s apart."""
-    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * max(dt, 0.0) / after.pixel_angle))
-    shift, _ = _best_shift(before.rotation, after.rotation, reach, after.ring)
-    _, change = _best_shift(before.translation, after.translation, reach, after.ring)
-    distance = min(config.scaling * change, config.max_speed * max(dt, 0.0))
-    return distance, shift * after.pixel_angle
+    dt = max(dt, 0.0)  # of stamps that go back, which the reader reports
+    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * dt / after.pixel_angle))
+    shift, _ = _best_shift(before.rotation, after.rotation, reach)
+    _, change = _best_shift(before.translation, after.translation, reach)
+    return min(config.scaling * change, config.max_speed * dt), shift * after.pixel_angle
 
 
-def _profile(part: np.ndarray) -> np.ndarray:
-    """[w] column sums of a crop [h, w], divided by their mean; ones if it is black."""
+def _profile(config: VisualOdometryConfig, name: str, grey: np.ndarray, where: str) -> Profile:
+    part = cropped(getattr(config, name), grey, where, f"visual_odometry.{name}")
     sums = part.sum(axis=0, dtype=np.int64)
     total = int(sums.sum())
-    return sums * (len(sums) / total) if total else np.ones(len(sums))
+    values = sums * (len(sums) / total) if total else np.ones(len(sums))
+    return Profile(values, config.fov_deg == 360 and len(sums) == grey.shape[1])
 
 
-def _best_shift(before: np.ndarray, after: np.ndarray, reach: int, ring: bool) -> tuple[float, float]:
-    """The shift (columns to the right) of the least mean absolute difference, and that difference.
+def _best_shift(before: Profile, after: Profile, reach: int) -> tuple[float, float]:
+    """The shift of the least mean absolute difference, in columns to the right, and that difference.
 
     Things move to the right in the image where the camera turns counter-clockwise.
     """
-    width = len(after)
+    width = len(after.values)
     reach = min(reach, width // 2)
     shifts = np.arange(-reach, reach + 1)
     columns = np.arange(width)[None, :] - shifts[:, None]  # where each column was before
-    inside = (columns >= 0) & (columns < width) | ring
-    difference = np.abs(after - before[columns % width])
+    inside = (columns >= 0) & (columns < width) | after.ring
+    difference = np.abs(after.values - before.values[columns % width])
     errors = np.sum(difference, axis=1, where=inside) / inside.sum(axis=1)
-    order = np.lexsort((np.abs(shifts), errors))  # of equal errors the smallest shift
-    best = int(order[0])
-    return float(shifts[best]), float(errors[best])
+    best = int(np.lexsort((np.abs(shifts), errors))[0])  # of equal errors the smallest shift
+    return float(shifts[best]) + _vertex(errors, best), float(errors[best])
+
+
+def _vertex(errors: np.ndarray, best: int) -> float:
+    """Position of the minimum between columns, -0.5 to 0.5 from `best`.
+
+    An absolute difference rises on both sides of its minimum with equal slope: the vertex of that V,
+    through the least error and its neighbours.
+    """
+    if not 0 < best < len(errors) - 1:
+        return 0.0
+    left, least, right = errors[best - 1 : best + 2].tolist()
+    rise = max(left, right) - least
+    return (left - right) / (2 * rise) if rise > 0 else 0.0

@@ -1,0 +1,130 @@
+"""A video as a recording: views of its frames, with odometry from a CSV file or from the frames
+themselves."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot.recordings.camera.rows import camera_rows
+from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
+from robot.recordings.csv_alignment import align_truth, each_nearest
+from robot.recordings.csv_config import CsvConfig
+from robot.recordings.csv_file import CsvFile, read_csv
+from robot.recordings.csv_reader import ODOMETRY, read_csv_recording
+from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import digest_of, raise_errors, require_file
+from robot.sources.registry import Warn
+from tactile.base.errors import InputError
+
+if TYPE_CHECKING:
+    from robot.recordings.formats import RecordingConfig
+
+BLOCK = 1 << 20  # bytes of a video read at once for its hash
+
+
+def read_video(config: RecordingConfig, warn: Warn = None) -> InMemorySource:
+    """A video as a `Source`: one sample per frame, or per odometry row where there is odometry.
+
+    Raises:
+        InputError: the video or a file beside it cannot be read, settings contradict each other, or times do
+            not fit.
+    """
+    path, video = config.file, config.video
+    require_file(path)
+    raise_errors(_contradictions(config))
+    wheels = None
+    if video.odometry is not None:
+        wheels = read_csv_recording(video.odometry, config.table, config.limits)
+    stamps = read_csv(video.stamps) if video.stamps is not None else None
+    if stamps is not None:
+        raise_errors(stamp_errors(stamps, video.time))
+    visual = config.visual_odometry if wheels is None else None
+    rows = camera_rows(video_frames(path, video, stamps, warn), config.image, visual, str(path))
+    digest = _digest(path, stamps)
+    if wheels is not None:
+        source = replace(wheels, name=path.stem, digest=digest_of([digest.encode(), wheels.digest.encode()]))
+        return _with_views(source, rows.time, rows.view, video, str(path))
+    assert rows.motion is not None  # `_contradictions` requires visual odometry
+    truth = _truth(config.table, rows.time, config.limits)
+    everywhere = np.ones(len(rows.time), bool)
+    # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
+    raise_errors(unit_errors(MotionTrack(rows.time, everywhere, rows.motion, None), str(path), config.limits))
+    return InMemorySource(
+        name=path.stem,
+        digest=digest,
+        time=rows.time,
+        motion=rows.motion,
+        moved=everywhere,
+        views=rows.view,
+        seen=everywhere,
+        label=np.full(len(rows.time), -1, np.int32),
+        truth=truth,
+    )
+
+
+def _contradictions(config: RecordingConfig) -> list[InputError]:
+    """Errors for settings that exclude or need each other."""
+    video, table, where = config.video, config.table, str(config.file)
+    errors = []
+    if video.rate is not None and video.stamps is not None:
+        errors.append(InputError(where, "both video.rate and video.stamps are given", "one of them"))
+    if table.views is not None:
+        found = "table.views is given, and the video has views"
+        errors.append(InputError(where, found, "views from one of them"))
+    if video.odometry is not None:
+        return errors
+    if config.visual_odometry is None:
+        cure = (
+            "set visual_odometry.fov_deg to the camera's horizontal field of view, or video.odometry to a CSV"
+        )
+        errors.append(InputError(where, "no odometry", "visual odometry or wheel odometry", cure))
+    given = [key for key in (*ODOMETRY, "labels", "pairs") if getattr(table, key) is not None]
+    if given:
+        found = f"table.{given[0]} is given, but no file that has it"
+        errors.append(InputError(where, found, "the CSV file in video.odometry"))
+    if table.truth is not None and table.truth.file is None:
+        errors.append(InputError(where, "table.truth names no file", "a CSV file in table.truth.file"))
+    return errors
+
+
+def _with_views(
+    source: InMemorySource, time: np.ndarray, view: np.ndarray, video: VideoConfig, where: str
+) -> InMemorySource:
+    """The odometry rows, each with the view of the frame nearest in time."""
+
+    def place(row: int) -> str:
+        return f"{where}, frame {row * video.every}"
+
+    rows, errors = each_nearest(time, source.time, video.tolerance, place)
+    raise_errors(errors)
+    views, seen = np.zeros((source.length, *view.shape[1:])), np.zeros(source.length, bool)
+    views[rows], seen[rows] = view, True
+    return replace(source, views=views, seen=seen)
+
+
+def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits) -> np.ndarray | None:
+    if table.truth is None or table.truth.file is None:
+        return None
+    file = read_csv(table.truth.file)
+    part = table.truth
+    named = {key: getattr(part, key) for key in ("time", "x", "y", "heading")}
+    raise_errors(file.absences([(column, f"table.truth.{key}") for key, column in named.items()]))
+    truth, errors = align_truth(file, part, time, limits, same_rows=False)
+    raise_errors(errors)
+    return truth
+
+
+def _digest(path: Path, stamps: CsvFile | None) -> str:
+    """SHA-256 (hex) of the video and its stamps."""
+    total = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(BLOCK):
+            total.update(block)
+    total.update(stamps.content if stamps is not None else b"")
+    return total.hexdigest()
