@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -29,6 +30,15 @@ def add_commands(commands: Commands) -> None:
         help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
         "experiences, .yaml nav2 map; a name without a suffix becomes a ROS 2 bag folder",
     )  # fmt: skip
+    convert = commands.add(
+        "convert", _convert, "turn an OpenRatSLAM parameter file into a configuration",
+        "convert config_irat.txt --recording irat_red.bag -o irat.yaml", "files",
+    )  # fmt: skip
+    convert.add_argument("parameters", type=Path, metavar="INI", help="the parameter file")
+    convert.add_argument(
+        "--recording", type=Path, metavar="FILE", help="the bag or video to map (default ROOT.bag)"
+    )
+    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help="write to a file instead")
 
     schema = commands.add(
         "schema", _schema, "print the JSON schema of configurations, for editors",
@@ -61,6 +71,21 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.run, arguments.output, lambda text: print(f"ratslam: warning: {text}", file=sys.stderr)
     )
     print(f"{arguments.output}: written")
+def _convert(arguments: argparse.Namespace) -> int:
+    from ratslam.config.openratslam import convert_parameters
+    from ratslam.config.strict_yaml import dump_data
+
+    output, recording = arguments.output, arguments.recording
+    if recording is not None and output is not None and not recording.is_absolute():
+        recording = Path(os.path.relpath(recording, output.parent))  # paths in a file start at its folder
+    converted = convert_parameters(arguments.parameters, recording)
+    for note in converted.notes:
+        print(f"note: {note}", file=sys.stderr)
+    text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(converted.settings)
+    if output:
+        output.write_text(text, encoding="utf-8")
+    else:
+        print(text, end="")
     return 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-PresetName = Literal["touch", "arm", "create"]
+PresetName = Literal["touch", "arm", "create", "visual_odometry"]
 
 PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # Salman & Pearson 2016, III-C: the odometry of their arm, in pose cells of 5 cm; many whisker images look
@@ -48,6 +48,14 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "drift": {"session": 0.0, "move": 0.0, "step": 0.27, "heading": 2e-3},
             "footprint": {"blob_sd": 0.015, "along": 0.05, "across": 0.015},
         }
+    },
+    # Distances from images vary with what is near: in a rendered corridor by a third from frame to frame
+    # (robot/recordings/camera/README.md). Patch normalisation is that of RatSLAM (Ball et al. 2013).
+    "visual_odometry": {
+        "templates": {"patch": 2},
+        "keyframes": {
+            "noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1},
+        },
     },
     # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
     "create": {},

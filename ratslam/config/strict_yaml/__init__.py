@@ -122,8 +122,12 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 def dump(model: BaseModel) -> str:
     """The model as YAML that `load` and `validate` turn into an equal model."""
-    data = _escape(model.model_dump(mode="json"))
-    return yaml.dump(data, Dumper=Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return dump_data(model.model_dump(mode="json"))
+
+
+def dump_data(data: dict[str, Any]) -> str:
+    """Nested settings as YAML that `load` turns into the same settings."""
+    return yaml.dump(_escape(data), Dumper=Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
 def schema(model: type[BaseModel]) -> dict[str, Any]:
