@@ -82,7 +82,7 @@ def test_the_irat_becomes_a_configuration(write, tmp_path: Path, capsys) -> None
     assert settings["recording"] == {
         "file": "irat_red.bag",
         "image": {
-            "crop": {"x_min": 0, "x_max": None, "y_min": 0, "y_max": 150},
+            "crop": {"x_min": 0, "y_min": 0, "y_max": 150},
             "rows": 20,
             "columns": 60,
         },

@@ -1,0 +1,116 @@
+"""A camera alone, from a video to a map by the command `run`: a rendered corridor loop with known truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+
+from evaluation.metrics.trajectory import read_tum
+from ratslam.cli import main
+from tests.helpers.corridor_camera import Camera, CorridorLoop, write_csv, write_video
+
+# The parts of the image that look ahead (turns) and at near things (distances), as shares of it.
+CROPS = {
+    60: {"rotation": (0, 1, 180 / 480, 300 / 480), "translation": (0, 1, 0.5, 1)},
+    360: {
+        "rotation": (260 / 640, 380 / 640, 150 / 480, 330 / 480),
+        "translation": (0, 1, 150 / 480, 330 / 480),
+    },
+}
+
+
+class Errors(NamedTuple):
+    """Errors after the best similarity of each path to the truth: m, m; heading of the odometry at the end,
+    rad."""
+
+    odometry: float
+    trajectory: float
+    drift: float
+
+
+def crop(camera: Camera, shares: tuple[float, float, float, float]) -> dict[str, int]:
+    sizes = camera.width, camera.width, camera.height, camera.height
+    names = ("x_min", "x_max", "y_min", "y_max")
+    return {name: round(share * size) for name, share, size in zip(names, shares, sizes, strict=True)}
+
+
+def write_loop(folder: Path, world: CorridorLoop, camera: Camera, name: str, codec: str = "MJPG") -> Path:
+    """A video of the loop with truth and wheel odometry beside it, and the configuration that maps it."""
+    time, pose = world.truth
+    write_video(folder / name, camera.frames(world), world.rate, codec)
+    write_csv(folder / "truth.csv", t=time, x=pose[:, 0], y=pose[:, 1], heading=pose[:, 2])
+    clock, speed, turn = world.wheels()
+    write_csv(folder / "wheels.csv", t=clock, vx=speed, w=turn)
+    visual = {key: crop(camera, shares) for key, shares in CROPS[int(camera.fov_deg)].items()}
+    config = {
+        "recording": {
+            "file": name,
+            "video": {"rate": world.rate},
+            "image": {"crop": crop(camera, (0, 1, 0.25, 0.75)), "rows": 12, "columns": 60},
+            "visual_odometry": {"fov_deg": camera.fov_deg, **visual},
+            "table": {"truth": {"file": "truth.csv"}},
+        },
+        "presets": ["visual_odometry"],
+        "pose_cells": {"cells_xy": 41, "cell_size": 0.25},
+    }
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def run_errors(config: Path, output: Path, *settings: str) -> Errors:
+    """Runs a configuration by the command, and the errors of its paths against the truth."""
+    options = [option for setting in settings for option in ("--set", setting)]
+    assert main(["run", str(config), "-o", str(output), *options]) == 0
+    (_, odometry), (_, path), (_, truth) = (
+        read_tum(output / f"{name}.tum") for name in ("odometry", "trajectory", "truth")
+    )
+    turned, true = (np.unwrap(pose[:, 2])[[0, -1]] @ [-1, 1] for pose in (odometry, truth))
+    return Errors(scale_free_error(odometry, truth), scale_free_error(path, truth), abs(turned - true))
+
+
+def scale_free_error(path: np.ndarray, truth: np.ndarray) -> float:
+    """RMS distance, m, of a path [N, 3] from the truth after rotation, translation and scaling of the
+    path."""
+    a, b = (pose[:, 0] + 1j * pose[:, 1] for pose in (path, truth))
+    a, b = a - a.mean(), b - b.mean()
+    return float(np.sqrt(np.mean(np.abs(np.vdot(a, b) / np.vdot(a, a) * a - b) ** 2)))
+
+
+def test_a_camera_alone_maps_a_small_loop(tmp_path: Path) -> None:
+    world = CorridorLoop(seed=7, length=5.0, depth=4.0, breadth=1.4, laps=1.9, rate=6.0)
+    config = write_loop(tmp_path, world, Camera(60, 160, 120), "loop.avi")
+    errors = run_errors(config, tmp_path / "run")
+    assert errors.odometry < 0.6
+    assert errors.drift < np.deg2rad(25)
+    assert errors.trajectory < errors.odometry * 1.1
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("exposure", [0.4, 1.0, 1.8])
+@pytest.mark.parametrize("fov_deg", [60, 360])
+def test_a_camera_alone_maps_a_loop(fov_deg: int, exposure: float, tmp_path: Path) -> None:
+    """With visual and with wheel odometry."""
+    world = CorridorLoop(seed=2, length=9.0, depth=5.5, breadth=1.8)
+    config = write_loop(tmp_path, world, Camera(fov_deg, exposure=exposure), "loop.avi")
+    alone = run_errors(config, tmp_path / "alone")
+    assert alone.odometry < 1.5
+    assert alone.trajectory < alone.odometry * 1.1
+    beside = ("recording.video.odometry=wheels.csv", "recording.table.velocity.forward=vx")
+    wheels = run_errors(config, tmp_path / "wheels", *beside, "presets=[]", "templates.patch=2")
+    assert wheels.trajectory < wheels.odometry * 1.1
+    assert wheels.trajectory < alone.trajectory * 1.1
+
+
+@pytest.mark.soak
+def test_codecs_give_the_same_map(tmp_path: Path) -> None:
+    world = CorridorLoop(seed=2, length=9.0, depth=5.5, breadth=1.8)
+    errors = [
+        run_errors(write_loop(tmp_path, world, Camera(60), name, codec), tmp_path / codec)
+        for name, codec in (("loop.avi", "MJPG"), ("loop.mp4", "mp4v"))
+    ]
+    assert errors[0] == pytest.approx(errors[1], abs=0.2)
