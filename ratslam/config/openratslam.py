@@ -108,15 +108,49 @@ def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
         InputError: the file cannot be read, or values are impossible; with file and line.
     """
     lines, parser = _read_ini(path)
+    values, notes = _read_values(path, lines, parser)
+    root = str(values.get("topic_root") or "").strip("/")
+    file = recording or Path(f"{root or 'recording'}.bag")
+    places: dict[KeyPath, Place] = {(): Place(f"{path}:", f"{path}:")}
+    settings: dict[str, Any] = {"recording": {"file": str(file)}, "backend": "classic"}
+    settings["experience"] = {"solver": {"name": "relaxation"}}
+    chosen = RATSLAM | (VISUAL_ODOMETRY if "camera_fov_deg" in values else {})
+    for key, parameter in chosen.items():
+        value = _converted(key, values, parameter)
+        section = "ratslam" if key in RATSLAM else "visual_odometry"
+        for setting in parameter.paths:
+            keys = tuple(setting.split("."))
+            if value is not None:
+                _put(settings, keys, value)
+            if key in values:
+                at = f"{path}:{lines[section, key]}: {key}:"
+                places[keys] = Place(at, at)
+    notes += _put_source(settings, file, root, values)
+    notes += _notes(values, settings)
+    validate(Document(settings, places), RunConfig)
+    return Converted(settings, notes)
+
+
+def _read_values(
+    path: Path, lines: Mapping[tuple[str, str], int], parser: configparser.ConfigParser
+) -> tuple[dict[str, Value], list[str]]:
+    """The values of the known parameters in a file, and notes about the others.
+
+    Raises:
+        InputError: the file has no section [ratslam], or values have the wrong type.
+    """
     values: dict[str, Value] = {}
     notes, errors = [], []
-    for section in parser.sections():
+    if not parser.has_section("ratslam"):
+        raise InputError(str(path), "no section [ratslam]", "a parameter file of OpenRatSLAM")
+    for section in (name for name in parser.sections() if name not in IGNORED):
         known = SECTIONS.get(section)
-        if known is None and section not in IGNORED:
+        if known is None:
             notes.append(f"[{section}] is unknown and ignored")
-        for key, text in parser.items(section) if known is not None else ():
+            continue
+        for key, text in parser.items(section):
             where = f"{path}:{lines[section, key]}"
-            if known is None or key not in known:
+            if key not in known:
                 notes.append(f"{where}: {key} in [{section}] is unknown and ignored")
                 continue
             try:
@@ -126,30 +160,7 @@ def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
             except ValueError as error:
                 errors.append(InputError(where, f"{key} = {text}", str(error)))
     raise_errors(errors)
-    if not parser.has_section("ratslam"):
-        raise InputError(str(path), "no section [ratslam]", "a parameter file of OpenRatSLAM")
-    root = str(values.get("topic_root") or "").strip("/")
-    file = recording or Path(f"{root or 'recording'}.bag")
-    places: dict[KeyPath, Place] = {(): Place(f"{path}:", f"{path}:")}
-    settings: dict[str, Any] = {"recording": {"file": str(file)}, "backend": "classic"}
-    settings["experience"] = {"solver": {"name": "relaxation"}}
-    chosen = dict(RATSLAM)
-    if values.get("camera_fov_deg") is not None:
-        chosen |= VISUAL_ODOMETRY
-    for key, parameter in chosen.items():
-        value = _converted(key, values, parameter)
-        section = "ratslam" if key in RATSLAM else "visual_odometry"
-        for setting in parameter.paths:
-            keys = tuple(setting.split("."))
-            if value is not None or key in values:
-                _put(settings, keys, value)
-            if key in values:
-                at = f"{path}:{lines[section, key]}: {key}:"
-                places[keys] = Place(at, at)
-    validate(Document(settings, places), RunConfig)
-    notes += _put_source(settings, file, root, values)
-    notes += _notes(values, settings)
-    return Converted(settings, notes)
+    return values, notes
 
 
 def _read_ini(path: Path) -> tuple[dict[tuple[str, str], int], configparser.ConfigParser]:

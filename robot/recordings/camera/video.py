@@ -104,7 +104,8 @@ def _grey(cv2: ModuleType, video: Any, where: str) -> np.ndarray:
 
 
 def _opencv() -> ModuleType:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it would print its own errors beside ours
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # or it prints its own errors beside ours
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     try:
         import cv2
     except ModuleNotFoundError:
