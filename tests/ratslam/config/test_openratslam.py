@@ -78,6 +78,7 @@ def test_the_irat_becomes_a_configuration(write, tmp_path: Path, capsys) -> None
     assert main(["convert", str(write(IRAT)), "-o", str(output)]) == 0
     notes = capsys.readouterr().err.splitlines()
     assert notes == ["note: exp_initial_em_deg has no counterpart: maps start at heading 0"]
+    assert load_config(output).backend == "classic"
     settings = yaml.safe_load(output.read_text())
     assert settings["recording"] == {
         "file": "irat_red.bag",
