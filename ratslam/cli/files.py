@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from ratslam.cli.common import Commands
+from tactile.base.atomic_write import write_text_atomically
 
 
 def add_commands(commands: Commands) -> None:
@@ -30,6 +31,7 @@ def add_commands(commands: Commands) -> None:
         help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
         "experiences, .yaml nav2 map; a name without a suffix becomes a ROS 2 bag folder",
     )  # fmt: skip
+
     convert = commands.add(
         "convert", _convert, "turn an OpenRatSLAM parameter file into a configuration",
         "convert config_irat.txt --recording irat_red.bag -o irat.yaml", "files",
@@ -71,6 +73,9 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.run, arguments.output, lambda text: print(f"ratslam: warning: {text}", file=sys.stderr)
     )
     print(f"{arguments.output}: written")
+    return 0
+
+
 def _convert(arguments: argparse.Namespace) -> int:
     from ratslam.config.openratslam import convert_parameters
     from ratslam.config.strict_yaml import dump_data
@@ -83,7 +88,7 @@ def _convert(arguments: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(converted.settings)
     if output:
-        output.write_text(text, encoding="utf-8")
+        write_text_atomically(output, text)
     else:
         print(text, end="")
     return 0
@@ -95,7 +100,7 @@ def _schema(arguments: argparse.Namespace) -> int:
 
     text = json.dumps(schema(RunConfig), indent=2) + "\n"
     if arguments.output:
-        arguments.output.write_text(text, encoding="utf-8")
+        write_text_atomically(arguments.output, text)
     else:
         print(text, end="")
     return 0
