@@ -1,4 +1,4 @@
-"""Puts the configurations, and the recording that one of them maps, into a wheel.
+"""Puts the configurations, the recording that one of them maps, and the citation into a wheel.
 
 They keep their places relative to each other, so that the relative paths inside them stay valid.
 """
@@ -8,7 +8,7 @@ from pathlib import Path
 from setuptools import Command, setup
 from setuptools.command.build import build
 
-FILES = ("configs/*.yaml", "tests/golden/a_square3.npz")
+FILES = ("configs/*.yaml", "tests/golden/a_square3.npz", "CITATION.cff")
 FOLDER = "ratslam/packaged"  # see ratslam/config/packaged.py
 
 

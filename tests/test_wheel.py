@@ -24,7 +24,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tree = tmp_path_factory.mktemp("tree")
     for name in (*PACKAGES, "configs", "tests/golden"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "CITATION.cff"):
         shutil.copy(ROOT / name, tree)
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", "."]
     done = subprocess.run(command, cwd=tree, capture_output=True, text=True)
@@ -62,6 +62,7 @@ def test_the_wheel_has_every_file(wheel: Path) -> None:
     }
     assert {f"{package}/py.typed" for package in PACKAGES} <= sources
     packaged = [*(ROOT / "configs").glob("*.yaml"), ROOT / "tests" / "golden" / "a_square3.npz"]
+    packaged.append(ROOT / "CITATION.cff")
     assert names == sources | {f"ratslam/packaged/{path.relative_to(ROOT).as_posix()}" for path in packaged}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -17,6 +16,18 @@ from tactile.base.npz import read_npz
 
 SESSION_REPORT = "live.json"
 """Report of a live session, written when it has ended."""
+
+
+def check_run_directory(path: Path) -> None:
+    """Checks that a folder holds a run.
+
+    Raises:
+        InputError: there is no such folder, or it holds no run.
+    """
+    if not path.is_dir():
+        raise InputError(str(path), "no such folder", "the directory of a run")
+    if not any((path / name).exists() for name in ("manifest.json", "steps.csv")):
+        raise InputError(str(path), "no run in this folder", "the directory of a run")
 
 
 def read_run(path: Path) -> RunArrays:
@@ -93,41 +104,10 @@ def read_walls(path: Path) -> np.ndarray:
     return read_text_table(file, dict.fromkeys(WALL_COLUMNS, ())).values
 
 
-def read_closures(path: Path) -> np.ndarray:
-    """Reads the pairs of steps [n, 2] joined by accepted loop closures; n is 0 without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
-    pairs, verdicts = read_candidates(path)
-    return pairs[np.array(verdicts) == "accepted"]
-
-
-def read_candidates(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Reads all candidates for loop closures: the earlier and the later step [n, 2] of each, and its verdict
-    (accepted, open, undone); n is 0 without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
-    file = path / "closures.csv"
-    if not file.exists():
-        return np.zeros((0, 2), int), []
-    pairs, verdicts = [], []
-    with file.open(encoding="utf-8", newline="") as lines:
-        for row in (reader := csv.DictReader(lines)):
-            try:
-                pairs.append([int(row["match_step"]), int(row["step"])])
-                verdicts.append(str(row["verdict"]))
-            except (KeyError, TypeError, ValueError):
-                expected = "the columns step, match_step, verdict"
-                raise InputError(f"{file}:{reader.line_num}", "a malformed closure", expected) from None
-    # A continued run counts from the first step of the run before it.
+def first_step(path: Path) -> int:
+    """The number of the first step of a run directory: above 0 if the run continues another."""
     saved = checkpoint_steps(path)
-    skipped = max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
-    steps = np.array(pairs, int).reshape(-1, 2) - skipped
-    known = np.flatnonzero((steps >= 0).all(axis=1))
-    return steps[known], [verdicts[k] for k in known]
+    return max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
 
 
 def checkpoint_steps(path: Path) -> int:
@@ -138,17 +118,14 @@ def checkpoint_steps(path: Path) -> int:
         return 0
 
 
-def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    if not path.exists():
-        raise InputError(str(path), "no such file", "a file of a run directory")
-    return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
+def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray:
+    """A numeric column of a growing CSV file of a run; an incomplete last line is dropped.
 
-
-def read_column(path: Path, name: str) -> np.ndarray:
-    """A numeric column [n] of a CSV file of a run directory; an incomplete last line is dropped.
+    Args:
+        empty: value of an empty cell; None: an empty cell is an error.
 
     Raises:
-        InputError: no such file or column, or a cell that is not a number.
+        InputError: the file is missing, or a row has no number in that column.
     """
     if not path.exists():
         raise InputError(str(path), "no such file", "a file of a run directory")
@@ -156,9 +133,16 @@ def read_column(path: Path, name: str) -> np.ndarray:
     header, *lines = text[: text.rfind("\n") + 1].splitlines() or [name]
     try:
         column = header.split(",").index(name)
-        return np.array([float(line.split(",")[column]) for line in lines])
+        cells = [line.split(",")[column] for line in lines]
+        return np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
     except (ValueError, IndexError):
         raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
+
+
+def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    if not path.exists():
+        raise InputError(str(path), "no such file", "a file of a run directory")
+    return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
 
 
 def _doubt(path: Path) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from array import array
 from collections import Counter
@@ -13,11 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.run_directory import SESSION_REPORT, checkpoint_steps
+from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.run_directory import check_run_directory, checkpoint_steps
 from tactile.base.errors import InputError
 
-RUNNING = "running"
-"""Status of a run that has not ended, or was killed."""
 WATCH_IMAGE = "watch.png"
 """The monitor's own image in the run directory; ignored when looking for activity of the run."""
 
@@ -69,10 +67,7 @@ class RunMonitor:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        if not directory.is_dir():
-            raise InputError(str(directory), "no such folder", "the directory of a run")
-        if not any((directory / name).exists() for name in ("manifest.json", "steps.csv")):
-            raise InputError(str(directory), "no run in this folder", "the directory of a run")
+        check_run_directory(directory)
         names = ("steps.csv", "odometry.tum", "truth.tum", "online_error.csv")
         self._steps, self._odometry, self._truth, self._errors = (_Lines(directory / name) for name in names)
         self._header: list[str] = []
@@ -92,9 +87,7 @@ class RunMonitor:
         Raises:
             InputError: a malformed line or manifest, or the directory was removed.
         """
-        status, total = self._manifest()  # read first: after the end, no line is missing
-        if status == RUNNING:
-            status = self._session_outcome()
+        manifest = read_manifest(self.directory)  # read first: after the end, no line is missing
         self._read()
         count = min(len(self._rows), len(self._reckoned))  # the lines of a chunk are written file by file
         rows = self._rows.first(count)
@@ -102,8 +95,8 @@ class RunMonitor:
         began, last = self._date("config.yaml"), self._date("steps.csv")
         return RunProgress(
             name=self.directory.resolve().name,
-            status=status,
-            total=total,
+            status=manifest.status,
+            total=manifest.total,
             path=rows[:, 1:4],
             sd=rows[-1, 4:7] if count else np.full(3, np.nan),
             odometry=self._reckoned.first(count),
@@ -149,27 +142,6 @@ class RunMonitor:
     def _count(self, count: int) -> None:
         """Counts the outcomes of the first steps that are not counted yet."""
         self._counted.update(self._outcomes[self._counted.total() : count])
-
-    def _manifest(self) -> tuple[str, int | None]:
-        file = self.directory / "manifest.json"
-        try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-            total = content["recording"]["samples"]
-            return str(content["status"]), None if content["continued"] else total
-        except FileNotFoundError:
-            return RUNNING, None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
-
-    def _session_outcome(self) -> str:
-        """The outcome in the report of a live session; `running` without a report."""
-        file = self.directory / SESSION_REPORT
-        try:
-            return str(json.loads(file.read_text(encoding="utf-8"))["outcome"])
-        except FileNotFoundError:
-            return RUNNING
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(str(file), f"not a report ({error})", "the report of a live session") from None
 
     def _files(self) -> list[str]:
         """All files except the monitor's own."""

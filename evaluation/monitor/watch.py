@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.artifacts.manifest import RUNNING
 from evaluation.artifacts.run_directory import read_walls
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.monitor.plot import draw_watch
-from evaluation.monitor.progress import RUNNING, WATCH_IMAGE, RunMonitor, RunProgress, step_count
+from evaluation.monitor.progress import WATCH_IMAGE, RunMonitor, RunProgress, step_count
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 

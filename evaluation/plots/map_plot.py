@@ -22,7 +22,7 @@ NO_WALLS = np.zeros((0, 5))
 NO_CLOSURES = np.zeros((0, 2), int)
 
 
-class _Layers(NamedTuple):
+class Layers(NamedTuple):
     """Positions [.., 2] (m) to draw, in the frame of the truth if there is one."""
 
     truth: np.ndarray | None
@@ -45,7 +45,7 @@ def draw_map(
         walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
         closures: [n, 2] steps joined by loop closures; drawn with walls.
     """
-    layers = _align_layers(run)
+    layers = align_layers(run)
     shown = walls if layers.truth is not None else NO_WALLS
     box = _frame(layers, shown)
     width, height = box[1] - box[0]
@@ -103,23 +103,25 @@ def wall_corners(walls: np.ndarray) -> np.ndarray:
     return np.concatenate([walls[:, :2], walls[:, 2:4]])
 
 
-def _align_layers(run: RunArrays) -> _Layers:
+def align_layers(run: RunArrays) -> Layers:
+    """The layers of a run: map and odometry each aligned to the truth, as for ATE; without truth, odometry
+    starts at the first pose of the map."""
     rows = truth_rows(run)
     if run.truth is None or len(rows) == 0:
         to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
-        return _Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
+        return Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
     true = run.truth[rows]
     to_truth = align(run.final[rows], true)
     odometry = compose(align(run.odometry[rows], true), run.odometry)
     final, nodes = compose(to_truth, run.final), compose(to_truth, run.nodes)
-    return _Layers(_xy(run.truth), _xy(odometry), _xy(final), _xy(nodes))
+    return Layers(_xy(run.truth), _xy(odometry), _xy(final), _xy(nodes))
 
 
 def _xy(pose: np.ndarray) -> np.ndarray:
     return np.asarray(pose)[:, :2]
 
 
-def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
+def _frame(layers: Layers, walls: np.ndarray) -> np.ndarray:
     """Corners [[left, bottom], [right, top]] (m) around truth, walls, map and odometry near them."""
     truth = [] if layers.truth is None else [layers.truth]
     low, high = bounds(layers.final, layers.nodes, wall_corners(walls), *truth)
@@ -133,7 +135,7 @@ def _frame(layers: _Layers, walls: np.ndarray) -> np.ndarray:
     return np.stack([middle - size / 2, middle + size / 2])
 
 
-def _paint(axes: style.Axes, run: RunArrays, layers: _Layers) -> None:
+def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
     """Draws the layers in the order of the legend; `zorder` sets which layer is in front."""
     from matplotlib.collections import LineCollection
 
@@ -155,7 +157,7 @@ def _paint(axes: style.Axes, run: RunArrays, layers: _Layers) -> None:
             axes.add_collection(LineCollection(nodes[links], colors=color, lw=lw, zorder=3, label=label))
 
 
-def _paint_laps(axes: style.Axes, run: RunArrays, layers: _Layers, apart: float, pairs: np.ndarray) -> None:
+def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, pairs: np.ndarray) -> None:
     """Draws a run in a maze; a closure is wrong if its places are more than `apart` m apart in truth."""
     from matplotlib.collections import LineCollection
 
@@ -192,7 +194,7 @@ def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.insert(line, 1 + np.flatnonzero(step > _JUMP * np.quantile(moving, 0.9)), np.nan, axis=0)
 
 
-def _paint_start(axes: style.Axes, layers: _Layers) -> None:
+def _paint_start(axes: style.Axes, layers: Layers) -> None:
     truth = layers.truth
     start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
     axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")

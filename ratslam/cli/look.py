@@ -1,4 +1,4 @@
-"""The commands that look at a run: watch, score."""
+"""The commands that look at a run: watch, score, report."""
 
 from __future__ import annotations
 
@@ -48,9 +48,20 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     score.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
+    report = commands.add(
+        "report", _report, "write a page (HTML) about a run, or several compared",
+        "report runs/square -o report.html", "look",
+    )  # fmt: skip
+    report.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="run directory")
+    report.add_argument(
+        "-o", "--output", type=Path, default=Path("report.html"), metavar="HTML",
+        help="the page, replaced if it exists (default report.html)",
+    )  # fmt: skip
+
 
 def _watch(arguments: argparse.Namespace) -> int:
-    from evaluation.monitor.progress import RUNNING, WATCH_IMAGE
+    from evaluation.artifacts.manifest import RUNNING
+    from evaluation.monitor.progress import WATCH_IMAGE
     from evaluation.monitor.watch import watch_run
 
     for name in ("every", "patience"):
@@ -91,6 +102,14 @@ def _score(arguments: argparse.Namespace) -> int:
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
     print(card.model_dump_json(indent=2) if arguments.json else render_scorecard(card))
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from ratslam.pipeline.report import write_report
+
+    write_report(arguments.runs, arguments.output)
+    print(f"{arguments.output}: open it in a browser; it needs no network")
     return 0
 
 

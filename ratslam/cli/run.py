@@ -21,7 +21,7 @@ def add_commands(commands: Commands) -> None:
         help="checkpoint (map.npz) to continue from: after its last sample if the recording is the same, "
         "else from the first sample",
     )  # fmt: skip
-
+    run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)
 
     simulate = commands.add(
@@ -71,9 +71,12 @@ def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics import grid_score
     from evaluation.metrics.scorecard import render_health, render_scorecard
+    from ratslam.pipeline import report
     from ratslam.pipeline.run import run
     from ratslam.viewer.observer import open_viewer
 
+    if arguments.report:
+        report.check_report_libraries("--report")
     directory, config, target = run_directory(arguments), read_config(arguments), open_target(arguments)
     with open_viewer(target) as observers:
         card, interrupted = run(config, directory, arguments.resume, observers)
@@ -83,6 +86,9 @@ def _run(arguments: argparse.Namespace) -> int:
         print("\n" + grid_score.render_grid_scores([grid_score.GridScore.model_validate_json(text)]))
     print(f"\n{render_health(card)}".rstrip())
     print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
+    if arguments.report:
+        report.write_report([directory], directory / report.NAME)
+        print(f"{directory / report.NAME} is a page about the run")
     return INTERRUPTED if interrupted else 0
 
 

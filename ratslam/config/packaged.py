@@ -1,4 +1,4 @@
-"""Configurations that come with the program, found by name in a checkout and in an installed wheel."""
+"""Configurations and the citation that come with the program, in a checkout and in an installed wheel."""
 
 from __future__ import annotations
 
@@ -41,6 +41,12 @@ def find_config(text: str | os.PathLike[str], folder: Path = Path()) -> Path:
     close = get_close_matches(Path(name).stem.lower(), files, n=1)
     cure = f"did you mean {close[0]!r}?" if close else ""
     raise InputError(str(path), "no such file or packaged configuration", f"one of {', '.join(files)}", cure)
+
+
+def read_citation() -> str:
+    """The content of CITATION.cff: how to cite the program."""
+    places = [folder.parent / "CITATION.cff" for folder in FOLDERS]
+    return next(path for path in places if path.exists()).read_text(encoding="utf-8")
 
 
 def _files() -> list[Path]:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.artifacts.nav2 import Nav2Map, read_nav2
-from evaluation.artifacts.run_directory import read_candidates, read_column, read_run
+from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.run_directory import read_column, read_run
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import align
@@ -57,15 +58,15 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
     run = read_run(directory)
     steps = len(run.time)
     columns = [read_column(directory / "steps.csv", name)[:steps] for name in ("sd_x", "sd_y", "sd_heading")]
-    pairs, verdicts = read_candidates(directory)
-    known = np.flatnonzero((pairs < steps).all(axis=1))
+    closures = read_closure_table(directory)
+    known = np.flatnonzero(((closures.steps >= 0) & (closures.steps < steps)).all(axis=1))
     return ExportedRun(
         stamps=ros_stamps(directory, run.time),
         run=run,
         spread=np.stack(columns, axis=1),
         truth=truth_in_map(run),
-        candidates=pairs[known],
-        verdicts=[verdicts[k] for k in known],
+        candidates=closures.steps[known],
+        verdicts=[closures.verdicts[k] for k in known],
         grid=read_nav2(directory / "map.yaml") if (directory / "map.yaml").exists() else None,
         images=lambda: _images(directory, run.time, warn),
     )

@@ -1,9 +1,14 @@
-"""Writes the world, the whisker views and the grid map to a run directory, for scores and plots."""
+"""Writes the world, views and the grid map to a run directory, for scores, plots and the report."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from evaluation.artifacts import closure_views
+from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.closure_views import ClosureViews, write_closure_views
 from evaluation.artifacts.grid_npz import read_grid, write_grid_truth
 from evaluation.artifacts.nav2 import write_nav2
 from evaluation.artifacts.run_directory import write_walls
@@ -51,6 +56,16 @@ def save_whisker_views(views: list[WhiskerView], config: TouchConfig, directory:
         tallest=config.image.tallest,
     )
     directory.file("views.npz", lambda path: write_whisker_views(path, images))
+
+
+def save_closure_views(images: Sequence[np.ndarray | None], directory: RunDirectory) -> None:
+    """Writes closure_views.npz: the images [R, C] of this run's steps that closures join; None: no view."""
+    joined = np.unique(read_closure_table(directory.path).steps).tolist()
+    seen = {step: image for step, image in enumerate(images) if image is not None}
+    steps = [step for step in joined if step in seen]
+    if steps:
+        views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+        directory.file(closure_views.NAME, lambda path: write_closure_views(path, views))
 
 
 def save_grid_map(directory: RunDirectory) -> None:

@@ -17,9 +17,11 @@ import numpy as np
 from evaluation.artifacts.run_directory import read_run, read_scorecard
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, render_health, scorecard_html
-from evaluation.report import run_plots
+from evaluation.plots.run_plots import run_plots
+from evaluation.report.verdict import describe_score, judge_map
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.estimate import Health
+from ratslam.pipeline.report import NAME, write_report
 from ratslam.pipeline.run import run as write_run
 from ratslam.pipeline.source import ConfigLike, resolve_config
 from ratslam.pose_graph.io import read_json
@@ -131,6 +133,22 @@ class Result:
             raise InputError("plot", repr(name), f"one of {', '.join(plots)}")
         return plots[name]()
 
+    def report(self, path: str | os.PathLike[str] | None = None) -> Path:
+        """Writes a page (HTML) about the run, which opens in a browser without network.
+
+        Args:
+            path: the file, replaced if it exists; None: report.html in the run directory.
+
+        Returns:
+            the path of the page.
+
+        Raises:
+            InputError: the extra [report] is not installed.
+        """
+        page = self.directory / NAME if path is None else Path(path)
+        write_report([self.directory], page)
+        return page
+
     def __repr__(self) -> str:
         return f"<Result of {len(self.time)} steps in {self.directory}: {self._summary()}>"
 
@@ -139,7 +157,9 @@ class Result:
         self.plot().savefig(picture, format="png")
         source = f"data:image/png;base64,{b64encode(picture.getvalue()).decode()}"
         image = f'<img src="{source}" alt="map of {escape(self.scorecard.name)}" style="max-width: 100%">'
-        return f"<div>{image}<p>{escape(self._summary())}</p>{scorecard_html(self.scorecard)}</div>"
+        verdict = judge_map(self._run.doubt)
+        words = f"{verdict.headline}. {verdict.reason} {describe_score(self.scorecard)}"
+        return f"<div>{image}<p>{escape(words)}</p>{scorecard_html(self.scorecard)}</div>"
 
     def _summary(self) -> str:
         """Position error and health in one line, as far as they are known."""

@@ -23,7 +23,7 @@ COLUMNS = (
 """Columns of steps.csv before those of the backend: time (s), experience, action, online pose in the map
 frame and its standard deviations (m, m, rad), flag, probability that the map is worse than odometry,
 outcome."""
-STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv")
+STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv", "timing.csv")
 """Files that grow by whole lines."""
 
 
@@ -48,7 +48,9 @@ class RunDirectory:
                 str(path), f"cannot be created ({error.strerror})", "a writable folder"
             ) from None
         self._streams = {name: (path / name).open("x", encoding="utf-8", newline="") for name in STREAMS}
-        self.append({"steps.csv": ",".join((*COLUMNS, *columns)) + "\n", "online_error.csv": "t,error\n"})
+        heads = {"steps.csv": ",".join((*COLUMNS, *columns)), "online_error.csv": "t,error"}
+        heads["timing.csv"] = "step,steps,seconds"
+        self.append({name: head + "\n" for name, head in heads.items()})
 
     def __enter__(self) -> Self:
         return self

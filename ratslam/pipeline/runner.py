@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -13,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.artifacts.closure_table import write_closure_pairs
+from evaluation.artifacts.closure_views import eight_bit
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import write_tum
-from evaluation.report import plot_writers
+from evaluation.plots.run_plots import plot_writers
 from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
@@ -27,7 +30,13 @@ from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
 from ratslam.keyframes.config import FULL, Ablation
-from ratslam.pipeline.artifacts import WhiskerView, save_grid_map, save_whisker_views, save_world
+from ratslam.pipeline.artifacts import (
+    WhiskerView,
+    save_closure_views,
+    save_grid_map,
+    save_whisker_views,
+    save_world,
+)
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
 from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
@@ -67,6 +76,7 @@ class Runner:
         self.session, self.skipped = session, skipped
         self._config, self._source, self._directory, self._manifest = config, source, directory, manifest
         self._views: list[WhiskerView] = []
+        self._images: list[np.ndarray | None] = []  # of the views, for those that closures join
         self._odometry_pose = np.zeros(3)
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
@@ -78,8 +88,11 @@ class Runner:
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
         observations = [observation_of(sample) for sample in samples]
+        began = time.perf_counter()
         steps = list(self.session.replay(observations))
+        took = time.perf_counter() - began
         self._views += [(o.view, o.alive) for o in observations] if self._source.whiskers else []
+        self._images += [eight_bit(o.view) if bool(o.view_seen) else None for o in observations]
         odometry = []
         for sample, observation in zip(samples, observations, strict=True):
             self._odometry_pose = compose(self._odometry_pose, np.array(observation.odometry[:3], float))
@@ -88,6 +101,7 @@ class Runner:
         self._directory.append(
             _lines(samples, steps, odometry, BACKENDS.get(self._config.backend, "backend"))
         )
+        self._directory.append({"timing.csv": f"{self.session.steps},{len(steps)},{took:.6f}\n"})
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
             self._directory.append({"online_error.csv": f"{float(samples[-1].time)!r},{error!r}\n"})
@@ -111,6 +125,7 @@ class Runner:
         self._checkpoint()
         _write_final_map(self.session, directory)
         save_whisker_views(self._views, config.touch, directory)
+        save_closure_views(self._images, directory)
         save_grid_map(directory)
         card = score_run(
             read_run(directory.path),
@@ -289,8 +304,12 @@ def _write_final_map(session: Session, directory: RunDirectory) -> None:
     doubt = session.map.final_doubt()
     if np.isfinite(doubt):
         directory.text("health.json", json.dumps({"worse_than_odometry": doubt}) + "\n")
-    for name, write in session.map.files().items():
+    files = session.map.files()
+    for name, write in files.items():
         directory.file(name, write)
+    pairs = session.map.closures()
+    if "closures.csv" not in files and len(pairs):
+        directory.file("closures.csv", lambda path: write_closure_pairs(path, pairs))
 
 
 def _resume(session: Session, path: Path, digest: str) -> int:

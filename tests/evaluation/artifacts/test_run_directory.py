@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.artifacts.run_directory import read_closures, read_scorecard, read_walls, write_walls
+from evaluation.artifacts.closure_table import read_closures
+from evaluation.artifacts.run_directory import read_scorecard, read_walls, write_walls
 from evaluation.metrics.scorecard import score_run
 from tactile.base.errors import InputError
 

@@ -11,7 +11,7 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
-from evaluation.report import plot_writers
+from evaluation.plots.run_plots import plot_writers
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import load, validate

@@ -127,7 +127,7 @@ def test_a_path_is_interrupted_only_where_the_robot_was_moved_by_hand(circle):
 
 def test_scoring_needs_no_matplotlib_and_drawing_no_pyplot():
     code = (
-        "import sys, evaluation.report, evaluation.metrics.scorecard;"
+        "import sys, evaluation.plots.run_plots, evaluation.metrics.scorecard;"
         "assert not [m for m in sys.modules if m.split('.')[0] in ('matplotlib', 'robot', 'ratslam', 'jax')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evaluation.artifacts.closure_table import read_closures
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
-from evaluation.artifacts.run_directory import read_closures, read_run, read_scorecard, read_walls
+from evaluation.artifacts.run_directory import read_run, read_scorecard, read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays

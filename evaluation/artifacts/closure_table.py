@@ -1,0 +1,79 @@
+"""File `closures.csv`: all loop closures that a map considered, with their evidence and verdicts."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.artifacts.run_directory import first_step
+from tactile.base.errors import InputError
+
+ACCEPTED = "accepted"
+"""Verdict on the closures of the map."""
+KEYS = ("step", "match_step", "verdict")
+"""Columns that every closures.csv has; a map may add columns of numbers."""
+
+
+class ClosureTable(NamedTuple):
+    """The closures of a run, n of them, in the order of the file.
+
+    Attributes:
+        steps: [n, 2] the earlier and the later step that a closure joins, counted from the first step of
+            this run: negative in the run that this one continues.
+        verdicts: [n] `accepted`, or why it is no closure of the map.
+        evidence: the other columns, [n] each, by name.
+    """
+
+    steps: np.ndarray
+    verdicts: list[str]
+    evidence: Mapping[str, np.ndarray]
+
+    def accepted(self) -> np.ndarray:
+        """[n] bool, which are closures of the map."""
+        return np.array([verdict == ACCEPTED for verdict in self.verdicts], bool)
+
+
+def read_closure_table(directory: Path) -> ClosureTable:
+    """Reads the closures of a run directory; none without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    file = directory / "closures.csv"
+    if not file.exists():
+        return ClosureTable(np.zeros((0, 2), int), [], {})
+    steps, verdicts, numbers = [], [], []
+    with file.open(encoding="utf-8", newline="") as lines:
+        reader = csv.DictReader(lines)
+        names = [name for name in reader.fieldnames or () if name not in KEYS]
+        for row in reader:
+            try:
+                steps.append([int(row["match_step"]), int(row["step"])])
+                verdicts.append(str(row["verdict"]))
+                numbers.append([float(row[name]) for name in names])
+            except (KeyError, TypeError, ValueError):
+                expected = "the columns step, match_step, verdict, and numbers in all others"
+                raise InputError(f"{file}:{reader.line_num}", "a malformed closure", expected) from None
+    columns = np.array(numbers, float).reshape(len(steps), len(names)).T
+    counted = np.array(steps, int).reshape(-1, 2) - first_step(directory)
+    return ClosureTable(counted, verdicts, dict(zip(names, columns, strict=True)))
+
+
+def read_closures(directory: Path) -> np.ndarray:
+    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    table = read_closure_table(directory)
+    return table.steps[table.accepted() & (table.steps >= 0).all(axis=1)]
+
+
+def write_closure_pairs(path: Path, pairs: np.ndarray) -> None:
+    """Writes accepted closures without evidence: pairs [n, 2] of steps, the later and the earlier."""
+    lines = (f"{later},{earlier},{ACCEPTED}\n" for later, earlier in pairs.tolist())
+    Path(path).write_text("".join([",".join(KEYS) + "\n", *lines]), encoding="utf-8")

@@ -1,0 +1,66 @@
+"""File `manifest.json`: what was run, with which versions, and how it ended."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from evaluation.artifacts.run_directory import SESSION_REPORT
+from tactile.base.errors import InputError
+
+RUNNING = "running"
+"""Status of a run that has not ended, or was killed."""
+
+
+class Manifest(NamedTuple):
+    """The manifest of a run.
+
+    Attributes:
+        status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
+            finished, the outcome from its report. source: name of the recording or simulation.
+        total: final number of steps, if known. seed: of the session, if known.
+        versions: of the program, its libraries and Python.
+    """
+
+    status: str = RUNNING
+    source: str = ""
+    total: int | None = None
+    seed: int | None = None
+    versions: Mapping[str, str] = {}
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """Reads the manifest; that of a run without the file has no versions.
+
+    Raises:
+        InputError: the file, or the report of a live session, is malformed.
+    """
+    file = directory / "manifest.json"
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        recording, versions = content["recording"], content.get("versions", {})
+        found = Manifest(
+            status=str(content["status"]),
+            source=str(recording.get("name", "")),
+            total=None if content["continued"] else recording["samples"],
+            seed=content.get("seeds", {}).get("session"),
+            versions={str(name): str(version) for name, version in versions.items()},
+        )
+    except FileNotFoundError:
+        found = Manifest()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
+    return found._replace(status=_session_outcome(directory)) if found.status == RUNNING else found
+
+
+def _session_outcome(directory: Path) -> str:
+    """The outcome in the report of a live session; `running` without a report."""
+    file = directory / SESSION_REPORT
+    try:
+        return str(json.loads(file.read_text(encoding="utf-8"))["outcome"])
+    except FileNotFoundError:
+        return RUNNING
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(str(file), f"not a report ({error})", "the report of a live session") from None

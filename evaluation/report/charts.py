@@ -1,0 +1,287 @@
+"""The charts of the page, as figures of plotly.
+
+A trace names its role in `meta`; the page colours roles by `palette.PALETTE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from evaluation.artifacts.closure_table import ACCEPTED
+from evaluation.metrics.run_arrays import truth_rows
+from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.trajectory import position_errors
+from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
+from evaluation.report.closure_records import WORDS
+from evaluation.report.palette import GRID_SCALES, RUN_ROLES
+from evaluation.report.run_report import RunReport
+
+_DASHES = ("solid", "dash", "dot", "dashdot")
+_CLOSURES = {ACCEPTED: ("accepted", "circle", "solid"), "open": ("refused", "x", "dash")}
+_OTHER = ("refused", "square-open", "dot")  # verdicts of other names
+_MARK, _CROWD = 7.0, 300  # pixels of a closure's mark, and the number above which marks shrink
+_DRAWN = 500  # most marks of a kind at a time, evenly chosen from those in view, so that the page opens fast
+_ROOM, _MARGIN = 0.15, 0.06  # shares of the map's size: for drifting odometry, and on all sides
+
+
+def run_charts(report: RunReport) -> dict[str, Any]:
+    """The charts of a run by name: `map`, and those of `error`, `doubt`, `spread`, `cost` that have data."""
+    charts = {"map": map_chart(report), "error": error_chart([report])}
+    if np.isfinite(report.doubt).any():
+        charts["doubt"] = _doubt_chart(report)
+    elif report.run.truth is None:
+        charts["spread"] = _spread_chart(report)
+    if len(report.cost.time):
+        charts["cost"] = _cost_chart(report)
+    return {name: chart for name, chart in charts.items() if chart is not None}
+
+
+def map_chart(report: RunReport) -> Any:
+    """The map: walls or grid, truth, odometry, final trajectory, experiences with their links, closures."""
+    layers, traces = report.layers, []
+    if report.grid is not None:
+        traces.append(_grid_trace(report))
+    traces += [] if not len(report.walls) else [_wall_trace(report.walls)]
+    if len(report.truth_lines):
+        lines = _gapped(report.truth_lines.reshape(-1, 2, 2))
+        traces.append(_line(lines, "walls, true", "ink", width=1.5))
+    if layers.truth is not None:
+        truth = split_at_jumps(layers.truth, layers.truth)
+        traces.append(_line(truth, "truth", "truth", width=5, opacity=0.75))
+    traces.append(_line(layers.odometry, "odometry", "odometry", width=1, opacity=0.6))
+    if report.map_path is not None:
+        traces.append(_line(report.map_path, "map, not believed", "doubted", dash="dot", width=1.2))
+    final = layers.final if layers.truth is None else split_at_jumps(layers.final, layers.truth)
+    traces.append(_line(final, "trajectory", "final", width=1.6))
+    figure = _map_figure([*traces, *_place_traces(report), *_closure_traces(report)], _frame(report))
+    figure.update_layout(shapes=[*_link_shapes(report), *_closure_shapes(report)])
+    if report.grid is not None:  # no empty space beside the grid
+        figure.update_xaxes(constrain="domain").update_yaxes(constrain="domain")
+    return figure
+
+
+def overlay_chart(reports: Sequence[RunReport]) -> Any:
+    """The final trajectories of several runs, each aligned to its truth, over the truth of the first."""
+    known = next((report.layers.truth for report in reports if report.layers.truth is not None), None)
+    traces = [] if known is None else [_line(split_at_jumps(known, known), "truth", "truth", width=5)]
+    traces += [
+        _line(report.layers.final, report.name, *_run_style(number)) for number, report in enumerate(reports)
+    ]
+    frames = np.stack([_frame(report) for report in reports])
+    return _map_figure(traces, np.stack([frames[:, 0].min(axis=0), frames[:, 1].max(axis=0)]))
+
+
+def error_chart(reports: Sequence[RunReport]) -> Any | None:
+    """Position errors against time; of one run also those of odometry and of the current pose; None without
+    truth."""
+    traces, alone = [], len(reports) == 1
+    for number, report in enumerate(reports):
+        run, rows = report.run, truth_rows(report.run)
+        if run.truth is None or len(rows) == 0:
+            continue
+        time, start = run.time[rows] - run.time[0], run.time[0]
+        final = np.column_stack([time, position_errors(run.final[rows], run.truth[rows])])
+        if not alone:
+            traces.append(_line(final, report.name, *_run_style(number)))
+            continue
+        odometry = np.column_stack([time, position_errors(run.odometry[rows], run.truth[rows])])
+        traces.append(_line(odometry, "odometry", "odometry", width=1))
+        if len(report.online_error.time):
+            online = np.column_stack([report.online_error.time - start, report.online_error.value])
+            traces.append(_line(online, "map, as known at the time", "online", dash="dot", width=1.6))
+        traces.append(_line(final, "final trajectory", "final", width=2))
+    return _figure(traces, "time, s", "position error, m", zero=True) if traces else None
+
+
+def _doubt_chart(report: RunReport) -> Any:
+    time = report.run.time - report.run.time[0]
+    doubt = _line(np.column_stack([time, report.doubt]), "probability worse than odometry", "final", width=2)
+    limit = np.array([[time[0], DOUBTED], [time[-1], DOUBTED]])
+    traces = [doubt, _line(limit, "limit above which a map is doubted", "limit", dash="dash", width=1.4)]
+    figure = _figure(traces, "time, s", "probability")
+    figure.update_yaxes(range=[-0.02, 1.02])
+    return figure
+
+
+def _spread_chart(report: RunReport) -> Any:
+    time = report.run.time - report.run.time[0]
+    spread = np.column_stack([time, report.spread])
+    return _figure([_line(spread, "standard deviation", "final", width=1.6)], "time, s", "m", zero=True)
+
+
+def _cost_chart(report: RunReport) -> Any:
+    cost = np.column_stack([report.cost.time, 1e3 * report.cost.value])
+    figure = _figure([_line(cost, "mean of each chunk of steps", "final", width=1.4)], "step", "ms a step")
+    figure.update_yaxes(type="log", dtick=1)
+    return figure
+
+
+def _place_traces(report: RunReport) -> list[Any]:
+    from plotly import graph_objects
+
+    nodes = report.layers.nodes
+    if not len(nodes):
+        return []
+    x, y = _columns(nodes)
+    size = _MARK * min(1.0, np.sqrt(_CROWD / len(nodes))) * 0.75
+    marker = {"size": size, "symbol": "circle", "maxdisplayed": _DRAWN}
+    hover, name = "experience %{pointNumber}<extra></extra>", "experience, with links"
+    places = graph_objects.Scatter(x=x, y=y, mode="markers", name=name, meta="place", marker=marker)
+    return [places.update(hovertemplate=hover, legendgroup="experience")]
+
+
+def _link_shapes(report: RunReport) -> list[Any]:
+    lines = report.layers.nodes[report.run.links]
+    return [_line_shape(lines, "link", "solid", "experience")] if len(lines) else []
+
+
+def _closure_traces(report: RunReport) -> list[Any]:
+    """Of each verdict the marks halfway between the two places; a mark carries the closure's number."""
+    from plotly import graph_objects
+
+    traces, table = [], report.closures
+    size = max(4.0, _MARK * min(1.0, np.sqrt(_CROWD / max(1, len(table.steps)))))
+    for verdict, rows, ends in _drawn_closures(report):
+        role, symbol, _ = _CLOSURES.get(verdict, _OTHER)
+        x, y = _columns(ends.mean(axis=1))
+        name = f"closure, {_text(WORDS.get(verdict, verdict))} ({len(rows):,})"
+        mark = {"size": size, "symbol": symbol, "line": {"width": 1}, "maxdisplayed": _DRAWN}
+        text = [f"steps {earlier} and {later}" for earlier, later in table.steps[rows].tolist()]
+        trace = graph_objects.Scatter(x=x, y=y, mode="markers", name=name, meta=role, marker=mark, text=text)
+        trace.update(customdata=rows.astype(np.int32), hovertemplate="%{text}<extra></extra>")
+        traces.append(trace.update(legendgroup=_text(verdict)))
+    return traces
+
+
+def _closure_shapes(report: RunReport) -> list[Any]:
+    """Of each verdict the lines between the two places, in the order of its marks."""
+    return [
+        _line_shape(ends, *_CLOSURES.get(verdict, _OTHER)[::2], _text(verdict))
+        for verdict, _, ends in _drawn_closures(report)
+    ]
+
+
+def _drawn_closures(report: RunReport) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Each verdict, accepted last, with the numbers [k] and ends [k, 2, 2] of its closures in this run."""
+    table, path = report.closures, report.map_path if report.map_path is not None else report.layers.final
+    inside = ((table.steps >= 0) & (table.steps < len(path))).all(axis=1)
+    verdicts = np.array(table.verdicts)
+    for verdict in sorted(dict.fromkeys(table.verdicts), key=lambda verdict: verdict == ACCEPTED):
+        rows = np.flatnonzero(inside & (verdicts == verdict))
+        if len(rows):
+            yield verdict, rows, path[table.steps[rows]]
+
+
+def _line_shape(lines: np.ndarray, role: str, dash: str, group: str) -> dict[str, Any]:
+    """Lines [n, 2, 2] as one shape, which is drawn faster than a trace with n gaps."""
+    path = "".join(f"M{a:.5g},{b:.5g}L{c:.5g},{d:.5g}" for a, b, c, d in lines.reshape(-1, 4).tolist())
+    line = {"width": 1, "dash": dash}
+    return {
+        "type": "path",
+        "path": path,
+        "name": role,
+        "line": line,
+        "layer": "below",
+        "legendgroup": group,
+        "opacity": 0.6,
+    }
+
+
+def _grid_trace(report: RunReport) -> Any:
+    from plotly import graph_objects
+
+    grid = report.grid
+    assert grid is not None
+    percent = np.rint(100 * grid.probability).astype(np.uint8)
+    x0, y0 = (grid.origin + grid.cell / 2).tolist()
+    return graph_objects.Heatmap(
+        z=percent, x0=x0, dx=grid.cell, y0=y0, dy=grid.cell, zmin=0, zmax=100, meta="grid", name="occupancy",
+        colorscale=GRID_SCALES["light"],
+        hovertemplate="occupied: %{z} %<extra></extra>",
+        colorbar={"title": {"text": "occupied, %", "side": "right"}, "thickness": 10, "len": 0.6},
+    )  # fmt: skip
+
+
+def _wall_trace(walls: np.ndarray) -> Any:
+    from plotly import graph_objects
+
+    west, south, east, north = walls[:, :4].T
+    corners = np.stack([west, south, east, south, east, north, west, north], axis=1).reshape(-1, 4, 2)
+    x, y = _columns(_gapped(corners))
+    return graph_objects.Scatter(
+        x=x, y=y, fill="toself", mode="lines", line_width=0, name="wall", meta="wall", hoverinfo="skip"
+    )
+
+
+def _line(
+    points: np.ndarray, name: str, role: str, dash: str = "solid", width: float = 1, opacity: float = 1
+):
+    """A line through points [n, 2]; NaN rows interrupt it."""
+    from plotly import graph_objects
+
+    x, y = _columns(points)
+    line = {"width": width, "dash": dash}
+    return graph_objects.Scatter(
+        x=x, y=y, mode="lines", name=_text(name), meta=role, line=line, opacity=opacity, hoverinfo="skip"
+    )
+
+
+def _map_figure(traces: list[Any], frame: np.ndarray) -> Any:
+    """A figure with equal scales that shows a frame [[left, bottom], [right, top]], m."""
+    figure = _figure(traces, "x, m", "y, m")
+    figure.update_layout(dragmode="pan")
+    figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
+    figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
+    return figure
+
+
+def _frame(report: RunReport) -> np.ndarray:
+    """Corners [[left, bottom], [right, top]] (m) around the map, and around odometry near it."""
+    layers, lines = report.layers, report.truth_lines.reshape(-1, 2)
+    truth = [] if layers.truth is None else [layers.truth]
+    low, high = bounds(layers.final, layers.nodes, wall_corners(report.walls), lines, *truth)
+    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
+    low = np.minimum(low, np.maximum(far_low, low - room))
+    high = np.maximum(high, np.minimum(far_high, high + room))
+    margin = max(_MARGIN * (high - low).max(), 1e-3)
+    return np.stack([low - margin, high + margin])
+
+
+def _figure(traces: list[Any], across: str, up: str, zero: bool = False) -> Any:
+    from plotly import graph_objects
+
+    figure = graph_objects.Figure(traces)
+    legend = {"orientation": "h", "yanchor": "bottom", "y": 1.01, "x": 0, "itemsizing": "trace"}
+    figure.update_layout(
+        template={}, margin={"l": 56, "r": 12, "t": 12, "b": 44}, legend=legend, hovermode="closest",
+        hoverdistance=12, xaxis_title_text=across, yaxis_title_text=up, showlegend=True,
+    )  # fmt: skip
+    figure.update_xaxes(zeroline=False)
+    figure.update_yaxes(zeroline=False, rangemode="tozero" if zero else "normal")
+    return figure
+
+
+def _run_style(number: int) -> tuple[str, str, float]:
+    """Role, dash and width of a run's line."""
+    return f"run{number % RUN_ROLES}", _DASHES[number % len(_DASHES)], 1.8
+
+
+def _gapped(lines: np.ndarray) -> np.ndarray:
+    """Lines [n, k, 2] as one line of points, interrupted after each."""
+    gaps = np.full((len(lines), 1, 2), np.nan)
+    return np.concatenate([lines, gaps], axis=1).reshape(-1, 2)
+
+
+def _columns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of points [n, 2]; 32 bits are finer than a screen and halve the page."""
+    x, y = np.asarray(points, np.float32).reshape(-1, 2).T
+    return np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+
+def _text(name: str) -> str:
+    """A text as plotly shows it as it is: plotly reads names as HTML."""
+    return escape(name, quote=False)

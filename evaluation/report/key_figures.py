@@ -1,0 +1,98 @@
+"""The main figures of a run, for the head of the page and the table of several runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.report.run_report import RunReport, describe_status
+
+
+class KeyFigure(NamedTuple):
+    """A figure in the head of the page: what it is, its value with the unit, and a remark."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+class Comparison(NamedTuple):
+    """A table: the headings of its columns, and a row of cells for each run, its name first."""
+
+    columns: list[str]
+    rows: list[list[str]]
+
+
+def key_figures(report: RunReport) -> list[KeyFigure]:
+    """The figures of one run, the most important first."""
+    figures = [_error(report), *_grid(report)]
+    if len(report.run.nodes):
+        figures.append(
+            KeyFigure("Experiences", f"{len(report.run.nodes):,}", f"{len(report.run.links):,} links")
+        )
+    if report.closures.verdicts:
+        count, accepted = len(report.closures.verdicts), int(report.closures.accepted().sum())
+        figures.append(KeyFigure("Closures accepted", f"{accepted:,}", f"of {count:,} considered"))
+    time = report.run.time
+    figures.append(KeyFigure("Duration", _duration(float(time[-1] - time[0])), f"{len(time):,} steps"))
+    if len(report.cost.value):
+        cost = 1e3 * float(np.median(report.cost.value))
+        figures.append(KeyFigure("Cost of a step", f"{cost:.3g} ms", "median"))
+    return figures
+
+
+def compare_figures(reports: Sequence[RunReport]) -> Comparison:
+    """The figures of several runs, a row each; "–" where a run has none."""
+    columns = [
+        "run", "method", "status", "map doubted", "error, final (m)", "error, online (m)",
+        "error, odometry (m)", "experiences", "closures", "refused", "ms a step",
+    ]  # fmt: skip
+    return Comparison(columns, [_row(report) for report in reports])
+
+
+def _row(report: RunReport) -> list[str]:
+    final, online = (report.card.quantities[name] for name in ("ate_final", "ate_online"))
+    closures, accepted = len(report.closures.verdicts), int(report.closures.accepted().sum())
+    doubt = report.run.doubt
+    return [
+        report.name,
+        report.backend or "–",
+        describe_status(report),
+        "–" if np.isnan(doubt) else f"{doubt:.0%}",
+        *(_number(value) for value in (final.value, online.value, final.odometry)),
+        f"{len(report.run.nodes):,}" if len(report.run.nodes) else "–",
+        *((f"{accepted:,}", f"{closures - accepted:,}") if closures else ("–", "–")),
+        _number(1e3 * float(np.median(report.cost.value)) if len(report.cost.value) else None),
+    ]
+
+
+def _error(report: RunReport) -> KeyFigure:
+    error = report.card.quantities["ate_final"]
+    if error.value is None:
+        return KeyFigure("Position error", "unknown", "no truth to compare with")
+    note = "" if error.odometry is None else f"odometry {error.odometry:.3g} {error.unit}"
+    return KeyFigure("Position error", f"{error.value:.3g} {error.unit}", note)
+
+
+def _grid(report: RunReport) -> list[KeyFigure]:
+    if report.grid_score is None or report.grid_score.quantities["map_brier"].value is None:
+        return []
+    score = report.grid_score.quantities
+    skill = score["map_brier_skill"].value
+    return [
+        KeyFigure(
+            "Grid, Brier score",
+            f"{score['map_brier'].value:.3g}",
+            "" if skill is None else f"skill {skill:.3g}",
+        )
+    ]
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"

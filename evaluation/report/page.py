@@ -1,0 +1,156 @@
+"""The page: one file of HTML that works without network, with everything it shows inside it."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Sequence
+from hashlib import sha256
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from evaluation.metrics.scorecard import scorecard_lines
+from evaluation.report.charts import error_chart, overlay_chart, run_charts
+from evaluation.report.citation import read_citations
+from evaluation.report.closure_records import closure_records, view_records
+from evaluation.report.key_figures import compare_figures, key_figures
+from evaluation.report.palette import GRID_SCALES, PALETTE
+from evaluation.report.run_report import RunReport, describe_status
+from evaluation.report.verdict import describe_score
+from tactile.base.atomic_write import write_atomically
+from tactile.base.errors import InputError
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_CAPTIONS = {
+    "error": ("Error over time", "Distance from the truth after one alignment of the whole path."),
+    "doubt": (
+        "Doubt over time",
+        "Probability, by the map itself, that it is worse than odometry. It needs no truth.",
+    ),
+    "spread": ("Uncertainty over time", "Standard deviation of the position, by the method itself."),
+    "cost": (
+        "Cost of a step",
+        "Computing time on the machine of the run. The first chunks include the compilation of the program.",
+    ),
+}
+"""Heading and caption of each chart besides the map."""
+
+
+class PageRun(NamedTuple):
+    """A run and the settings in which it differs from the defaults: path, value and default of each; None:
+    they are unknown."""
+
+    report: RunReport
+    settings: Sequence[tuple[str, str, str]] | None
+
+
+def check_report_libraries(where: str) -> None:
+    """Checks that the libraries of the page are installed.
+
+    Args:
+        where: what asks for the page, for the error.
+
+    Raises:
+        InputError: one is not.
+    """
+    missing = [name for name in ("jinja2", "plotly") if find_spec(name) is None]
+    if missing:
+        found = f"{' and '.join(missing)} not installed"
+        raise InputError(where, found, "the extra 'report'", "pip install 'ratslam[report]'")
+
+
+def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
+    """Writes the page of one run, or of several runs and their comparison, atomically.
+
+    Args:
+        citation: the content of a CITATION.cff.
+
+    Raises:
+        InputError: the libraries of the page are not installed.
+    """
+    check_report_libraries("report")
+    page = render_page(runs, citation).encode()
+    write_atomically(path, lambda temporary: temporary.write_bytes(page))
+
+
+def render_page(runs: Sequence[PageRun], citation: str) -> str:
+    """The page as a text; equal runs give equal texts. Its arguments are those of `write_page`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    # The library takes most of the time of opening; the page works on its table before that.
+    scripts = [(_TEMPLATES / "page.js").read_text(encoding="utf-8"), get_plotlyjs()]
+    reports = [run.report for run in runs]
+    charts = [run_charts(report) for report in reports]
+    shown = {"overlay": overlay_chart(reports), "errors": error_chart(reports)} if len(runs) > 1 else {}
+    compared = {name: _figure_data(chart) for name, chart in shown.items() if chart is not None}
+    data = {
+        "palette": PALETTE,
+        "gridScales": GRID_SCALES,
+        "runs": [_run_data(*pair) for pair in zip(reports, charts, strict=True)],
+        "comparison": compared,
+    }
+    return environment.get_template("page.html").render(
+        title=", ".join(report.name for report in reports),
+        policy=content_policy(scripts),
+        style=(_TEMPLATES / "page.css").read_text(encoding="utf-8"),
+        scripts=scripts,
+        data=embedded_json(data),
+        runs=[_run_context(k, *pair) for k, pair in enumerate(zip(runs, charts, strict=True))],
+        comparison=compare_figures(reports) if len(runs) > 1 else None,
+        compared_charts=list(compared),
+        citations=read_citations(citation),
+        citation=citation,
+    )
+
+
+def content_policy(scripts: Sequence[str]) -> str:
+    """The policy of a page that loads nothing and runs these scripts only."""
+    digests = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in digests)
+    return f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:"
+
+
+def embedded_json(data: Any) -> str:
+    """JSON in which no text can end the element around it."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _run_data(report: RunReport, charts: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "charts": {name: _figure_data(chart) for name, chart in charts.items()},
+        "closures": closure_records(report.closures, report.run),
+        "views": view_records(report.views),
+    }
+
+
+def _figure_data(figure: Any) -> Any:
+    """A figure as plain data; arrays of numbers are encoded as bytes."""
+    return json.loads(figure.to_json())
+
+
+def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str, Any]:
+    report = run.report
+    return {
+        "number": number,
+        "name": report.name,
+        "status": describe_status(report),
+        "backend": report.backend,
+        "source": report.source,
+        "manifest": report.manifest,
+        "verdict": report.verdict,
+        "score": describe_score(report.card),
+        "figures": key_figures(report),
+        "sections": scorecard_lines(report.card),
+        "closures": len(report.closures.verdicts),
+        "views": report.views is not None,
+        "charts": [(name, *_CAPTIONS[name]) for name in charts if name != "map"],
+        "settings": run.settings,
+        "files": report.files,
+    }

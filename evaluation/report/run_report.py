@@ -1,0 +1,192 @@
+"""A run as the report shows it, read from its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from evaluation.artifacts.closure_table import ClosureTable, read_closure_table
+from evaluation.artifacts.closure_views import ClosureViews, read_closure_views
+from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
+from evaluation.artifacts.manifest import RUNNING, Manifest, read_manifest
+from evaluation.artifacts.run_directory import (
+    check_run_directory,
+    read_column,
+    read_run,
+    read_scorecard,
+    read_walls,
+)
+from evaluation.metrics.grid_score import GridScore
+from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.scorecard import Scorecard, score_run
+from evaluation.metrics.trajectory import align, read_tum
+from evaluation.plots.map_plot import Layers, align_layers
+from evaluation.report.run_files import RunFile, list_run_files
+from evaluation.report.verdict import Verdict, judge_map
+from tactile.base.se2 import between, compose
+
+SOURCES = {
+    "recording": "a recording",
+    "simulation": "a simulated whisker head in a maze",
+    "create_simulation": "a simulated Create with whiskers",
+    "source": "a registered source",
+    "live": "a live session",
+}
+"""Sections of a configuration that name its source, and what each is."""
+
+
+class Series(NamedTuple):
+    """Values [n] at times [n], s."""
+
+    time: np.ndarray
+    value: np.ndarray
+
+
+class RunReport(NamedTuple):
+    """A run of N steps.
+
+    Attributes:
+        backend, source: method, and kind of source; '' where the configuration cannot be read.
+        doubt: [N] probability at each step that the map is worse than odometry, NaN: not judged.
+        spread: [N] standard deviation of the position at each step, m.
+        online_error: error of the current pose. cost: computing time a step, s, against the number of steps.
+        layers: paths of the map in the frame of `walls` and `truth_lines`.
+        map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
+        truth_lines: [S, 4] true walls of a grid's arena, m. grid: in the frame of the layers.
+    """
+
+    name: str
+    manifest: Manifest
+    backend: str
+    source: str
+    run: RunArrays
+    card: Scorecard
+    verdict: Verdict
+    doubt: np.ndarray
+    spread: np.ndarray
+    online_error: Series
+    cost: Series
+    layers: Layers
+    map_path: np.ndarray | None
+    walls: np.ndarray
+    truth_lines: np.ndarray
+    grid: OccupancyGrid | None
+    grid_score: GridScore | None
+    closures: ClosureTable
+    views: ClosureViews | None
+    files: Sequence[RunFile]
+
+
+def read_run_report(directory: Path) -> RunReport:
+    """Reads a run directory, also that of an interrupted, killed or unfinished run; such a run is scored and
+    judged by what is there.
+
+    Raises:
+        InputError: the folder holds no run, a run without steps, or a malformed file.
+    """
+    check_run_directory(directory)
+    run, steps = read_run(directory), directory / "steps.csv"
+    count = len(run.time)
+    doubt = read_column(steps, "doubt", np.nan)[:count]
+    if np.isnan(run.doubt):
+        run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]) if np.isfinite(doubt).any() else np.nan)
+    name = directory.resolve().name
+    scored = (directory / "scorecard.json").exists()
+    layers, lines, grid = _layers(directory, run)
+    return RunReport(
+        name=name,
+        manifest=read_manifest(directory),
+        **_method(directory),
+        run=run,
+        card=read_scorecard(directory) if scored else score_run(run, name),
+        verdict=judge_map(run.doubt),
+        doubt=doubt,
+        spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
+        online_error=_online_error(directory),
+        cost=_cost(directory),
+        layers=layers,
+        map_path=_map_path(directory, run),
+        walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
+        truth_lines=lines,
+        grid=grid,
+        grid_score=_grid_score(directory / "gridscore.json"),
+        closures=read_closure_table(directory),
+        views=read_closure_views(directory),
+        files=list_run_files(directory),
+    )
+
+
+def describe_status(report: RunReport) -> str:
+    """How the run ended, in a few words."""
+    count, total, status = len(report.run.time), report.manifest.total, report.manifest.status
+    steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
+    if status == "complete":
+        return f"finished, {steps}"
+    if status == "interrupted":
+        return f"interrupted after {steps}"
+    if status == RUNNING:
+        return f"not finished: killed, or still running, after {steps}"
+    return f"ended as {status} after {steps}"
+
+
+def _method(directory: Path) -> dict[str, str]:
+    """Backend and kind of source by the configuration."""
+    try:
+        content = yaml.safe_load((directory / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        content = None
+    given: Mapping[str, Any] = content if isinstance(content, dict) else {}
+    source = next((words for name, words in SOURCES.items() if given.get(name) is not None), "")
+    return {"backend": str(given.get("backend", "")), "source": source}
+
+
+def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, OccupancyGrid | None]:
+    """Paths, true walls [S, 4] and grid in one frame: that of the truth, or of the grid."""
+    nothing = np.zeros((0, 4))
+    if not (directory / "grid.npz").exists():
+        return align_layers(run), nothing, None
+    grid, lines, truth = read_grid(directory / "grid.npz"), nothing, None
+    if (directory / "arena.npz").exists():
+        arena, start = read_grid_truth(directory / "arena.npz")
+        lines = arena.segments
+        truth = None if run.truth is None else between(start, run.truth)
+    elif run.truth is not None:
+        known = np.isfinite(run.truth).all(axis=1)
+        truth = compose(align(run.truth[known], run.final[known]), run.truth)
+    paths = (None if truth is None else truth[:, :2], run.odometry[:, :2], run.final[:, :2], run.nodes[:, :2])
+    return Layers(*paths), lines, grid
+
+
+def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
+    """The path of the map of a doubted run, in the frame of its layers."""
+    file = directory / "map.tum"
+    if not file.exists() or not (directory / "trajectory.tum").exists():
+        return None
+    path = read_tum(file)[1][: len(run.time)]
+    if len(path) < len(run.time) or np.array_equal(path, run.final):
+        return None
+    return align_layers(run._replace(final=path)).final
+
+
+def _online_error(directory: Path) -> Series:
+    file = directory / "online_error.csv"
+    if not file.exists():
+        return Series(np.zeros(0), np.zeros(0))
+    return Series(read_column(file, "t"), read_column(file, "error"))
+
+
+def _cost(directory: Path) -> Series:
+    file = directory / "timing.csv"
+    if not file.exists():
+        return Series(np.zeros(0), np.zeros(0))
+    step, steps, seconds = (read_column(file, name) for name in ("step", "steps", "seconds"))
+    return Series(step, seconds / np.maximum(steps, 1))
+
+
+def _grid_score(file: Path) -> GridScore | None:
+    return GridScore.model_validate_json(file.read_text(encoding="utf-8")) if file.exists() else None

@@ -1,0 +1,71 @@
+"""The verdict on a map in words: whether to believe it, and how it compares with the truth."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.scorecard import Scorecard
+
+CAUTION = 1 - DOUBTED
+"""Probability of being worse than odometry above which a map is to be taken with care."""
+
+
+class Verdict(NamedTuple):
+    """Whether to believe a map.
+
+    Attributes:
+        level: its kind. headline: a few words. reason: a sentence.
+    """
+
+    level: Literal["believed", "uncertain", "doubted", "unjudged"]
+    headline: str
+    reason: str
+
+
+def judge_map(doubt: float) -> Verdict:
+    """The verdict on a map.
+
+    Args:
+        doubt: probability that its error is worse than odometry's; NaN if the method does not judge its map.
+    """
+    if np.isnan(doubt):
+        reason = "This method does not say how far its map can be trusted."
+        return Verdict("unjudged", "The map is not judged", reason)
+    worse, better = _percent(doubt), _percent(1 - doubt)
+    if doubt > DOUBTED:
+        reason = f"It is {worse} likely worse than odometry, so the trajectory given is that of odometry."
+        return Verdict("doubted", "Do not believe this map", reason)
+    if doubt > CAUTION:
+        reason = f"It is {better} likely no worse than odometry; that leaves {worse} that it is worse."
+        return Verdict("uncertain", "Take this map with care", reason)
+    return Verdict("believed", "Believe this map", f"It is {better} likely no worse than odometry.")
+
+
+def describe_score(card: Scorecard) -> str:
+    """The position error in a sentence, or that the truth is unknown."""
+    error = card.quantities["ate_final"]
+    if error.value is None:
+        return "The truth is unknown, so there is no score."
+    text = f"Against the truth, the root mean square position error is {error.value:.3g} {error.unit}"
+    if error.odometry is None:
+        return f"{text}."
+    factor = _factor(error.value, error.odometry)
+    return f"{text}; that of odometry is {error.odometry:.3g} {error.unit}{factor}."
+
+
+def _percent(probability: float) -> str:
+    """A probability in percent; one that is not quite certain is not called certain."""
+    if 0.995 <= probability < 1:
+        return "over 99%"
+    return "under 1%" if 0 < probability < 0.005 else f"{probability:.0%}"
+
+
+def _factor(error: float, odometry: float) -> str:
+    """The ratio of two errors in words."""
+    if min(error, odometry) <= 0:
+        return ""
+    more = odometry / error
+    return f", {more:.2g} times as much" if more >= 1.05 else f": the map is {1 / more:.2g} times as far off"

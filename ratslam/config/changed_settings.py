@@ -1,0 +1,62 @@
+"""The settings of a configuration that differ from the defaults."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ValidationError
+
+from ratslam.config.run_config import LoopConfig
+from ratslam.config.strict_yaml import load, validate
+
+
+class ChangedSetting(NamedTuple):
+    """A setting: its dotted path, and its value and default as JSON ('' for a setting without default)."""
+
+    path: str
+    value: str
+    default: str
+
+
+def changed_settings(path: Path) -> list[ChangedSetting]:
+    """The settings in a configuration file that differ from the defaults, in the order of the file.
+
+    The file of a run directory is completed: values of its source and of presets are among them.
+
+    Raises:
+        InputErrors: the configuration has errors.
+    """
+    return list(_changes(validate(load(path), LoopConfig), LoopConfig(), ""))
+
+
+def _changes(section: BaseModel, default: BaseModel | None, prefix: str) -> Iterator[ChangedSetting]:
+    """The changes in a section; a default of None: it has none, because some setting must be given."""
+    values = section.model_dump(mode="json")
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        usual = field.get_default(call_default_factory=True) if default is None else getattr(default, name)
+        if isinstance(value, BaseModel):
+            same = isinstance(usual, type(value))
+            yield from _changes(value, usual if same else _default_of(type(value)), f"{prefix}{name}.")
+        elif field.is_required() or value != usual:
+            yield ChangedSetting(
+                prefix + name, _text(values[name]), "" if field.is_required() else _text(usual)
+            )
+
+
+def _default_of(section: type[BaseModel]) -> BaseModel | None:
+    try:
+        return section()
+    except ValidationError:
+        return None
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, default=_plain, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    return value.model_dump(mode="json") if isinstance(value, BaseModel) else str(value)

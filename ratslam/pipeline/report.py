@@ -1,0 +1,37 @@
+"""The report: one page of HTML about runs, made from their directories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from evaluation.report.page import PageRun, check_report_libraries, write_page
+from evaluation.report.run_report import read_run_report
+from ratslam.config.changed_settings import ChangedSetting, changed_settings
+from ratslam.config.packaged import read_citation
+from tactile.base.errors import InputError
+
+NAME = "report.html"
+"""Name of the page in a run directory."""
+
+
+def write_report(directories: Sequence[Path], path: Path) -> None:
+    """Writes the page of a run, or of several and their comparison; the file works without network.
+
+    Args:
+        directories: of runs, also of interrupted or killed ones. path: the file, replaced if it exists.
+
+    Raises:
+        InputError: a folder holds no run or a malformed one, or the extra [report] is not installed.
+    """
+    check_report_libraries("report")
+    runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
+    write_page(path, runs, read_citation())
+
+
+def _settings(directory: Path) -> list[ChangedSetting] | None:
+    """The settings of a run that differ from the defaults; None for a configuration of another version."""
+    try:
+        return changed_settings(directory / "config.yaml")
+    except InputError:
+        return None
