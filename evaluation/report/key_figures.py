@@ -7,7 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.report.run_report import RunReport, describe_status
+from evaluation.artifacts.manifest import RUNNING
+from evaluation.report.run_report import RunReport
+
+_ENDS = {"complete": "finished", RUNNING: "not finished"}
 
 
 class KeyFigure(NamedTuple):
@@ -46,7 +49,7 @@ def key_figures(report: RunReport) -> list[KeyFigure]:
 def compare_figures(reports: Sequence[RunReport]) -> Comparison:
     """The figures of several runs, a row each; "–" where a run has none."""
     columns = [
-        "run", "method", "status", "map doubted", "error, final (m)", "error, online (m)",
+        "run", "method", "status", "steps", "map doubted", "error, final (m)", "error, online (m)",
         "error, odometry (m)", "experiences", "closures", "refused", "ms a step",
     ]  # fmt: skip
     return Comparison(columns, [_row(report) for report in reports])
@@ -59,7 +62,8 @@ def _row(report: RunReport) -> list[str]:
     return [
         report.name,
         report.backend or "–",
-        describe_status(report),
+        _ENDS.get(report.manifest.status, report.manifest.status),
+        f"{len(report.run.time):,}",
         "–" if np.isnan(doubt) else f"{doubt:.0%}",
         *(_number(value) for value in (final.value, online.value, final.odometry)),
         f"{len(report.run.nodes):,}" if len(report.run.nodes) else "–",

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from evaluation.artifacts.manifest import RUNNING
 from evaluation.metrics.scorecard import scorecard_lines
 from evaluation.report.charts import error_chart, overlay_chart, run_charts
 from evaluation.report.citation import read_citations
@@ -141,6 +142,7 @@ def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str,
         "number": number,
         "name": report.name,
         "status": describe_status(report),
+        "unfinished": report.manifest.status == RUNNING,
         "backend": report.backend,
         "source": report.source,
         "manifest": report.manifest,

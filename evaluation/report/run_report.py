@@ -93,8 +93,11 @@ def read_run_report(directory: Path) -> RunReport:
     run, steps = read_run(directory), directory / "steps.csv"
     count = len(run.time)
     doubt = read_column(steps, "doubt", np.nan)[:count]
-    if np.isnan(run.doubt):
-        run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]) if np.isfinite(doubt).any() else np.nan)
+    verdict = judge_map(run.doubt)
+    if np.isnan(run.doubt) and np.isfinite(doubt).any():
+        run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]))
+        verdict = judge_map(run.doubt)
+        verdict = verdict._replace(reason=f"{verdict.reason} So it was judged at the last step in its files.")
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
@@ -104,7 +107,7 @@ def read_run_report(directory: Path) -> RunReport:
         **_method(directory),
         run=run,
         card=read_scorecard(directory) if scored else score_run(run, name),
-        verdict=judge_map(run.doubt),
+        verdict=verdict,
         doubt=doubt,
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
         online_error=_online_error(directory),

@@ -68,4 +68,6 @@ def _factor(error: float, odometry: float) -> str:
     if min(error, odometry) <= 0:
         return ""
     more = odometry / error
-    return f", {more:.2g} times as much" if more >= 1.05 else f": the map is {1 / more:.2g} times as far off"
+    if max(more, 1 / more) < 1.05:
+        return ", the same"
+    return f", {more:.2g} times as much" if more > 1 else f": the map is {1 / more:.2g} times as far off"

@@ -92,7 +92,7 @@
     const canvas = make("canvas", "", { width: views.columns, height: views.rows });
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", `View at step ${step}, ${views.shape[0]} × ${views.shape[1]} pixels`);
-    const context = canvas.getContext("2d");
+    const context = canvas.getContext("2d", { willReadFrequently: true });
     const image = context.createImageData(views.columns, views.rows);
     pixels.forEach((value, k) => image.data.set([value, value, value, 255], 4 * k));
     context.putImageData(image, 0, 0);

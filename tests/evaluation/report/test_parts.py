@@ -58,6 +58,7 @@ def test_the_score_is_told_in_words(circle) -> None:
     assert "times as far off" in words(
         circle._replace(final=circle.odometry * 2, odometry=circle.final * 1.001)
     )
+    assert words(circle._replace(final=circle.odometry)).endswith(", the same.")
     assert words(circle._replace(truth=None)) == "The truth is unknown, so there is no score."
 
 

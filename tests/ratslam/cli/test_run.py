@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[3]
 FILES = {
     "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
     "map.json", "map.npz", "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv",
-    "trajectory.tum", "truth.tum", "health.json", "map.tum",
+    "trajectory.tum", "truth.tum", "health.json", "map.tum", "timing.csv", "closure_views.npz",
 }  # fmt: skip
 SQUARE = str(ROOT / "configs" / "square.yaml")
 

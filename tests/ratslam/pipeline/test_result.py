@@ -122,6 +122,19 @@ def test_texts_of_the_page_are_escaped(result: ratslam.Result) -> None:
     assert result.scorecard.name in (page.attributes["alt"] or "")
 
 
+def test_the_page_says_whether_to_believe_the_map(result: ratslam.Result) -> None:
+    page = result._repr_html_()
+    assert "<p>The map is not judged. This method does not say" in page
+    assert "Against the truth, the root mean square position error is" in page
+
+
+def test_a_result_writes_its_report(result: ratslam.Result, tmp_path: Path) -> None:
+    page = result.report(tmp_path / "page.html")
+    assert page == tmp_path / "page.html"
+    assert HOSTILE.replace("<", "&lt;").partition(">")[0] in page.read_text(encoding="utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
 def test_runs_get_new_directories(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in a thread, where Ctrl-C cannot be caught."""
     monkeypatch.chdir(tmp_path)
