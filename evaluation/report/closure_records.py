@@ -29,11 +29,11 @@ WORDS = {"accepted": "accepted", "open": "not accepted", "undone": "undone"}
 
 
 def closure_records(table: ClosureTable, run: RunArrays) -> dict[str, Any]:
-    """The closures in columns: the steps and times that each joins, how far these are apart in truth (m; None
-    where unknown), verdict and evidence."""
+    """The closures in columns: the steps that each joins, their times (s from the first step), how far they
+    are apart in truth (m; None where unknown), verdict and evidence."""
     inside = (table.steps >= 0) & (table.steps < len(run.time))
     rows = np.where(inside, table.steps, 0)
-    time = np.where(inside, run.time[rows], np.nan)
+    time = np.where(inside, run.time[rows] - run.time[0], np.nan)
     apart = np.full(len(rows), np.nan)
     if run.truth is not None and len(rows):
         ends = np.where(inside[..., None], run.truth[rows][..., :2], np.nan)
