@@ -49,8 +49,8 @@ def key_figures(report: RunReport) -> list[KeyFigure]:
 def compare_figures(reports: Sequence[RunReport]) -> Comparison:
     """The figures of several runs, a row each; "–" where a run has none."""
     columns = [
-        "run", "method", "status", "steps", "map doubted", "error, final (m)", "error, online (m)",
-        "error, odometry (m)", "experiences", "closures", "refused", "ms a step",
+        "run", "method", "status", "steps", "doubt", "final, m", "online, m",
+        "odometry, m", "experiences", "closures", "refused", "ms a step",
     ]  # fmt: skip
     return Comparison(columns, [_row(report) for report in reports])
 

@@ -97,7 +97,9 @@ def read_run_report(directory: Path) -> RunReport:
     if np.isnan(run.doubt) and np.isfinite(doubt).any():
         run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]))
         verdict = judge_map(run.doubt)
-        verdict = verdict._replace(reason=f"{verdict.reason} So it was judged at the last step in its files.")
+        verdict = verdict._replace(
+            reason=f"{verdict.reason} This is the judgement at the last step in its files."
+        )
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
