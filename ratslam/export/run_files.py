@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.nav2 import Nav2Map, read_nav2
 from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.nav2 import Nav2Map, read_nav2
 from evaluation.artifacts.run_directory import read_column, read_run
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.run_arrays import RunArrays

@@ -15,8 +15,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.nav2 import read_nav2, write_nav2
-from evaluation.artifacts.run_directory import read_candidates, read_run
+from evaluation.artifacts.run_directory import read_run
 from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.trajectory import align, read_tum
@@ -136,7 +137,7 @@ def test_markers_show_the_graph_and_every_candidate_for_a_closure(square, export
     ((_, array),) = messages(exported)["/markers"]
     points = {marker.ns: len(marker.points) for marker in array.markers}
     run = read_run(square)
-    pairs, verdicts = read_candidates(square)
+    pairs, verdicts, _ = read_closure_table(square)
     assert len(pairs) == len(verdicts) > 100
     expected = {"graph/experiences": len(run.nodes), "graph/links": 2 * len(run.links)}
     expected |= {f"closures/{verdict}": 2 * verdicts.count(verdict) for verdict in set(verdicts)}

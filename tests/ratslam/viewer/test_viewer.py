@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evaluation.artifacts.run_directory import read_candidates, read_run
+from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.run_directory import read_run
 from ratslam.cli import main
 from ratslam.config.run_config import load_config
 from ratslam.pipeline.run import run
@@ -127,7 +128,7 @@ def test_the_file_shows_the_pose_cells_and_the_graph(shown):
 def test_the_file_shows_closures_as_they_are_judged(shown):
     directory, file = shown
     chunks = store(file)
-    pairs, verdicts = read_candidates(directory)
+    pairs, verdicts, _ = read_closure_table(directory)
     said = {}
     for chunk in chunks.stream():
         if chunk.entity_path == "/judgements":
