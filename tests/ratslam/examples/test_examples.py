@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
+import matplotlib.image as plt_image
+import numpy as np
 import pytest
 
 import ratslam.examples
@@ -19,7 +21,12 @@ from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 
 NAMES = ("dead_reckoning", "own_arrays", "own_loop", "own_metric", "taxel_array")
+STEPS = (
+    "one_packet", "path_integration", "two_packets", "view_templates", "first_loop", "places_that_look_alike",
+    "whisker_images", "grid_filter", "sensor_live",
+)  # fmt: skip
 FOLDER = Path(ratslam.examples.__file__).parent
+PICTURES = FOLDER.parents[1] / "docs" / "examples"
 
 
 @pytest.fixture
@@ -32,18 +39,36 @@ def own_names() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("own_names")
-@pytest.mark.parametrize("name", NAMES)
-def test_an_example_prints_what_its_docstring_says(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", [*NAMES, *STEPS])
+def test_an_example_prints_what_its_docstring_says(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     text = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
     said = re.findall(r"^    (.+)$", ast.get_docstring(ast.parse(text)) or "", re.MULTILINE)
     assert len(said) == 1
     runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     assert capsys.readouterr().out.splitlines() == said
+    if name in STEPS:
+        drawn, shown = (read_image(folder / f"{name}.png") for folder in (tmp_path, PICTURES))
+        assert drawn.shape == shown.shape
+        assert np.abs(drawn - shown).mean() < 0.02  # fonts differ, and in one picture the times of the steps
 
 
-@pytest.mark.parametrize("name", NAMES)
+def read_image(path: Path) -> np.ndarray:
+    """[H, W, 3] values in 0..1."""
+    return plt_image.imread(path)[..., :3]
+
+
+@pytest.mark.parametrize("name", [*NAMES, *STEPS])
 def test_an_example_is_short(name: str) -> None:
-    assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 60
+    assert len((FOLDER / f"{name}.py").read_text(encoding="utf-8").splitlines()) < 80
+
+
+def test_every_step_is_in_the_readme() -> None:
+    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"`python -m ratslam.examples.(\w+)` \| !\[\]\(../../docs/examples/(\w+).png\)", text)
+    assert named == [(name, name) for name in STEPS]
 
 
 @pytest.mark.usefixtures("own_names")
