@@ -25,7 +25,7 @@ from evaluation.plots.style import (
 from tactile.base.se2 import compose, integrate
 
 STEP, LAP, LAPS, PIXELS = 0.15, 200, 2, 12  # m per step, steps per lap, laps, pixels of a view
-SETTINGS = ["recording=null", "pose_cells.cell_size=0.2", "templates.threshold=0.06"]
+SETTINGS = ["recording=null", "session.reserve=512", "pose_cells.cell_size=0.2", "templates.threshold=0.06"]
 
 
 def main() -> None:
