@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[1]
+FORMS = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
 COPIED = ("ratslam", "tactile", "robot", "evaluation", "configs", "tests/golden")
 
 
@@ -72,7 +73,9 @@ def test_the_steps_and_the_command_run(image: Path) -> None:
     assert (image / command[-1] / "map.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("form", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda f: f.stem)
+@pytest.mark.parametrize(
+    "form", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda f: f.stem
+)
 def test_forms_ask_for_the_manifest(form: Path) -> None:
     content = yaml.safe_load(form.read_text(encoding="utf-8"))
     assert {"name", "description", "body"} <= content.keys()
@@ -82,4 +85,4 @@ def test_forms_ask_for_the_manifest(form: Path) -> None:
 
 
 def test_there_are_two_forms() -> None:
-    assert len(list((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))) == 2
+    assert len(FORMS) == 2
