@@ -69,7 +69,8 @@ def measure(poses: np.ndarray) -> np.ndarray:
     angle = poses[:, 2:] + RAYS
     ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     walls = np.where(ahead > 0, ROOM, 0.0) - (poses[:, None, :2] + (ROOM[0] / 2, 0.4))
-    return (walls / ahead).min(axis=-1).astype(np.float32)
+    ranges: np.ndarray = (walls / ahead).min(axis=-1)
+    return ranges.astype(np.float32)
 
 
 if __name__ == "__main__":
