@@ -24,17 +24,12 @@ from robot.drivers.head.protocol import (
     unpack_command,
 )
 from robot.emulators.head import usb_descriptors
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.config import BridgeEmulatorConfig
 from robot.emulators.head.faults import HeadFaults
 from robot.emulators.head.fifo import Fifo
-from robot.emulators.head.pose_source import AlongPath, PoseSource
-from robot.emulators.head.whiskers import Block, Whiskers
-from robot.world.walls import Walls
+from robot.emulators.head.sensor_array import Block, SensorArray, block_samples
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import ur10_head
 
-BLOCK = 0.01
-"""Samples are made and sent in blocks of this duration, s."""
 STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
 """Supported standard requests, by bmRequestType and bRequest."""
 
@@ -43,28 +38,18 @@ class EmulatedHead:
     """A powered head.
 
     Args:
-        walls: of the maze. place: pose over time. now: host time at which the head's clock starts, s.
+        whiskers: the simulated whiskers. now: host time at which the head's clock starts, s.
 
     Attributes:
-        fifo: frames for the host. faults: active faults. whiskers: the simulated whiskers. streaming: whether
+        fifo: frames for the host. faults: active faults. whiskers: as given. streaming: whether
         frames are made. received: number of commands by kind; "" counts ignored ones.
     """
 
-    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: PoseSource, now: float) -> None:
-        head = ur10_head(config.head)
-        self.config, self.place, self.began = config, place, now
-        self.samples = max(round(BLOCK * config.stream.rate), 2)
-        self.whiskers = Whiskers(
-            config.stream,
-            config.mechanics,
-            head,
-            walls,
-            place,
-            stream(config.seed, "sensor"),
-            self.samples,
-        )
+    def __init__(self, config: BridgeEmulatorConfig, whiskers: SensorArray, now: float) -> None:
+        self.config, self.whiskers, self.began = config, whiskers, now
+        self.samples = block_samples(config.stream.rate)
         self.fifo = Fifo(config.fifo)
-        self.faults = HeadFaults(len(head.length), stream(config.seed, "faults"))
+        self.faults = HeadFaults(whiskers.count, stream(config.seed, "faults"))
         self.streaming = False
         self.received: Counter[str] = Counter()
         self._pace = 1 + config.drift_ppm * 1e-6  # clock rate
@@ -81,7 +66,7 @@ class EmulatedHead:
         end = self.due
         if now < end:
             return False
-        if self.streaming or not self.whiskers.drives.resting:
+        if self.streaming or not self.whiskers.resting:
             block = self.whiskers.block(self._when(self._made), end)
             if self.streaming:
                 self._send(block, end)
@@ -105,7 +90,7 @@ class EmulatedHead:
             self.received[""] += 1
             return
         self.received[command.kind.name] += 1
-        self.whiskers.drives.receive(command, now)
+        self.whiskers.receive(command, now)
 
     def control(self, kind: int, request: int, value: int, size: int, now: float) -> bytes:
         """The answer to a control request, at most `size` bytes.
@@ -147,7 +132,7 @@ class EmulatedHead:
     def halt(self) -> None:
         """Retracts the whiskers, stops making frames and drops unread ones."""
         self.streaming = False
-        self.whiskers.drives.stop()
+        self.whiskers.stop()
         self.fifo.clear()
 
     def counts(self) -> dict[str, int]:
@@ -164,38 +149,29 @@ class EmulatedHead:
 
     def state(self, now: float) -> dict[str, Any]:
         """Pose and activity, as JSON values."""
-        drives, whisk = self.whiskers.drives, self.whiskers.drives.whisk
-        pose, lift = self.place.at(now)
-        doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
         return {
             "plugged": self.faults.plugged,
             "streaming": self.streaming,
-            "resting": drives.resting,
-            "whisking": doing,
-            "angle": self.whiskers.balance.before[0].tolist(),
-            "pose": pose.tolist(),
-            "lift": float(lift) if np.isfinite(lift) else None,
+            **self.whiskers.state(now),
             "commands": dict(self.received),
             "sequence": self._first + self._made,
-            "late": now - self.due + BLOCK / self._pace,
+            "late": now - self.due + self.samples / (self.config.stream.rate * self._pace),
         }
 
     def _vendor(self, request: Request, now: float) -> bytes:
         if request == Request.START:
             self.fifo.clear()
             self.streaming = True
-            if isinstance(self.place, AlongPath):
-                self.place.begin(self._when(self._made))
+            self.whiskers.begin(self._when(self._made))
         elif request == Request.STOP:
             self.halt()
         elif request == Request.CLOCK:
             return self._clock(now).to_bytes(8, "little")
         else:
-            head = self.whiskers.head
             identity = {
                 "name": "emulated head",
                 "version": f"{VERSION}",
-                "whiskers": len(head.length),
+                "whiskers": self.whiskers.count,
                 "channels": CHANNELS,
                 "rate": self.config.stream.rate,
             }

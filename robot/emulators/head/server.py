@@ -12,21 +12,24 @@ import errno
 import json
 import os
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 from robot.drivers.head.protocol import ENDPOINT_IN
 from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
 from robot.drivers.process_priority import urgent
 from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head import usb_descriptors
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
 from robot.emulators.head.pose_source import AlongPath, CarriedByArm, PoseSource
+from robot.emulators.head.whiskers import maze_whiskers
 from robot.world.head_trajectory import HeadPath
 from robot.world.scene import KidnapConfig, make_scene
 from tactile.whiskers.head_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+FaultHandler = Callable[[dict[str, Any], float], dict[str, Any]]
 ENDS = (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError)
 """Exceptions that end a connection."""
 
@@ -40,10 +43,8 @@ def serve(config: HeadEmulatorConfig) -> None:
     head = ur10_head(config.head)
     made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
     with urgent(), contextlib.ExitStack() as stack:
-        bridge = EmulatedHead(
-            config, made.surroundings.walls, _place(config, made.path, stack), time.monotonic()
-        )
-        asyncio.run(_run_server(config, bridge))
+        whiskers = maze_whiskers(config, made.surroundings.walls, _place(config, made.path, stack))
+        asyncio.run(_run_server(config, EmulatedHead(config, whiskers, time.monotonic())))
 
 
 def _place(config: HeadEmulatorConfig, path: HeadPath, stack: contextlib.ExitStack) -> PoseSource:
@@ -55,14 +56,30 @@ def _place(config: HeadEmulatorConfig, path: HeadPath, stack: contextlib.ExitSta
 
 
 async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
-    server = HeadServer(bridge)
+    async with open_server(config, bridge, bridge.do) as server:
+        print("ready", flush=True)
+        await server.run()
+
+
+@contextlib.asynccontextmanager
+async def open_server(
+    config: BridgeEmulatorConfig, bridge: EmulatedHead, do: FaultHandler
+) -> AsyncIterator[HeadServer]:
+    """A server of the USB and of the fault requests of an emulated bridge, which listens.
+
+    Args:
+        do: executes a fault request at a time, s, and returns the answer.
+
+    Raises:
+        OSError: a port is in use.
+    """
+    server = HeadServer(bridge, do)
     async with contextlib.AsyncExitStack() as stack:
         for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
             await stack.enter_async_context(
                 await asyncio.start_server(_ignore_disconnects(client), config.host, port, reuse_address=True)
             )
-        print("ready", flush=True)
-        await server.run()
+        yield server
 
 
 def _ignore_disconnects(client: Client) -> Client:
@@ -79,8 +96,8 @@ def _ignore_disconnects(client: Client) -> Client:
 class HeadServer:
     """Connections of clients to the emulated head."""
 
-    def __init__(self, bridge: EmulatedHead) -> None:
-        self.bridge = bridge
+    def __init__(self, bridge: EmulatedHead, do: FaultHandler) -> None:
+        self.bridge, self._do = bridge, do
         self._changed = asyncio.Event()
         self._owner: tuple[object, int] | None = None  # connection and plug count
 
@@ -115,7 +132,7 @@ class HeadServer:
         """Executes fault requests: one JSON line each, answered by one JSON line."""
         while line := await reader.readline():
             try:
-                answer = self.bridge.do(dict(json.loads(line)), time.monotonic())
+                answer = self._do(dict(json.loads(line)), time.monotonic())
             except (TypeError, ValueError) as error:
                 answer = {"ok": False, "error": str(error)}
             self._notify()

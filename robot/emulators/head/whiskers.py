@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from robot.emulators.head.pose_source import PoseSource
+from robot.drivers.head.protocol import Command
+from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.pose_source import AlongPath, PoseSource
+from robot.emulators.head.sensor_array import Block, block_samples
 from robot.emulators.head.servo_drives import ServoDrives
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import advance_balance, whiskers_at_rest
 from robot.simulation.head.whisk_stream import WallSweep, sensor_readings, sweep_walls
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
-from tactile.whiskers.head_geometry import Head
+from tactile.base.random_streams import stream
+from tactile.whiskers.head_geometry import Head, ur10_head
 
 STEP = 1e-4
 """Resolution of lifts, m; an arm at working height stays within it."""
-
-
-class Block(NamedTuple):
-    """T samples.
-
-    Attributes:
-        angle: [T, W] rad. deflection: [T, W, 2] rad. begins: [T] bool, the first sample of a whisk.
-        fed_back: whether feedback has lowered an amplitude.
-    """
-
-    angle: np.ndarray
-    deflection: np.ndarray
-    begins: np.ndarray
-    fed_back: bool
 
 
 class Whiskers:
@@ -60,6 +50,37 @@ class Whiskers:
         self._lowered = np.inf
         # Above this lift no tip reaches the tallest wall.
         self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
+
+    @property
+    def count(self) -> int:
+        return len(self.head.length)
+
+    @property
+    def resting(self) -> bool:
+        return self.drives.resting
+
+    def begin(self, time: float) -> None:
+        if isinstance(self.place, AlongPath):
+            self.place.begin(time)
+
+    def receive(self, command: Command, now: float) -> None:
+        self.drives.receive(command, now)
+
+    def stop(self) -> None:
+        self.drives.stop()
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Pose and activity, as JSON values."""
+        whisk = self.drives.whisk
+        pose, lift = self.place.at(now)
+        doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
+        return {
+            "resting": self.drives.resting,
+            "whisking": doing,
+            "angle": self.balance.before[0].tolist(),
+            "pose": pose.tolist(),
+            "lift": float(lift) if np.isfinite(lift) else None,
+        }
 
     def skip_block(self) -> None:
         """Skips a block without samples or motion."""
@@ -107,3 +128,17 @@ class Whiskers:
             lower = self.walls._replace(height=self.walls.height - lift)
             self._around, self._lowered = Surroundings(lower, self.head), lift
         return self._around
+
+
+def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> Whiskers:
+    """The whiskers of an emulated head among the walls of its maze."""
+    samples = block_samples(config.stream.rate)
+    return Whiskers(
+        config.stream,
+        config.mechanics,
+        ur10_head(config.head),
+        walls,
+        place,
+        stream(config.seed, "sensor"),
+        samples,
+    )

@@ -12,6 +12,7 @@ from robot.simulation.create.state_machine import (
     WheelCommand,
     drive,
     motion_end,
+    planned_rows,
 )
 from robot.simulation.create.strain_sensors import (
     WhiskersConfig,
@@ -73,7 +74,7 @@ class CreateRobot:
     def step(self, last: CreateStep, state: CreateState, command: WheelCommand) -> CreateStep:
         """Execute a motion until its planned or early end."""
         config = self.behaviour
-        count = max(int(np.ceil(command.duration / config.period - 1e-9)), 1)
+        count = planned_rows(config, command)
         time = np.minimum(np.arange(1, count + 1) * config.period, max(command.duration, MIN_DURATION))
         near = self._near(last.pose, command)
         poses = drive(command, last.pose, time)

@@ -151,42 +151,79 @@ def motion_end(
             before: [W] bool, whiskers in contact at its start.
     """
     last = len(strain) - 1
+    return early_end(config, state, strain, bumped, before, last) or planned_end(state, last)
+
+
+def planned_rows(config: BehaviourConfig, command: WheelCommand) -> int:
+    """Rows of the monitor in a motion of the planned duration, at least 1."""
+    return max(int(np.ceil(command.duration / config.period - 1e-9)), 1)
+
+
+def planned_end(state: CreateState, last: int) -> MotionEnd:
+    """The end of a motion that nothing has ended before row `last`."""
+    return MotionEnd(last, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)
+
+
+def early_end(
+    config: BehaviourConfig,
+    state: CreateState,
+    strain: np.ndarray,
+    bumped: np.ndarray,
+    before: np.ndarray,
+    last: int,
+) -> MotionEnd | None:
+    """The end of a motion by whiskers or body; None if the rows so far have none.
+
+    Args:
+        strain, bumped, before: as in `motion_end`, rows so far. last: row of the planned end.
+    """
+    if state == CreateState.BACK:  # only a contact of the body ends BACK early
+        return MotionEnd(_first(bumped), StepEnd.FREE) if bumped.any() else None
     level = np.abs(strain[..., 0])
     over = np.abs(strain).max(axis=2) > config.safety
-    ends = [(last, 9, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)]
-    if state == CreateState.BACK:
-        return MotionEnd(_first(bumped, last), StepEnd.FREE)  # only a contact of the body ends BACK early
     if state == CreateState.TURN:
         # Whiskers above the safe limit from the start end a turn only if their strain increases.
         over &= level > 1.1 * level[0]
+    ends = []
     stop = over.any(axis=1) | bumped
     if stop.any():
-        ends.append((_first(stop, last), 1, StepEnd.ABORT))
+        ends.append((_first(stop), 1, StepEnd.ABORT))
     touching = level > config.contact
     if state == CreateState.FWD1 and touching.any():
-        ends.append((_first(touching.any(axis=1), last), 2, StepEnd.HIT1))
+        ends.append((_first(touching.any(axis=1)), 2, StepEnd.HIT1))
     if state == CreateState.FWD2:
         ever = np.logical_or.accumulate(touching | before, axis=0).sum(axis=1) >= 2
         ever[: min(round(config.least / config.period), last)] = False
         if ever.any():
-            ends.append((_first(ever, last), 2, StepEnd.HIT2))
+            ends.append((_first(ever), 2, StepEnd.HIT2))
+    if not ends:
+        return None
     row, _, moment = min(ends)
     return MotionEnd(row, moment)
 
 
-def _first(flags: np.ndarray, otherwise: int) -> int:
-    return int(np.argmax(flags)) if flags.any() else otherwise
+def _first(flags: np.ndarray) -> int:
+    return int(np.argmax(flags))
 
 
 def next_state(
-    config: BehaviourConfig, doing: MachineState, moment: StepEnd, turned: float, random: np.random.Generator
+    config: BehaviourConfig,
+    doing: MachineState,
+    moment: StepEnd,
+    turned: float,
+    random: np.random.Generator,
+    least_turn: float = MIN_TURN,
 ) -> MachineState:
-    """The next state after a step that ended at `moment` and turned by `turned` rad."""
+    """The next state after a step that ended at `moment` and turned by `turned` rad.
+
+    Args:
+        least_turn: remaining turn that is not executed any more, rad: that which the odometry resolves.
+    """
     if doing.state == CreateState.BACK:
         return MachineState(CreateState.TURN, draw_turn(config.turn, random))
     if doing.state == CreateState.FWD2 or moment == StepEnd.ABORT:
         return MachineState(CreateState.BACK)
     rest = doing.rest - turned
-    if doing.state == CreateState.TURN and abs(rest) > MIN_TURN:
+    if doing.state == CreateState.TURN and abs(rest) > least_turn:
         return MachineState(CreateState.TURN, rest)
     return MachineState(CreateState.FWD2 if moment == StepEnd.HIT1 else CreateState.FWD1)

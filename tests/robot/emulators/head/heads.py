@@ -20,8 +20,10 @@ from robot.drivers.head.protocol import (
     to_counts,
 )
 from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.device import BLOCK, EmulatedHead
+from robot.emulators.head.device import EmulatedHead
 from robot.emulators.head.pose_source import AlongPath, PoseSource
+from robot.emulators.head.sensor_array import BLOCK
+from robot.emulators.head.whiskers import maze_whiskers
 from robot.world.scene import KidnapConfig, Scene, make_scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head
@@ -55,9 +57,9 @@ class HostedHead:
     ) -> None:
         self.config = HeadEmulatorConfig() if config is None else config
         here = AlongPath(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
-        self.bridge = EmulatedHead(self.config, walls, here if place is None else place, 0.0)
-        whiskers = len(self.bridge.whiskers.head.length)
-        self.decoder, self.now = Decoder(whiskers, 3), 0.0
+        self.whiskers = maze_whiskers(self.config, walls, here if place is None else place)
+        self.bridge = EmulatedHead(self.config, self.whiskers, 0.0)
+        self.decoder, self.now = Decoder(self.whiskers.count, 3), 0.0
 
     def start(self) -> None:
         """Starts the stream of frames."""

@@ -19,7 +19,7 @@ from robot.drivers.head.protocol import (
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.pose_listener import ToolPose
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.device import BLOCK
+from robot.emulators.head.sensor_array import BLOCK
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
 from robot.simulation.head.kinematic import HeadSetup
 from robot.simulation.head.quasistatic import simulate_quasistatic
@@ -116,7 +116,7 @@ def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
         head.send(drive())
         found.append(head.pass_by(1.0).values.astype(int))
     assert np.abs(found[0] - found[1]).max() <= 1
-    expected = Surroundings(lower, head.bridge.whiskers.head).contact(pose[None]).angle[0] < np.radians(60)
+    expected = Surroundings(lower, head.whiskers.head).contact(pose[None]).angle[0] < np.radians(60)
     assert expected.any() == ((found[0][..., 2] * ANGLE).max() > 0.05)
 
 

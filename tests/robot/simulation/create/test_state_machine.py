@@ -16,8 +16,10 @@ from robot.simulation.create.state_machine import (
     WheelCommand,
     draw_turn,
     drive,
+    early_end,
     motion_end,
     next_state,
+    planned_end,
     wheel_command,
 )
 from tactile.base.random_streams import stream
@@ -185,3 +187,24 @@ def test_motions_are_straight_or_on_the_spot(
 def test_contradicting_settings_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         BehaviourConfig.model_validate(changes)
+
+
+@given(
+    st.sampled_from(list(CreateState)),
+    st.lists(st.sampled_from([0.0, 1.5e-4, 3e-4, 1.9e-3, 2.1e-3]), min_size=6, max_size=6),
+    st.integers(0, ROWS),
+    st.integers(0, ROWS),
+)
+def test_a_motion_ends_at_the_same_row_when_its_rows_come_one_by_one(
+    state: CreateState, levels: list[float], since: int, bumped: int
+) -> None:
+    """The live robot sees a row at a time, the simulated one all of them."""
+    strain = quiet()
+    strain[since:, :3] = np.array(levels[:3])[:, None]
+    strain[(since + ROWS) // 2 :, :3] = np.array(levels[3:])[:, None]
+    body = np.arange(ROWS) >= bumped
+    ends = (
+        early_end(CONFIG, state, strain[:rows], body[:rows], NONE, ROWS - 1) for rows in range(1, ROWS + 1)
+    )
+    found = next((end for end in ends if end is not None), planned_end(state, ROWS - 1))
+    assert found == motion_end(CONFIG, state, strain, body, NONE)
