@@ -26,6 +26,9 @@ class CreateConfig(Settings):
     silence: Annotated[float, Field(ge=0.1, le=5)] = 0.3
     """Time without a reply after which the link counts as lost and the wheels are stopped, s."""
 
+    replug: PositiveFloat = 60.0
+    """Time for which the watchdog process waits for a disconnected port, to stop the robot on its return, s."""
+
     @model_validator(mode="after")
     def _replies_fit(self) -> CreateConfig:
         if self.silence < 2 / self.rate:

@@ -54,7 +54,7 @@ class CreateDriver:
             raise ValueError("a driver starts once")
         self._link = SerialLink(open_port(self.config.port))
         try:
-            self.watchdog = Watchdog(self.config.port, self.config.patience)
+            self.watchdog = Watchdog(self.config.port, self.config.patience, self.config.replug)
             self._wake_up(self._link)
             self._loop = ControlLoop(self.config, self._link, time.monotonic)
         except BaseException:
@@ -76,6 +76,11 @@ class CreateDriver:
     def stop(self) -> None:
         """Stops the wheels; returns when the command has been sent."""
         self._running_loop().steer(0.0, 0.0)
+        self._next_poll()
+
+    def refresh(self) -> None:
+        """Reads the sensors now; returns when the reading has arrived or failed. Commands continue."""
+        self._running_loop()
         self._next_poll()
 
     def release(self) -> None:
@@ -111,19 +116,30 @@ class CreateDriver:
         return self._link.counts if self._link else LinkCounts()
 
     def close(self) -> None:
-        """Stops the wheels, leaves safe mode and closes the port. May be called more than once."""
+        """Stops the wheels, leaves safe mode and closes the port. May be called more than once.
+
+        If the port was disconnected, the watchdog process remains for `replug` s, to stop the robot when the
+        port returns.
+        """
         self._ending.set()
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+        gone = False
         if self._link is not None:
-            with contextlib.suppress(Unplugged):
+            try:
                 self._link.send(protocol.STOP_ANYHOW)
                 self._link.send(protocol.START)
-            self._link.close()
+            except Unplugged:
+                gone = True
+            with contextlib.suppress(OSError):
+                self._link.close()
         if self.watchdog is not None:
-            self.watchdog.close()
+            if gone:
+                self.watchdog.leave()
+            else:
+                self.watchdog.close()
             self.watchdog = None
         self._loop = None
 

@@ -20,6 +20,10 @@ class NoPort(InputError):
     """The serial port cannot be opened."""
 
 
+class PortBusy(NoPort):
+    """Another program holds the serial port."""
+
+
 class Unplugged(Exception):
     """The port was disconnected."""
 
@@ -68,7 +72,7 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
     """Opens the serial port at the Create's speed.
 
     Raises:
-        NoPort: the port cannot be opened.
+        NoPort: the port cannot be opened; `PortBusy` if another program holds it.
         InputError: pyserial is not installed.
     """
     try:
@@ -95,7 +99,7 @@ def _explain(name: str, error: OSError) -> NoPort:
     if cause == errno.EACCES:
         return NoPort(name, "no permission to open it", "", "join its group: sudo usermod -aG dialout $USER")
     if cause in (errno.EAGAIN, errno.EBUSY):
-        return NoPort(name, "is held by another program", "", "end that program")
+        return PortBusy(name, "is held by another program", "", "end that program")
     return NoPort(name, f"cannot be opened ({error})", "a serial port")
 
 

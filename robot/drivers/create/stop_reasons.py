@@ -18,8 +18,8 @@ class StopReason(Enum):
     LEFT_SAFE_MODE = "a cliff, the charger or a button ended safe mode: check the robot, then `release` it"
     SILENT = "no replies: check battery and cable; the robot may still drive"
     GARBLED = "invalid replies: check the cable, and whether another program reads the port"
-    UNPLUGGED = "the port was disconnected: lift the robot (it may still drive), plug it in, start again"
-    UNGUARDED = "the watchdog process or the control thread has ended: start again"
+    UNPLUGGED = "the robot may still roll: lift it or plug it in, which stops it, then start again"
+    UNGUARDED = "the watchdog process hangs or has ended, or the control thread has: start again"
 
 
 class StopEvent(NamedTuple):

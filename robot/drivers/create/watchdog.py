@@ -1,24 +1,30 @@
 """Watchdog process: stops the wheels when the driver's process has ended or hangs. The Create has none.
 
-The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE` and sends a heartbeat, any byte, to
-its standard input. After PATIENCE s without one, or at the end of input, it stops the wheels. `q` ends it.
+The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE REPLUG` and sends a heartbeat, any byte,
+to its standard input, which it echoes. After PATIENCE s without one, or at the end of input, it stops the wheels.
+If the port is gone then, it waits REPLUG s for it to return and stops the wheels at once. `q` ends it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import queue
 import subprocess
 import sys
 import threading
+import time
 
 from robot.drivers.create import protocol
-from robot.drivers.create.serial_link import open_port
+from robot.drivers.create.serial_link import NoPort, PortBusy, SerialPort, open_port
+from robot.drivers.process_priority import become_urgent
 from tactile.base.errors import InputError
 
 START_LIMIT = 10.0
 """Time limit of the watchdog's start, s."""
+RETRY = 0.05
+"""Time between attempts to open a port that was disconnected, and between two stops on its return, s."""
 
 
 class WatchdogFailed(InputError):
@@ -26,21 +32,29 @@ class WatchdogFailed(InputError):
 
 
 class Watchdog:
-    """Starts the watchdog process and sends its heartbeat."""
+    """Starts the watchdog process and sends its heartbeat.
 
-    def __init__(self, port: str, patience: float) -> None:
+    Args:
+        patience: time without a heartbeat, or without its echo, that counts as a hang, s. replug: time for
+            which the process waits for a port that was disconnected, s.
+    """
+
+    def __init__(self, port: str, patience: float, replug: float) -> None:
+        command = [sys.executable, "-m", "robot.drivers.create.watchdog", port, repr(patience), repr(replug)]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.drivers.create.watchdog", port, repr(patience)],
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,
             start_new_session=True,  # an interrupt from the terminal must not end it first
         )
-        ready = threading.Thread(target=self._read_ready, daemon=True)
-        self._ready = b""
-        ready.start()
-        ready.join(START_LIMIT)
-        if self._ready != b"r":
+        self._patience = patience
+        self._beaten = self._asked = -math.inf  # the last beat; the oldest one that may be without an echo
+        self._heard = -math.inf
+        self._ready = threading.Event()
+        self._reader = threading.Thread(target=self._read, daemon=True, name="watchdog echo")
+        self._reader.start()
+        if not self._ready.wait(START_LIMIT):
             self.close()
             raise WatchdogFailed(port, "the watchdog process did not start")
 
@@ -50,33 +64,62 @@ class Watchdog:
         return self._process.pid
 
     def beat(self) -> bool:
-        """Sends a heartbeat; False if the process has ended."""
+        """Sends a heartbeat; False if the process has ended or hangs."""
+        now = time.monotonic()
+        late, self._beaten = now - self._beaten > self._patience, now
+        if self._heard >= self._asked:
+            self._asked = now
         try:
             assert self._process.stdin is not None
             self._process.stdin.write(b".")
         except OSError:
             return False
-        return True
+        # After a hang of this process itself the echo may wait to be read.
+        return late or now - self._asked <= self._patience
 
     def close(self) -> None:
         """Ends the process without a command to the wheels."""
-        with contextlib.suppress(subprocess.TimeoutExpired, OSError):
-            self._process.communicate(b"q", timeout=1)
+        with contextlib.suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.write(b"q")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(1)
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
+        self._close_pipes()
+
+    def leave(self) -> None:
+        """Leaves the process to stop the robot when its port returns."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        threading.Thread(target=self._outlive, daemon=True, name="watchdog end").start()
+
+    def _outlive(self) -> None:
+        self._process.wait()
+        self._close_pipes()
+
+    def _close_pipes(self) -> None:
+        self._reader.join(1)
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe:
                 with contextlib.suppress(OSError):
                     pipe.close()
 
-    def _read_ready(self) -> None:
+    def _read(self) -> None:
         assert self._process.stdout is not None
-        self._ready = self._process.stdout.read(1)
+        while self._process.stdout.read(1):
+            self._heard = time.monotonic()
+            self._ready.set()
 
 
-def watch(port: str, patience: float) -> None:
-    """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s)."""
+def watch(port: str, patience: float, replug: float) -> None:
+    """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s).
+
+    Args:
+        replug: time for which a disconnected port is awaited, s.
+    """
     line = open_port(port, exclusive=False)
     beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
@@ -86,7 +129,7 @@ def watch(port: str, patience: float) -> None:
         beats.put(b"")
 
     threading.Thread(target=read_beats, daemon=True).start()
-    print("r", end="", flush=True)
+    _say(b"r")
     beating = False  # the wheels are still before the first heartbeat
     while True:
         try:
@@ -97,14 +140,50 @@ def watch(port: str, patience: float) -> None:
             return
         if data:
             beating = True
+            _say(b".")
             continue
         try:
             line.write(protocol.STOP_ANYHOW)
-        except OSError:  # the port was disconnected
+        except OSError:
+            line.close()  # else the system may give the returning port another name
+            _stop_on_return(port, replug)
             return
         if data is not None:
             return
 
 
+def _stop_on_return(port: str, replug: float) -> None:
+    """Waits for a disconnected port and stops the robot on it, which then leaves safe mode.
+
+    Ends without a command if another program has the port: a new session stops the robot itself.
+    """
+    end = time.monotonic() + replug
+    while time.monotonic() < end:
+        try:
+            if os.name == "nt" or os.path.exists(port):
+                _stop_for_good(open_port(port))
+                return
+        except PortBusy:
+            return
+        except (NoPort, OSError):
+            pass  # not yet
+        time.sleep(RETRY)
+
+
+def _stop_for_good(line: SerialPort) -> None:
+    for _ in range(2):  # the first bytes after the connection may be lost
+        line.write(protocol.STOP_ANYHOW)
+        time.sleep(RETRY)
+    line.write(protocol.START)
+    time.sleep(RETRY)  # until the byte is on the line
+    line.close()
+
+
+def _say(word: bytes) -> None:
+    with contextlib.suppress(OSError):  # the driver's process has ended
+        os.write(1, word)
+
+
 if __name__ == "__main__":
-    watch(sys.argv[1], float(sys.argv[2]))
+    become_urgent()
+    watch(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]))

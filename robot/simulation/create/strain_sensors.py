@@ -143,15 +143,57 @@ def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.rand
     """Horizontal and vertical strain [T, 2] from vibration of the body, from the start of a motion."""
     from scipy.signal import lfilter  # slow to import
 
-    time = np.arange(count) / rate
-    damped = np.exp(-time / config.decay)
-    amplitude, phase = config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
-    ringing = amplitude * damped[:, None] * np.sin(2 * np.pi * config.frequency * time[:, None] + phase)
-    pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
-    back = [1.0, -2 * pole.real, abs(pole) ** 2]
+    amplitude, phase = _draw_ringing(config, random)
+    ringing = _ringing(config, amplitude, phase, np.arange(count) / rate)
+    back = _resonance(config, rate)
     lead = int(5 * config.decay * rate)  # until the transient has decayed
     rumble = lfilter([1.0], back, random.standard_normal((lead + count, 2)), axis=0)[lead:]
     return ringing + config.rumble / _gain(back) * rumble
+
+
+class BodyVibration:
+    """`body_vibration` of a robot that starts, rolls and stops, block by block."""
+
+    def __init__(self, config: ShakeConfig, rate: float, random: np.random.Generator) -> None:
+        self._config, self._rate, self._random = config, rate, random
+        self._back = _resonance(config, rate)
+        self._state = np.zeros((2, 2))
+        self._since = 0  # samples since the last start
+        self._amplitude = self._phase = np.zeros(2)
+
+    def advance(self, count: int, *, rolls: bool, starts: bool) -> np.ndarray:
+        """The next [T, 2] strains.
+
+        Args:
+            rolls: whether the wheels turn. starts: whether a motion has started.
+        """
+        from scipy.signal import lfilter  # slow to import
+
+        if starts:
+            self._since = 0
+            self._amplitude, self._phase = _draw_ringing(self._config, self._random)
+        time = (self._since + np.arange(count)) / self._rate
+        self._since += count
+        drive = self._random.standard_normal((count, 2)) * rolls
+        rumble, self._state = lfilter([1.0], self._back, drive, axis=0, zi=self._state)
+        ringing = _ringing(self._config, self._amplitude, self._phase, time)
+        return ringing + self._config.rumble / _gain(self._back) * rumble
+
+
+def _draw_ringing(config: ShakeConfig, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude and phase [2] of the vibration at the start of a motion."""
+    return config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
+
+
+def _ringing(config: ShakeConfig, amplitude: np.ndarray, phase: np.ndarray, time: np.ndarray) -> np.ndarray:
+    damped = np.exp(-time / config.decay)
+    return amplitude * damped[:, None] * np.sin(2 * np.pi * config.frequency * time[:, None] + phase)
+
+
+def _resonance(config: ShakeConfig, rate: float) -> list[float]:
+    """Recursive coefficients of the resonance at a sample rate, Hz."""
+    pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
+    return [1.0, -2 * pole.real, abs(pole) ** 2]
 
 
 def _gain(back: list[float]) -> float:

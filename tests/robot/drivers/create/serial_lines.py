@@ -86,7 +86,7 @@ class Emulated:
             bufsize=1,
         )
         assert self.process.stdout
-        self.path = self.process.stdout.readline().strip()
+        self.path = self.process.stdout.readline().split()[0]
 
     def do(self, what: str, **more: Any) -> Any:
         assert self.process.stdin

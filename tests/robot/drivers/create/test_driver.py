@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -35,8 +37,10 @@ def emulated() -> Iterator[Emulated]:
 
 
 def create(emulated: Emulated, **settings: float) -> CreateDriver:
-    """A driver with longer time limits than usual, since the machine may be busy."""
-    return CreateDriver(CreateConfig(port=emulated.path, **{"silence": 5.0, "patience": 5.0, **settings}))
+    """A driver with longer time limits than usual, since the machine may be busy. Its watchdog does not wait
+    for a disconnected port, since the next emulator may have a terminal of the same name."""
+    usual = {"silence": 5.0, "patience": 5.0, "replug": 0.01}
+    return CreateDriver(CreateConfig(port=emulated.path, **{**usual, **settings}))
 
 
 def drive_for(driver: CreateDriver, seconds: float, forward: float, turn: float = 0.0) -> None:
@@ -161,6 +165,40 @@ def test_unplugging_stops_a_driving_robot(emulated: Emulated) -> None:
     driver.close()
     with pytest.raises(CommandRefused, match="not started"):
         driver.drive(0.1, 0.0)
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_rolling_robot_is_stopped_when_its_port_returns(tmp_path: Path, killed: bool) -> None:
+    """By the watchdog process: the driver, or the program that it runs in, has ended."""
+    link = str(tmp_path / "create.tty")
+    robot = Emulated("--config", json.dumps({"port": link}))
+    program = subprocess.Popen([sys.executable, "-c", DRIVES, link])
+    try:
+        until(lambda: robot.do("state")["wheels"] == [100, 100])
+        robot.do("unplug")
+        if killed:
+            program.kill()
+        else:
+            assert program.wait(30) != 0  # refused to drive on
+        assert robot.do("state")["wheels"] == [100, 100]
+        robot.do("plug")
+        until(lambda: robot.do("state")["mode"] == "PASSIVE")
+        assert robot.do("state")["wheels"] == [0, 0]
+    finally:
+        program.kill()
+        program.wait()
+        robot.close()
+
+
+def test_a_hanging_watchdog_is_noticed(emulated: Emulated) -> None:
+    with create(emulated, patience=1.0) as driver:
+        assert driver.watchdog is not None
+        until(lambda: driver.drive(0.1, 0.0) or emulated.do("state")["wheels"] == [100, 100])
+        os.kill(driver.watchdog.pid, signal.SIGSTOP)
+        until(lambda: driver.active_stop)
+        assert driver.active_stop
+        assert driver.active_stop.reason is StopReason.UNGUARDED
+        until(lambda: emulated.do("state")["wheels"] == [0, 0])
 
 
 def test_switching_off_is_reported(emulated: Emulated) -> None:

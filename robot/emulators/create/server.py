@@ -1,0 +1,215 @@
+"""The process of an emulated Create: its serial line and, with an arena, the bridge of its whiskers.
+
+Fault requests are lines of JSON, answered by a line: on standard input, or on the bridge's fault port with
+`"device": "create"`; without that the port takes those of the bridge.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import sys
+import threading
+import time
+from typing import Any
+
+from robot.drivers.create.protocol import Bumps
+from robot.drivers.process_priority import urgent
+from robot.emulators.create.config import CreateEmulatorConfig
+from robot.emulators.create.robot import EmulatedCreate
+from robot.emulators.create.serial_line import LineFaults, Terminal
+from robot.emulators.create.whiskers import CreateWhiskers
+from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.server import open_server
+from robot.world.random_arena import make_arena
+from tactile.base.random_streams import stream
+
+TICK = 0.005
+"""Longest time between two moments at which the robot's motion is computed, s."""
+
+
+class CreateServer:
+    """An emulated Create in real time; `start` begins to serve its serial line.
+
+    Attributes:
+        robot: the robot. began: its time 0 on the host's monotonic clock, s.
+    """
+
+    def __init__(self, config: CreateEmulatorConfig) -> None:
+        world = config.world
+        arena = None if world is None else make_arena(world.arena, config.seed)
+        self.robot, self.faults = EmulatedCreate(config, arena), LineFaults(config.seed)
+        self.terminal = Terminal(config.port)
+        self.began = time.monotonic()
+        self._free = 0.0  # loop time at which the line has sent everything
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def start(self) -> None:
+        """Serves the serial line in the running event loop."""
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self.terminal.master, self._receive)
+
+    def move(self, now: float) -> None:
+        """Advances the robot to a time, s, host's monotonic clock."""
+        self.robot.advance_to(now - self.began)
+
+    def do(self, order: dict[str, Any]) -> dict[str, Any]:
+        """Executes a fault request; returns the answer.
+
+        Raises:
+            KeyError, TypeError, ValueError: invalid arguments.
+        """
+        self.move(time.monotonic())
+        do, robot = order.get("do"), self.robot
+        if do == "bump":
+            robot.touch(robot.bumps | Bumps.BUMPED)
+        elif do == "drop":
+            robot.touch(robot.bumps | Bumps.DROPPED_LEFT)
+        elif do == "cliff":
+            robot.touch(robot.bumps, cliff=True)
+        elif do == "clear":
+            robot.touch(Bumps(0))
+            self.faults.lose = self.faults.scramble = 0
+        elif do == "off":
+            robot.switch_off()
+        elif do in ("garbage", "cut"):
+            setattr(self.faults, do, int(order["bytes"]))
+        elif do in ("lose", "scramble"):
+            setattr(self.faults, do, int(order["replies"]))
+        elif do == "trickle":
+            self.faults.trickle = float(order["seconds"])
+        elif do == "unplug":
+            self._unplug()
+        elif do == "plug":
+            self._plug()
+        elif do == "die":
+            os._exit(1)
+        elif do == "state":
+            return self._state()
+        else:
+            return {"error": f"unknown: {do!r}"}
+        return {"ok": True}
+
+    def answer(self, line: str | bytes) -> dict[str, Any]:
+        """The answer to a line of JSON, or the error in it."""
+        try:
+            return self.do(json.loads(line))
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
+            return {"error": repr(error)}
+
+    def _state(self) -> dict[str, Any]:
+        robot = self.robot
+        return {
+            **robot.base._asdict(),
+            "time": robot.time,
+            "began": self.began,
+            "wheels": [robot.right, robot.left],
+            "mode": robot.mode.name,
+            "bumps": int(robot.bumps),
+            "plugged": self.terminal.plugged,
+            "drives": robot.drives,
+            "speeds": robot.speeds,
+            "queries": robot.queries,
+            "unknown": robot.unknown,
+        }
+
+    def _unplug(self) -> None:
+        if self.terminal.plugged and self._loop is not None:
+            self._loop.remove_reader(self.terminal.master)
+        self.terminal.unplug()
+
+    def _plug(self) -> None:
+        if not self.terminal.plugged and self._loop is not None:
+            self.terminal.plug()
+            self._loop.add_reader(self.terminal.master, self._receive)
+
+    def _receive(self) -> None:
+        self.move(time.monotonic())
+        try:
+            data = os.read(self.terminal.master, 4096)
+        except OSError:  # no data after all
+            return
+        for whole in self.robot.receive(data):
+            good = self.terminal.has_create_baud_rate()
+            reply = self.faults.disturb(whole if good else self.faults.noise(whole))
+            step = self.faults.trickle
+            for piece in [reply[i : i + 1] for i in range(len(reply))] if step else [reply]:
+                self._send(piece, step)
+
+    def _send(self, piece: bytes, after: float) -> None:
+        """Sends bytes some time, s, after all bytes before them."""
+        assert self._loop is not None
+        now, master = self._loop.time(), self.terminal.master
+        self._free = max(self._free, now) + after
+        if self._free <= now:
+            self._write(master, piece)
+        else:
+            self._free += 1e-6  # the order of equal times is not defined
+            self._loop.call_at(self._free, self._write, master, piece)
+
+    def _write(self, master: int, piece: bytes) -> None:
+        if self.terminal.plugged and master == self.terminal.master:
+            with contextlib.suppress(BlockingIOError):  # nobody reads
+                os.write(master, piece)
+
+
+def serve(config: CreateEmulatorConfig) -> None:
+    """Emulates a Create until the process ends; prints the port and `ready` when it listens.
+
+    Raises:
+        InputError: no pseudo-terminals, an invalid arena, or the port's name is taken.
+        OSError: a port of the bridge is in use.
+    """
+    server = CreateServer(config)
+    try:
+        with urgent():
+            asyncio.run(_run(config, server))
+    finally:
+        server.terminal.unplug()
+
+
+async def _run(config: CreateEmulatorConfig, server: CreateServer) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        if config.world is not None:
+            bridge = _bridge(config, server)
+
+            def do(request: dict[str, Any], now: float) -> dict[str, Any]:
+                if request.get("device") != "create":
+                    return bridge.do(request, now)
+                return server.do(request)
+
+            head = await stack.enter_async_context(open_server(config.world.bridge, bridge, do))
+            task = asyncio.create_task(head.run())
+            stack.callback(task.cancel)
+        server.start()
+        _read_requests(server)
+        print(f"{server.terminal.path} ready", flush=True)
+        while True:
+            server.move(time.monotonic())
+            await asyncio.sleep(TICK)
+
+
+def _bridge(config: CreateEmulatorConfig, server: CreateServer) -> EmulatedHead:
+    """The bridge of the whiskers."""
+    assert config.world is not None
+    random = stream(config.seed, "strain")
+    whiskers = CreateWhiskers(config.world, server.robot, server.move, random)
+    return EmulatedHead(config.world.bridge, whiskers, time.monotonic())
+
+
+def _read_requests(server: CreateServer) -> None:
+    """Answers requests from standard input, in the running event loop, until it ends."""
+    loop = asyncio.get_running_loop()
+
+    def answer(line: str) -> None:
+        print(json.dumps(server.answer(line)), flush=True)
+
+    def read() -> None:
+        for line in sys.stdin:
+            if line.strip():
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    loop.call_soon_threadsafe(answer, line)
+
+    threading.Thread(target=read, daemon=True, name="requests").start()
