@@ -23,25 +23,26 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     live = commands.add(
-        "live", _live, "map while a robot arm carries the whisker head",
-        "live live_maze --set live.whisks=60", "live",
+        "live", _live, "map with an arm and its whisker head, or a Create",
+        "live live_create --set live.create.port=/dev/ttyUSB0", "live",
     )  # fmt: skip
     add_config(live)
     add_run_directory(live)
     live.add_argument("--ur-host", metavar="HOST", help="address of the arm's controller")
     live.add_argument(
         "--head", metavar="ADDRESS",
-        help="usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulated head",
+        help="of the whiskers: usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulator",
     )  # fmt: skip
     add_rerun(live)
 
     emulate = commands.add(
-        "emulate", _emulate, "emulate the arm's controller or the whisker head",
+        "emulate", _emulate, "emulate the arm's controller, the head or a Create",
         "emulate ur10 live_maze", "live",
     )  # fmt: skip
     emulate.add_argument(
-        "device", choices=("ur10", "head"), help="the arm's controller, or the whisker head in its maze"
-    )
+        "device", choices=("ur10", "head", "create"),
+        help="the arm's controller, the whisker head in its maze, or a whiskered Create in its arena",
+    )  # fmt: skip
     add_config(emulate)
     emulate.add_argument(
         "--host", metavar="HOST", help="loopback address to listen on (default: from the configuration)"
@@ -71,11 +72,19 @@ def _live(arguments: argparse.Namespace) -> int:
 
 def _emulate(arguments: argparse.Namespace) -> int:
     config, session = _read_live_config(arguments, head_address=None)
-    from robot.live.emulator_config import arm_emulator_config, head_emulator_config
+    from robot.live.emulator_config import arm_emulator_config, create_emulator_config, head_emulator_config
 
     head = config.touch.head
+    if (arguments.device == "create") != (session.create is not None):
+        found = "that of a Create" if session.create else "that of an arm"
+        cure = "the packaged `live_create` is for `create`, `live_maze` for `ur10` and `head`"
+        raise InputError(f"{arguments.config}: live", found, f"one for `{arguments.device}`", cure)
     try:
-        if arguments.device == "ur10":
+        if session.create is not None:
+            from robot.emulators.create import serve as serve_create
+
+            serve_create(create_emulator_config(session.create, arguments.host or session.head.address))
+        elif arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
             serve(arm_emulator_config(session, head, arguments.host))
@@ -130,7 +139,7 @@ def _read_live_config(
         arguments.set.append(f"live.head.address={head_address}")
     config = read_config(arguments)
     if config.live is None:
-        cure = "the packaged `live_maze` is an example; `run` maps recordings and simulations"
+        cure = "`live_maze` and `live_create` are examples; `run` maps recordings and simulations"
         raise InputError(f"{arguments.config}: live", "missing", "settings of a live session", cure)
     return config, config.live
 

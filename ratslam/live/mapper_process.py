@@ -61,7 +61,8 @@ class MappedSample(NamedTuple):
     """The result of a sample.
 
     Attributes:
-        number: of the sample. pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
+        number: of the sample; a front end may add the motion of one to the next, which then has no result.
+            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
             name. seconds: computing time. doubt: see `ratslam.core.session.Step`.
     """
 
@@ -100,8 +101,9 @@ class Mapper:
         """Sends the job, for which the process compiles. Returns at once; see `compiled`."""
         self._outbox.put(job)
 
-    def begin(self, calibration: Calibration) -> None:
-        """Sends the head's calibration: the process makes its directory. Returns at once; see `ready`."""
+    def begin(self, calibration: Calibration | None) -> None:
+        """Sends the head's calibration, if it has one: the process makes its directory. Returns at once; see
+        `ready`."""
         self._outbox.put(calibration)
 
     def compiled(self) -> bool:
@@ -124,8 +126,8 @@ class Mapper:
     def behind(self) -> float:
         """Waiting time of the oldest sample that is not mapped yet, s."""
         self.receive()
-        waiting = len(self.mapped) < len(self._offered)
-        return time.monotonic() - self._offered[len(self.mapped)] if waiting else 0.0
+        done = self.mapped[-1].number + 1 if self.mapped else 0
+        return time.monotonic() - self._offered[done] if done < len(self._offered) else 0.0
 
     def receive(self) -> None:
         """Reads the messages of the process."""
@@ -203,7 +205,8 @@ class PipeSource:
     """The samples received through a pipe, as a source.
 
     Attributes:
-        interrupted: whether the session ended early. received: arrival of the last sample, s.
+        interrupted: whether the session ended early. received: arrival of the last sample, s. count: samples
+            so far.
     """
 
     name, digest, length = "live", "", None
@@ -212,7 +215,7 @@ class PipeSource:
         self.rate_hz, self.view_shape, self.whiskers = job.rate_hz, job.view_shape, job.whiskers
         self.info = job.info
         self.interrupted = True  # until the parent sends the flag
-        self.received = 0.0
+        self.received, self.count = 0.0, 0
         self._line = line
 
     def calibrate(self) -> None:
@@ -232,7 +235,7 @@ class PipeSource:
             if isinstance(message, bool):
                 self.interrupted = message
                 return
-            self.received = time.monotonic()
+            self.received, self.count = time.monotonic(), self.count + 1
             yield message
 
     def __enter__(self) -> Self:
@@ -282,12 +285,14 @@ def _map(line: Connection) -> None:
         with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
             _redirect_stderr(job.directory / LOG)
             line.send(True)
-            for number, sample in enumerate(source):
+            for sample in source:
                 (step,) = runner.process([sample])
                 action = Action(int(step.estimate.action)).name.lower()
                 took = time.monotonic() - fed.received
                 place = int(step.estimate.place)
-                _send(line, MappedSample(number, np.asarray(step.pose), place, action, took, step.doubt))
+                _send(
+                    line, MappedSample(fed.count - 1, np.asarray(step.pose), place, action, took, step.doubt)
+                )
             if runner.session.steps:
                 _send(line, runner.finish(fed.interrupted))
 

@@ -1,22 +1,28 @@
-"""Settings of a live session: arm, head, route, and checks before the start."""
+"""Settings of a live session: robot, head, route, and checks before the start."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.ur10.config import ArmConfig
+from robot.live.create_config import CreateLiveConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.sources.odometry import OdometryConfig
 from tactile.base.config import Settings
 
+ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "budget", "grace")
+"""Settings without a meaning for a Create."""
+
 
 class LiveConfig(Settings):
-    """A session on an arm with a whisker head: `python -m ratslam live config.yaml`."""
+    """A session of `python -m ratslam live config.yaml`: an arm with a head, or a Create with whiskers."""
 
+    create: CreateLiveConfig | None = None
+    """A Create instead of the arm; of the settings below it uses `head`, `gap`, `residual` and `room`."""
     arm: ArmConfig = ArmConfig()
     """The arm and its limits."""
     head: HeadLinkConfig = HeadLinkConfig()
@@ -50,6 +56,15 @@ class LiveConfig(Settings):
     seed: int = 0
     """Random seed of the errors added to the odometry."""
 
+    @model_validator(mode="after")
+    def _one_robot(self) -> LiveConfig:
+        given = [name for name in ARM_ONLY if name in self.model_fields_set]
+        if self.create is not None and given:
+            raise ValueError(f"create and {', '.join(given)}: a session has one robot, a Create or an arm")
+        return self
+
     def resolved(self, folder: Path) -> LiveConfig:
         """A copy with relative paths taken from the folder (of the configuration file)."""
+        if self.create is not None:
+            return self.model_copy(update={"create": self.create.resolved(folder)})
         return self.model_copy(update={"plan": self.plan.resolved(folder)})

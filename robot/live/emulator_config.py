@@ -1,15 +1,22 @@
-"""Configurations of emulators for a live session: an arm above its route's start, a head in its maze."""
+"""Configurations of emulators for a live session: an arm above its route's start, a head in its maze, a
+Create in its arena."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 
 from robot.drivers.head.address import Address
 from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.create.config import CreateEmulatorConfig, CreateWorldConfig
+from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.live.config import LiveConfig
+from robot.live.create_config import CreateLiveConfig
 from robot.live.route import plan_path
+from robot.simulation.head.beam import StreamConfig
+from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 
@@ -41,3 +48,33 @@ def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None 
         arm_hz=config.arm.hz,
         placing=config.arm.placing,
     )
+
+
+def create_emulator_config(create: CreateLiveConfig, address: str) -> CreateEmulatorConfig:
+    """A Create in the arena of the session's plan, its serial port a link of the session's name.
+
+    Args:
+        address: of its whiskers, HOST or HOST:PORT.
+
+    Raises:
+        InputError: the address or the port is that of a real device.
+    """
+    where = Address.parse(address)
+    if where.host is None:
+        raise InputError("live.head.address", address, "HOST or HOST:PORT of the emulated whiskers")
+    if Path(create.port).is_absolute() and Path("/dev") in Path(create.port).parents:
+        cure = "--set live.create.port=create.tty"
+        raise InputError("live.create.port", create.port, "a name for the emulated port", cure)
+    plan, whiskers = create.plan, create.plan.whiskers
+    bridge = BridgeEmulatorConfig(
+        host=where.host, port=where.port, stream=StreamConfig(rate=whiskers.rate), seed=plan.seed
+    )
+    world = CreateWorldConfig(
+        arena=plan.arena,
+        whiskers=whiskers,
+        wheels=plan.wheels,
+        body=plan.behaviour.body,
+        bridge=bridge,
+        strain_per_radian=create.strain_per_radian,
+    )
+    return CreateEmulatorConfig(wheel_base=create.wheel_base, seed=plan.seed, port=create.port, world=world)

@@ -17,10 +17,11 @@ import numpy as np
 from robot.drivers.head.cycle_assembly import MAX_FRAMES, Cut, select_frames
 from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import Fault, SessionOutcome
-from robot.recordings.cdr import encode_truth
+from robot.recordings.cdr import encode, encode_truth
 from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
 from robot.recordings.mcap_writer import McapWriter, RecordingWriteError
 from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
+from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 
 BLOCK_TIME = 0.15
@@ -62,7 +63,7 @@ class LiveRecorder:
 
     @property
     def count(self) -> int:
-        """Number of whisks so far."""
+        """Number of readings so far."""
         return self._tape.count
 
     def add_frames(self, frames: Frames, arrival: float) -> None:
@@ -103,6 +104,16 @@ class LiveRecorder:
                 if truth is not None:
                     self._tape.append(TRUTH, cut.time, encode_truth(cut.time, truth))
                 self._tape.append(CUT, cut.time, encode_cut(cut))
+                self._tape.flush()
+
+    def add_sample(self, sample: Sample) -> None:
+        """Adds a reading that holds all that was measured, after the frames so far, and flushes the file."""
+        described = self._tape.description
+        name, message = encode(sample, described.view_shape, described.whiskers)
+        with self._writing(sample.time) as able:
+            if able:
+                self._write()
+                self._tape.append(name, sample.time, message)
                 self._tape.flush()
 
     def add_event(self, time: float, name: str, text: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 import time
 from collections.abc import Callable
 from typing import Self
@@ -10,38 +9,21 @@ from typing import Self
 import numpy as np
 
 from robot.drivers.clock_sync import ClockSync
-from robot.drivers.head.decoder import Frames
 from robot.drivers.head.device import open_bridge
-from robot.drivers.head.protocol import FrameFlag
-from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.whisk_control import HeadDriver
-from robot.drivers.outcome import Fault, SessionOutcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.live.arm_odometry import ArmOdometry
 from robot.live.config import LiveConfig
+from robot.live.head_stream import HeadStream
+from robot.live.polling import TICK, OperatorStop, SessionFault, session_fault, wait_until
 from robot.live.recorder import LiveRecorder
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
-TICK = 0.01
-"""Period of the poll, s."""
 MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
-
-MAX_CLOCK_STEP = 2e-3
-"""Largest step of the head's clock against its sample count, s."""
-
-
-class SessionFault(Exception):
-    """A fault ends the session."""
-
-    def __init__(self, fault: Fault) -> None:
-        super().__init__(str(fault))
-        self.fault = fault
-
-
-class OperatorStop(Exception):
-    """The operator ends the session."""
 
 
 class Rig:
@@ -51,9 +33,8 @@ class Rig:
         stopped: whether the operator has requested the end.
 
     Attributes:
-        arm, head, driver: the devices. clock: of the head. odometer: of the arm. epoch: time 0 of the session
-            on the host's clock, s. state_ages: age of the newest state at each poll, s. whisk_starts:
-            sequence numbers of the first frames of whisks. restarts: number of connections of the head.
+        arm, head, driver: the devices. stream: samples and clock of the head. odometer: of the arm. epoch:
+            time 0 of the session on the host's clock, s. state_ages: age of the newest state at each poll, s.
             recorder: recorder of all data, or None.
     """
 
@@ -69,20 +50,13 @@ class Rig:
             on_overload=self._overload,
         )
         self.driver = HeadDriver(self.head, self.shape)
-        self.clock, self.odometer = ClockSync(), ArmOdometry(config)
+        self.stream, self.odometer = HeadStream(self.head), ArmOdometry(config)
         self.epoch = time.monotonic()
         self.state_ages: list[float] = []
-        self.whisk_starts: list[int] = []
-        self.restarts = 0
         self.recorder: LiveRecorder | None = None
         self._stopped = stopped
         self._arm_clock = ClockSync()
         self._seen = 0
-        self._ahead: float | None = None  # s by which the head's clock leads its sample count
-        self._uneven = 0.0
-        self._blocks: queue.SimpleQueue[tuple[Frames, float] | None] = queue.SimpleQueue()
-        self.head.on_restart.append(lambda device, host: self._blocks.put(None))
-        self.head.listeners.append(lambda frames, arrival: self._blocks.put((frames, arrival)))
 
     def now(self) -> float:
         """Session time, s."""
@@ -96,35 +70,17 @@ class Rig:
         """
         self._take_frames()
         self._take_states()
-        fault = self.arm.fault or self.head.fault or (self.recorder and self.recorder.fault)
+        fault = self.arm.fault or self.stream.fault or (self.recorder and self.recorder.fault)
         if fault:
             raise SessionFault(fault)
-        for jumped, whose in ((self.clock.jumps, "head"), (self._arm_clock.jumps, "controller")):
-            if jumped:
-                raise SessionFault(
-                    Fault(SessionOutcome.CLOCK_JUMPED, f"the {whose}'s clock jumped", time.monotonic())
-                )
-        if self._uneven > MAX_CLOCK_STEP:
-            detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its sample count"
-            raise SessionFault(Fault(SessionOutcome.CLOCK_JUMPED, detail, time.monotonic()))
+        if self._arm_clock.jumps:
+            raise session_fault(SessionOutcome.CLOCK_JUMPED, "the controller's clock jumped")
         if self._stopped():
             raise OperatorStop
 
     def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
-        """Polls until a condition is true.
-
-        Args:
-            longest: time limit, s. late: outcome after that time. what: the awaited event, for the fault.
-
-        Raises:
-            SessionFault, OperatorStop.
-        """
-        due = time.monotonic() + longest
-        while not done():
-            if time.monotonic() > due:
-                raise SessionFault(Fault(late, f"{what} took more than {longest:g} s", time.monotonic()))
-            self.poll()
-            time.sleep(TICK)
+        """Polls until a condition is true; see `robot.live.polling.wait_until`."""
+        wait_until(self.poll, done, longest, late, what)
 
     def begin(self) -> None:
         """Sets time 0 of the session to now."""
@@ -149,34 +105,10 @@ class Rig:
         if self.recorder is not None:
             self.recorder.add_event(self.now(), name, text)
 
-    @property
-    def streaming(self) -> bool:
-        """Whether the head sends samples."""
-        return self.head.state.link is LinkState.STREAMING
-
     def _take_frames(self) -> None:
-        while not self._blocks.empty():
-            block = self._blocks.get()
-            if block is None:  # the head was reconnected: its clock may have changed
-                self.clock, self.whisk_starts = ClockSync(), []
-                self.restarts += 1
-                self._ahead = None
-                continue
-            frames, arrival = block
-            self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
-            self._count(frames)
-            begins = (frames.flags & np.uint8(FrameFlag.CYCLE)) > 0
-            self.whisk_starts += frames.sequence[begins].tolist()
+        for frames, arrival in self.stream.take():
             if self.recorder is not None:
                 self.recorder.add_frames(frames, arrival - self.epoch)
-
-    def _count(self, frames: Frames) -> None:
-        """Checks the head's clock against its sample count; both are independent of the host's load."""
-        assert self.head.identity is not None
-        ahead = frames.time * 1e-6 - frames.sequence / self.head.identity.rate
-        before = ahead[0] if self._ahead is None else self._ahead
-        self._uneven = max(self._uneven, float(np.abs(ahead - before).max()))
-        self._ahead = float(ahead[-1])
 
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)

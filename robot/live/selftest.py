@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from robot.drivers.head.reader import HeadReader
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.startup_checks import check_controller
 from robot.live.config import LiveConfig
+from robot.live.head_stream import HeadStream
 from robot.live.rig import Rig
 from tactile.base.errors import InputError
 
@@ -43,10 +45,7 @@ def find_devices(rig: Rig) -> Iterator[str]:
     Raises:
         InputError: a device is missing or not ready; the error gives its cure.
     """
-    rig.head.start()
-    identity = rig.head.identity
-    assert identity is not None
-    yield f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
+    yield start_head(rig.head)
     version = ".".join(map(str, check_controller(rig.config.arm).version))
     yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
 
@@ -56,15 +55,29 @@ def start_and_check(rig: Rig) -> Iterator[str]:
 
     Raises:
         InputError: a check failed; the error gives its cure.
-        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
+        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
-    identity = rig.head.identity
-    assert identity is not None
     rig.arm.start()
     yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
-    before = rig.head.decoder.counts
-    _listen(rig)
-    after = rig.head.decoder.counts
+    check_stream(rig.head, rig.stream, rig.config.residual, lambda: _listen(rig))
+    age = float(np.median(rig.state_ages[-100:]))
+    yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
+
+
+def check_stream(head: HeadReader, stream: HeadStream, residual: float, listen: Callable[[], None]) -> None:
+    """Checks rate, damage and clock of a head's samples.
+
+    Args:
+        residual: largest one of the clock synchronisation, s. listen: polls for `LISTEN_TIME`.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+    """
+    identity = head.identity
+    assert identity is not None
+    before = head.decoder.counts
+    listen()
+    after = head.decoder.counts
     rate = (after.good - before.good) / LISTEN_TIME
     if rate < MIN_RATE_SHARE * identity.rate:
         raise InputError(
@@ -77,11 +90,21 @@ def start_and_check(rig: Rig) -> Iterator[str]:
             "none",
             "change the cable",
         )
-    if rig.clock.residual > rig.config.residual:
-        found = f"clock residual of {rig.clock.residual * 1e3:.1f} ms"
-        raise InputError("head", found, f"{rig.config.residual * 1e3:g} ms", "check the load of this machine")
-    age = float(np.median(rig.state_ages[-100:]))
-    yield f"clocks: head {rig.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
+    if stream.clock.residual > residual:
+        found = f"clock residual of {stream.clock.residual * 1e3:.1f} ms"
+        raise InputError("head", found, f"{residual * 1e3:g} ms", "check the load of this machine")
+
+
+def start_head(head: HeadReader) -> str:
+    """Starts a head; returns a line of text about it.
+
+    Raises:
+        InputError: it is missing or has another shape; the error gives the cure.
+    """
+    head.start()
+    identity = head.identity
+    assert identity is not None
+    return f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
 
 
 def _listen(rig: Rig) -> None:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from robot.drivers.head.cycle_assembly import assemble_cycle, make_cut
 from robot.drivers.head.decoder import Frames
-from robot.drivers.outcome import Fault, SessionOutcome
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.rig import TICK, Rig, SessionFault
+from robot.live.async_mapper import AsyncMapper, check_mapper
+from robot.live.polling import TICK, SessionFault, session_fault
+from robot.live.rig import Rig
 from robot.live.route import Route
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
@@ -22,28 +24,6 @@ from tactile.whiskers.whisking import MID_PROTRACTION
 
 MAX_ROUTE_TIME = 120.0
 """Longest duration of a route without whisks, s."""
-
-
-class AsyncMapper(Protocol):
-    """Asynchronous mapper interface."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether the mapper runs."""
-        ...
-
-    @property
-    def failure(self) -> str:
-        """Reason for the end of the mapper."""
-        ...
-
-    def behind(self) -> float:
-        """Waiting time of the oldest unmapped sample, s."""
-        ...
-
-    def offer(self, sample: Sample) -> None:
-        """Passes the next sample; returns at once."""
-        ...
 
 
 class WhiskReport(NamedTuple):
@@ -91,13 +71,13 @@ def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[
     The arm rests while the head sends no samples.
 
     Raises:
-        robot.live.rig.SessionFault, robot.live.rig.OperatorStop.
+        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
     number, most = 0, rig.config.whisks
     arrived = False
     while not arrived and number != most:
-        sequence, life = next_sequence(rig, number), rig.restarts
-        while rig.streaming and rig.restarts == life:
+        sequence, life = next_sequence(rig, number), rig.stream.restarts
+        while rig.stream.streaming and rig.stream.restarts == life:
             _poll(rig, mapper)
             arrived = arrived or _advance(rig, route)
             handed = _hand_on(rig, sequence, number, mapper)
@@ -122,7 +102,7 @@ def wait_for_head(rig: Rig, route: Route) -> None:
     rig.arm.halt()
     rig.record_event("held", "the head sends no samples")
     # The reader limits the waiting time and turns it into a fault.
-    rig.wait_until(lambda: rig.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
+    rig.wait_until(lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
     rig.record_event("resumed", "the head sends samples")
     route.resend_last()
 
@@ -139,11 +119,11 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
     if abs(count - round(count)) > 1e-6:
         raise InputError("live.plan.whisking.rate", f"{count:g} samples per whisk", "an integer")
     rig.poll()  # samples since the head's return may be queued
-    known, life = len(rig.whisk_starts), rig.restarts
+    known, life = len(rig.stream.whisk_starts), rig.stream.restarts
 
     def first_frame() -> int | None:
         """First frame of the next whisk, also of a reconnected head."""
-        return next(iter(rig.whisk_starts[known if rig.restarts == life else 0 :]), None)
+        return next(iter(rig.stream.whisk_starts[known if rig.stream.restarts == life else 0 :]), None)
 
     longest = rig.config.head.patience + 2 / rate + 1.0
     rig.wait_until(
@@ -152,7 +132,7 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
     first = first_frame()
     assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
-    start = float(rig.clock.to_host(device)) - rig.epoch
+    start = float(rig.stream.clock.to_host(device)) - rig.epoch
     return WhiskSequence(number, first, device, start, round(count), 1 / rate)
 
 
@@ -175,7 +155,7 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
 def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
     """Passes on a whisk that is complete or `grace` late; returns None before."""
     first, last = sequence.frame_range(number)
-    due = float(rig.clock.to_host(sequence.device + sequence.start_of(number + 1)))
+    due = float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + 1)))
     now = time.monotonic()
     if not _has_arrived(rig, last) and now < due + rig.config.grace:
         return None
@@ -183,7 +163,7 @@ def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper
     start = sequence.start + sequence.start_of(number)
     stamp = sequence.start + sequence.start_of(number + MID_PROTRACTION)
     odometry, truth = rig.odometer.step(
-        stamp, float(rig.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
+        stamp, float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
     )
     whole, slow = _is_complete(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
     cut = make_cut(number, stamp, start, frames, odometry, seen=whole and not slow)
@@ -202,14 +182,14 @@ def _advance(rig: Rig, route: Route) -> bool:
     try:
         return route.advance(rig.arm)
     except TargetRefused as error:  # the arm has a fault, or the target is invalid
-        fault = rig.arm.fault or Fault(SessionOutcome.OUT_OF_BOX, str(error), time.monotonic())
-        raise SessionFault(fault) from error
+        if rig.arm.fault is not None:
+            raise SessionFault(rig.arm.fault) from error
+        raise session_fault(SessionOutcome.OUT_OF_BOX, str(error)) from error
 
 
 def _poll(rig: Rig, mapper: AsyncMapper) -> None:
     rig.poll()
-    if not mapper.alive:
-        raise SessionFault(Fault(SessionOutcome.MAPPER_GONE, mapper.failure, time.monotonic()))
+    check_mapper(mapper)
 
 
 def _has_arrived(rig: Rig, last: int) -> bool:

@@ -27,7 +27,7 @@ class CreateConfig(Settings):
     """Time without a reply after which the link counts as lost and the wheels are stopped, s."""
 
     replug: PositiveFloat = 60.0
-    """Time for which the watchdog process waits for a disconnected port, to stop the robot on its return, s."""
+    """Time for which the watchdog process waits for a disconnected port, to stop the robot then, s."""
 
     @model_validator(mode="after")
     def _replies_fit(self) -> CreateConfig:

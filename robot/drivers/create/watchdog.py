@@ -1,8 +1,8 @@
 """Watchdog process: stops the wheels when the driver's process has ended or hangs. The Create has none.
 
-The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE REPLUG` and sends a heartbeat, any byte,
-to its standard input, which it echoes. After PATIENCE s without one, or at the end of input, it stops the wheels.
-If the port is gone then, it waits REPLUG s for it to return and stops the wheels at once. `q` ends it.
+The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE REPLUG` and sends a heartbeat, any
+byte, to its standard input, which it echoes. After PATIENCE s without one, or at the end of input, it stops
+the wheels. If the port is gone then, it waits REPLUG s for its return and stops them then. `q` ends it.
 """
 
 from __future__ import annotations

@@ -180,7 +180,5 @@ def _odometry_scales(config: CreateEmulatorConfig) -> np.ndarray:
     if config.world is None:
         return np.ones((1, 2))
     random = stream(config.seed, "wheels")
-    scales = simulate_wheel_odometry(
-        config.world.wheels, np.ones((MOVES, 4)), np.arange(MOVES) % 2, random
-    )
+    scales = simulate_wheel_odometry(config.world.wheels, np.ones((MOVES, 4)), np.arange(MOVES) % 2, random)
     return scales[:, [0, 2]]

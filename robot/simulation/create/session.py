@@ -26,7 +26,7 @@ from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_
 from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
 from robot.sources.source import rate_of
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
-from robot.world.arena import arena_text, wall_segments
+from robot.world.arena import Arena, arena_text, wall_segments
 from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
@@ -96,16 +96,9 @@ class CreateSimulation(SimulatedSource):
         motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
         kind = np.array([step.state.motion for step in steps])
         self.odometry = simulate_wheel_odometry(config.wheels, motion, kind, stream(config.seed, "wheels"))
-        plain = config.model_dump(mode="json", exclude={"arena": {"file"}})
-        drawing = arena_text(self.arena)
-        self.digest = digest_of_document({"create_simulation": plain, "arena": drawing})
-        mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
-        self.info = SourceInfo(
-            raw_whiskers=True,
-            planar_whiskers=PlanarWhiskersInfo(mounts=mounts, length=config.whiskers.length),
-            arena=drawing,
-            provenance={"create_simulation": plain},
-        )
+        self.info = describe_create(config, self.arena)
+        document = {"create_simulation": self.info.provenance["create_simulation"], "arena": self.info.arena}
+        self.digest = digest_of_document(document)
 
     @property
     def rate_hz(self) -> float:
@@ -113,6 +106,17 @@ class CreateSimulation(SimulatedSource):
 
     def _readings(self) -> Iterator[Report]:
         return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
+
+
+def describe_create(config: CreateSimulationConfig, arena: Arena) -> SourceInfo:
+    """Whiskers, arena and settings of a session; strain templates are trained from these."""
+    mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
+    return SourceInfo(
+        raw_whiskers=True,
+        planar_whiskers=PlanarWhiskersInfo(mounts=mounts, length=config.whiskers.length),
+        arena=arena_text(arena),
+        provenance={"create_simulation": config.model_dump(mode="json", exclude={"arena": {"file"}})},
+    )
 
 
 def _drive_steps(

@@ -1,0 +1,134 @@
+"""A live session on an arm with a whisker head: self-test, calibration, route, whisks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
+from ratslam.live.mapper_process import Mapper, MappingJob
+from robot.live.rig import Rig
+from robot.live.route import approach_route, check_targets, descent_route, main_route, plan_path, plan_scene
+from robot.live.selftest import find_devices, start_and_check
+from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
+from robot.sources.source_info import SourceInfo
+from robot.world.head_trajectory import HeadPath
+from robot.world.maze import POSE_CELL_SIZE
+from robot.world.scene import maze_info
+from tactile.features.calibration import Calibration, calibrate
+from tactile.features.whisker_image import view_shape
+from tactile.whiskers.head_geometry import ur10_head
+
+
+def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callable[[], bool]], ArmSession]:
+    """Checks the route of a session, all of its targets; returns the function that opens the devices.
+
+    Raises:
+        InputError: a target is rejected.
+    """
+    assert config.live is not None
+    path = plan_path(config.live, ur10_head(config.touch.head))
+    check_targets(config.live, path)
+    return lambda stopped: ArmSession(config, path, directory, stopped)
+
+
+class ArmSession:
+    """The arm's part of a session (`ratslam.live.live_robot.LiveRobot`).
+
+    Args:
+        path: the route. stopped: whether the operator has requested the end.
+    """
+
+    unit = "whisk"
+
+    def __init__(
+        self, config: RunConfig, path: HeadPath, directory: Path, stopped: Callable[[], bool]
+    ) -> None:
+        assert config.live is not None
+        self._config, self._path = config, path
+        self.rig = Rig(config.live, config.touch.head, stopped)
+        self.job = mapping_job(config, path, directory)
+        self.total = config.live.whisks or ceil(path.duration * config.live.plan.whisking.rate)
+        self._whisks: list[WhiskReport] = []
+        self._dropped = self._lost = 0
+
+    @property
+    def count(self) -> int:
+        return len(self._whisks)
+
+    def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> Calibration:
+        """Tests both devices, calibrates in free air above the start, lowers the head and starts whisking."""
+        rig = self.rig
+        for line in find_devices(rig):
+            log(line)
+        compile_mapper(rig, mapper, self.job, log)
+        calibration = _calibrate(rig, self._config, self._path, log)
+        begin_mapping(rig, mapper, calibration)
+        follow_route(rig, descent_route(rig.config, self._path))
+        whisking = rig.config.plan.whisking
+        rig.driver.whisk(whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
+        return calibration
+
+    def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
+        def count(whisk: WhiskReport) -> None:
+            self._whisks.append(whisk)
+            self._dropped, self._lost = self._dropped + (not whisk.seen), self._lost + whisk.missing
+            late = f"late {1e3 * whisk.lateness:.0f} ms"
+            lost = f"{self._lost} samples lost, {self._dropped} images dropped"
+            tell(f"{mapper_status(mapper)}{late}, {lost}")
+
+        run_whisk_loop(self.rig, main_route(self.rig.config, self._path), mapper, count)
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "dropped": self._dropped,
+            "missing": self._lost,
+            "lateness_s": quantiles([whisk.lateness for whisk in self._whisks]),
+            "state_age_s": quantiles(self.rig.state_ages),
+            "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
+        }
+
+
+def mapping_job(config: RunConfig, path: HeadPath, directory: Path) -> MappingJob:
+    """The job of the mapper, with the description of the robot for the recording."""
+    assert config.live is not None
+    head = ur10_head(config.touch.head)
+    plan = config.live.plan
+    rate = plan.whisking.rate
+    rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
+    return MappingJob(
+        mapped_config(config, directory, rows),
+        SourceInfo(
+            raw_whiskers=True,
+            cell_size=POSE_CELL_SIZE,
+            head=config.touch.head,
+            maze=None
+            if config.live.waypoints
+            else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed),
+            provenance={"live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})},
+        ),
+        directory,
+        view_shape(config.touch.image, head),
+        len(head.length),
+        rate,
+        float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
+    )
+
+
+def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:
+    """Tests both devices, and records free whisks above the start of the route for the calibration."""
+    plan = rig.config.plan
+    for line in start_and_check(rig):
+        log(line)
+    log("arm: moving above the start of the route")
+    follow_route(rig, approach_route(rig.config, path))
+    count = ceil(plan.calibration.min_duration * plan.whisking.rate)
+    log(f"head: {count} whisks in free air")
+    rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
+    record = record_free_whisks(rig, count)
+    return calibrate(plan.calibration, record, config.touch.contact.slope_window, "free whisking")

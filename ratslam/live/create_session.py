@@ -1,0 +1,118 @@
+"""A live session on a whiskered Create: self-test, exploration by the state machine, reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status
+from ratslam.live.mapper_process import Mapper, MappingJob
+from robot.live.create_loop import MotionReport, run_create_loop
+from robot.live.create_rig import CreateRig
+from robot.live.create_selftest import find_devices, start_and_check
+from robot.simulation.create.session import CreateSimulationConfig, describe_create
+from robot.world.arena import Arena, wall_segments
+from robot.world.random_arena import make_arena
+from tactile.base.errors import InputError
+from tactile.base.types import StepEnd
+
+SHORTEST_STEP = 0.25
+"""Mean duration of a motion for which the session reserves rows, s: most take 0.5."""
+
+
+def prepare_create_session(
+    config: RunConfig, directory: Path
+) -> Callable[[Callable[[], bool]], CreateSession]:
+    """Checks that the method maps what a Create reports; returns the function that opens the devices.
+
+    Raises:
+        InputError: the backend needs views, which a Create does not have.
+    """
+    if config.backend in ("recall", "classic"):
+        found = f"{config.backend}, which recognises views"
+        expected = "a method that maps contacts, such as `grid`: a Create has no views"
+        raise InputError("backend", found, expected, "--set backend=grid")
+    return lambda stopped: CreateSession(config, directory, stopped)
+
+
+class CreateSession:
+    """The Create's part of a session (`ratslam.live.live_robot.LiveRobot`).
+
+    Args:
+        stopped: whether the operator has requested the end.
+    """
+
+    unit = "report"
+
+    def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:
+        assert config.live is not None
+        assert config.live.create is not None
+        self.rig = CreateRig(config.live, stopped)
+        plan = config.live.create.plan
+        self.job = mapping_job(config, plan, directory)
+        self.total = plan.reports
+        self._count = 0
+        self._ends: Counter[StepEnd] = Counter()
+
+    @property
+    def count(self) -> int:
+        return self._count
+
+    def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> None:
+        """Finds and tests the devices; nothing moves."""
+        for line in find_devices(self.rig):
+            log(line)
+        compile_mapper(self.rig, mapper, self.job, log)
+        for line in start_and_check(self.rig):
+            log(line)
+        begin_mapping(self.rig, mapper, None)
+
+    def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
+        def count(motion: MotionReport) -> None:
+            self._count += 1
+            self._ends[motion.moment] += 1
+            ends = ", ".join(f"{self._ends[end]} {end.name}" for end in StepEnd if end is not StepEnd.FREE)
+            tell(f"{mapper_status(mapper)}{motion.time:.0f} s, {motion.state.name}, {ends}")
+
+        run_create_loop(self.rig, mapper, count)
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "ends": {end.name.lower(): self._ends[end] for end in StepEnd},
+            "alive": self.rig.alive.tolist(),
+            "serial": self.rig.robot.counts._asdict(),
+            "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
+        }
+
+
+def mapping_job(config: RunConfig, plan: CreateSimulationConfig, directory: Path) -> MappingJob:
+    """The job of the mapper, with the description of the robot for the recording."""
+    assert config.live is not None
+    arena = make_arena(plan.arena, plan.seed)
+    info = describe_create(plan, arena)
+    live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
+    whiskers = len(plan.whiskers.mounts)
+    return MappingJob(
+        mapped_config(config, directory, plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)),
+        info.model_copy(update={"provenance": {**info.provenance, "live": live}}),
+        directory,
+        (1, whiskers, 1),
+        whiskers,
+        1 / plan.behaviour.step,
+        farthest_wall(arena),
+    )
+
+
+def farthest_wall(arena: Arena) -> float:
+    """Largest distance of a wall from the start along the robot's first x or y axis, m."""
+    x, y, heading = arena.start
+    offset = wall_segments(arena).reshape(-1, 2) - [x, y]
+    c, s = np.cos(heading), np.sin(heading)
+    ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+    return float(np.abs([ahead, left]).max())
