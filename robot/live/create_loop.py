@@ -63,11 +63,19 @@ class _Motion(NamedTuple):
 
 
 def run_create_loop(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
-    """Explores as the state machine does and passes on a report of every motion, until the planned end.
+    """Explores as the state machine does and passes on a report of every motion, until the planned end; then,
+    and at any fault, the robot is stopped.
 
     Raises:
         robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
+    try:
+        _explore(rig, mapper, tell)
+    finally:
+        rig.robot.stop()
+
+
+def _explore(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
     plan = rig.create.plan
     random = stream(plan.seed, "behaviour")
     doing, touching = MachineState(CreateState.FWD1), np.zeros(len(rig.alive), bool)

@@ -121,22 +121,26 @@ class SessionServer:
         assert self._process.stdout.readline() == "ready\n"
 
     def start(
-        self, section: dict[str, Any], mapper: float, without: Sequence[str], rate_check: bool
+        self,
+        config: dict[str, Any],
+        mapper: float | None = 0.0,
+        without: Sequence[str] = (),
+        rate_check: bool = False,
     ) -> Session:
         """Starts a session.
 
         Args:
-            section: `live` of its configuration. mapper: s that the stub takes for each sample.
-            without: libraries that it cannot import. rate_check: whether it checks the head's rate.
+            config: its configuration. mapper: s that the stub takes for each sample; None: no stub, the
+                mapper itself. without: libraries that it cannot import. rate_check: whether it checks the head's rate.
         """
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
-        config, log, code = folder / "config.yaml", folder / "log", folder / "code"
-        config.write_text(json.dumps({"live": section}))
+        file, log, code = folder / "config.yaml", folder / "log", folder / "code"
+        file.write_text(json.dumps(config))
         log.touch()
         order = {
-            "arguments": ["live", str(config), "-o", str(folder / "run")],
+            "arguments": ["live", str(file), "-o", str(folder / "run")],
             "log": str(log),
             "code": str(code),
             "mapper": mapper,
@@ -291,7 +295,7 @@ class Bench:
             rate_check: whether it listens to the head for as long as in use and checks its rate.
             settings: of the section `live`.
         """
-        session = self._server.start(self.quick(**settings), mapper, without, rate_check)
+        session = self._server.start({"live": self.quick(**settings)}, mapper, without, rate_check)
         try:
             yield session
         finally:

@@ -2,8 +2,8 @@
 
 Each line of JSON on its standard input starts one; the process id is printed. The line gives the `arguments`
 of `python -m ratslam`, files for the output (`log`) and the exit code (`code`), how long the stub mapper
-takes for a sample (`mapper`, s), whether the self-test checks the head's rate (`rate_check`), and the
-libraries that the session cannot import (`without`: modules, or `libusb`).
+takes for a sample (`mapper`, s; null for no stub), whether the self-test checks the head's rate
+(`rate_check`), and the libraries that the session cannot import (`without`: modules, or `libusb`).
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def _become_session(order: dict[str, Any], program: Any) -> None:
         os.dup2(fd, target)
     _hide(order["without"], Path(order["code"]).parent / "hidden")
     arguments = order["arguments"]
-    mapping = partial(stub_mapper.mapping, arguments[arguments.index("-o") + 1], order["mapper"])
+    directory, takes = arguments[arguments.index("-o") + 1], order["mapper"]
+    mapping = None if takes is None else partial(stub_mapper.mapping, directory, takes)
     run = ratslam.live.session.run_live_session
     # Without the process that draws the map.
     ratslam.live.session.run_live_session = lambda *given, armed: run(*given, mapping=mapping)
