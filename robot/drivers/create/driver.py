@@ -197,8 +197,9 @@ class CreateDriver:
                 self._polled.set()
                 if loop.active_stop and loop.active_stop.reason is StopReason.UNPLUGGED:
                     return
-                if not guard.beat():
+                if not guard.beat() and loop.active_stop is None:
                     loop.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
+                    continue  # stops the wheels at once
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
         finally:  # the watchdog then stops the wheels

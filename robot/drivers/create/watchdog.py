@@ -49,8 +49,7 @@ class Watchdog:
             start_new_session=True,  # an interrupt from the terminal must not end it first
         )
         self._patience = patience
-        self._beaten = self._asked = -math.inf  # the last beat; the oldest one that may be without an echo
-        self._heard = -math.inf
+        self._beaten = self._heard = -math.inf  # times of the last beat and of the last echo
         self._ready = threading.Event()
         self._reader = threading.Thread(target=self._read, daemon=True, name="watchdog echo")
         self._reader.start()
@@ -66,16 +65,15 @@ class Watchdog:
     def beat(self) -> bool:
         """Sends a heartbeat; False if the process has ended or hangs."""
         now = time.monotonic()
-        late, self._beaten = now - self._beaten > self._patience, now
-        if self._heard >= self._asked:
-            self._asked = now
+        if now - self._beaten > self._patience:  # the first, or this process hung: an echo may be unread
+            self._heard = now
+        self._beaten = now
         try:
             assert self._process.stdin is not None
             self._process.stdin.write(b".")
         except OSError:
             return False
-        # After a hang of this process itself the echo may wait to be read.
-        return late or now - self._asked <= self._patience
+        return now - self._heard <= self._patience
 
     def close(self) -> None:
         """Ends the process without a command to the wheels."""

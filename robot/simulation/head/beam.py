@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.linalg import eigh
 
 from tactile.base.config import Settings
 from tactile.features.contact import ShaftConfig
@@ -85,6 +84,8 @@ class Beam(NamedTuple):
     @property
     def modes(self) -> np.ndarray:
         """Angular frequencies [2] of the bending modes with a clamped base."""
+        from scipy.linalg import eigh  # slow to import
+
         return np.sqrt(eigh(self.stiffness, self.mass, eigvals_only=True))
 
 

@@ -131,7 +131,8 @@ class SessionServer:
 
         Args:
             config: its configuration. mapper: s that the stub takes for each sample; None: no stub, the
-                mapper itself. without: libraries that it cannot import. rate_check: whether it checks the head's rate.
+                mapper itself. without: libraries that it cannot import. rate_check: whether it checks the
+                head's rate.
         """
         self._count += 1
         folder = self._folder / str(self._count)

@@ -69,6 +69,7 @@ class CreateBench:
         self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
+        Path(self.port).unlink(missing_ok=True)  # its terminal's name is free for the next emulator
 
 
 @contextmanager

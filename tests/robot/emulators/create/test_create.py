@@ -1,0 +1,142 @@
+"""An emulated Create among walls: contact, odometry, strain of its whiskers."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot.drivers.create.protocol import QUERY, REPLY, SAFE, START, Bumps, drive
+from robot.drivers.head.decoder import Decoder
+from robot.drivers.head.protocol import ANGLE, REQUEST_OUT, Request, to_radians
+from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
+from robot.emulators.create.config import CreateWorldConfig
+from robot.emulators.create.serial_line import Terminal
+from robot.emulators.create.whiskers import CreateWhiskers
+from robot.emulators.head.device import EmulatedHead
+from robot.simulation.create.strain_sensors import (
+    ShakeConfig,
+    WhiskersConfig,
+    base_strains,
+    bend_whiskers,
+    fixed_whiskers,
+)
+from robot.simulation.create.wheel_odometry import WheelsConfig
+from robot.world.arena import Arena
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+
+CORNERS = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+ROOM = Arena("room", CORNERS, (), np.array([1.0, 1.0, 0.0]))
+BODY = 0.17
+
+
+def robot_in(world: CreateWorldConfig, arena: Arena = ROOM, seed: int = 0) -> EmulatedCreate:
+    robot = EmulatedCreate(CreateEmulatorConfig(world=world, seed=seed), arena)
+    robot.receive(START + SAFE)
+    return robot
+
+
+def test_a_wall_stops_the_body_and_presses_the_bumper() -> None:
+    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
+    robot.receive(drive(200, 200))
+    robot.advance(5.0)
+    assert robot.base.x == pytest.approx(2.0 - BODY, abs=0.003)
+    assert robot.bumps == Bumps.BUMPED
+    robot.receive(drive(0, 0))
+    robot.advance(1.0)
+    assert robot.bumps == Bumps.BUMPED  # still against the wall
+    robot.receive(drive(-200, -200))
+    robot.advance(0.5)
+    assert robot.bumps == 0
+    assert robot.base.x == pytest.approx(2.0 - BODY - 0.1, abs=0.005)
+
+
+def test_the_wheels_slip_unnoticed() -> None:
+    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
+    robot.receive(drive(200, 200))
+    robot.advance(10.0)
+    (reply,) = robot.receive(QUERY)
+    assert REPLY.unpack(reply)[0] == pytest.approx(2000, abs=1)
+
+
+def test_odometry_has_one_error_for_the_whole_session() -> None:
+    wide = ROOM._replace(outer=100 * ROOM.outer, start=np.array([50.0, 50.0, 0.0]))
+    shares = []
+    for seed in range(12):
+        robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="bias", level=0.05)), wide, seed)
+        for _ in range(5):
+            robot.receive(drive(200, 200))
+            robot.advance(5.0)
+            robot.receive(drive(0, 0))
+        measured = REPLY.unpack(robot.receive(QUERY)[0])[0]
+        shares.append(measured / (1000 * (robot.base.x - 50.0)))
+    assert 0.02 < np.std(shares) < 0.09
+    assert abs(np.mean(shares) - 1) < 0.05
+
+
+def test_the_strain_is_that_of_the_simulator() -> None:
+    """Within the resolution of the samples."""
+    still = ShakeConfig(start=0.0, rumble=0.0)
+    config = WhiskersConfig(noise=0.0, shake=still)
+    near = ROOM._replace(start=np.array([1.75, 1.0, 0.3]))
+    world = CreateWorldConfig(whiskers=config)
+    robot = robot_in(world, near)
+    whiskers = CreateWhiskers(world, robot, robot.advance_to, stream(0, "strain"))
+    bridge = EmulatedHead(world.bridge, whiskers, now=0.0)
+    bridge.control(REQUEST_OUT, Request.START, 0, 0, 0.0)
+    robot.receive(drive(50, 50))
+    got, poses = [], []
+    decoder = Decoder(whiskers.count)
+    for block in range(20):
+        before = robot.pose
+        assert bridge.advance((block + 1) * 0.01 + 1e-9)
+        share = (np.arange(bridge.samples) + 1)[:, None] / bridge.samples
+        poses.append(before + share * (robot.pose - before))
+        got.append(decoder.feed(bridge.bulk_in(1 << 20, 0.0)).values)
+    fan = fixed_whiskers(config)
+    bent = bend_whiskers(fan, np.concatenate(poses), robot.walls, np.zeros(whiskers.count, int))
+    expected = base_strains(config, fan, bent)
+    assert np.abs(expected).max() > 1e-3
+    strain = to_radians(np.concatenate(got))[1] * world.strain_per_radian
+    assert np.abs(strain - expected).max() <= 0.51 * ANGLE * world.strain_per_radian
+
+
+def test_rolling_shakes_the_whiskers_and_standing_does_not() -> None:
+    world = CreateWorldConfig()
+    robot = robot_in(world)
+    whiskers = CreateWhiskers(world, robot, robot.advance_to, stream(0, "strain"))
+    blocks = [whiskers.block(0.01 * k, 0.01 * k + 0.01).deflection for k in range(50)]
+    robot.receive(drive(50, 50))
+    rolling = [whiskers.block(0.01 * k, 0.01 * k + 0.01).deflection for k in range(50, 100)]
+    quiet, loud = (np.std(np.concatenate(part)) * world.strain_per_radian for part in (blocks, rolling))
+    assert quiet == pytest.approx(3e-6, rel=0.1)
+    assert loud > 2 * quiet
+
+
+def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path: Path) -> None:
+    pytest.importorskip("termios", reason="needs pseudo-terminals")
+    name = tmp_path / "create.tty"
+    name.write_text("mine")
+    with pytest.raises(InputError, match="is no link"):
+        Terminal(str(name))
+    assert name.read_text() == "mine"
+    name.unlink()
+    name.symlink_to("/dev/pts/none")  # left by an emulator that was killed
+    terminal = Terminal(str(name))
+    assert name.resolve().exists()
+    terminal.unplug()
+    assert not name.is_symlink()
+
+
+def test_turns_are_not_blocked_at_a_wall() -> None:
+    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
+    robot.receive(drive(200, 200))
+    robot.advance(5.0)
+    robot.receive(drive(100, -100))
+    before = robot.base.heading
+    robot.advance(1.0)
+    assert robot.base.heading - before == pytest.approx(0.2 / 0.258)
+    assert math.isclose(robot.base.x, 2.0 - BODY, abs_tol=0.003)
