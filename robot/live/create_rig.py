@@ -64,6 +64,7 @@ class CreateRig:
         self.epoch = time.monotonic()
         self.recorder: LiveRecorder | None = None
         self._stopped = stopped
+        self._connections = 0  # of the whiskers, seen so far
         self._free = self.epoch  # newest time at which the bumper was not pressed
 
     def now(self) -> float:
@@ -77,6 +78,9 @@ class CreateRig:
             SessionFault, OperatorStop: the session must end.
         """
         for frames, arrival in self.stream.take():
+            if self.stream.restarts != self._connections:
+                self._connections = self.stream.restarts
+                self.monitor.restart()
             if self.recorder is not None:
                 self.recorder.add_frames(frames, arrival - self.epoch)
             self.monitor.add(frames)

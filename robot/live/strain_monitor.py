@@ -7,6 +7,9 @@ import numpy as np
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.protocol import to_radians
 
+MAX_ROWS = 2**16
+"""Rows that are kept of a motion; later ones are ignored."""
+
 
 class StrainMonitor:
     """Averages samples over the period of the state machine; counts samples, not the host's time.
@@ -24,27 +27,33 @@ class StrainMonitor:
         self.rest = np.zeros((whiskers, 2))
         self.first = 0
         self._scale = strain_per_radian
-        self._sum = np.zeros((0, whiskers, 2))
-        self._count = np.zeros(0, np.int64)
-        self._newest = -1
+        self._sum = np.zeros((64, whiskers, 2))
+        self._count = np.zeros(64, np.int64)
+        self._newest: int | None = None
 
     def begin(self) -> None:
         """Starts a motion with the next sample."""
-        self.first = self._newest + 1
-        self._sum, self._count = self._sum[:0], self._count[:0]
+        self.first = 0 if self._newest is None else self._newest + 1
+        self._sum[:], self._count[:] = 0.0, 0
+
+    def restart(self) -> None:
+        """Starts with the next sample, of any number: the head was connected."""
+        self._newest = None
+        self.begin()
 
     def add(self, frames: Frames) -> None:
         """Adds samples; those before the motion are ignored."""
-        mine = frames.sequence >= self.first
+        if self._newest is None:
+            self.first = int(frames.sequence.min())
+            self._newest = self.first - 1
         self._newest = max(self._newest, int(frames.sequence.max()))
-        place = (frames.sequence[mine] - self.first) // self.samples
-        if not len(place):
+        place = (frames.sequence - self.first) // self.samples
+        mine = (place >= 0) & (place < MAX_ROWS)
+        if not mine.any():
             return
-        more = max(int(place.max()) + 1 - len(self._count), 0)
-        self._sum = np.concatenate([self._sum, np.zeros((more, *self._sum.shape[1:]))])
-        self._count = np.concatenate([self._count, np.zeros(more, np.int64)])
-        np.add.at(self._sum, place, self.strain(frames.values[mine]))
-        np.add.at(self._count, place, 1)
+        self._reserve(int(place[mine].max()) + 1)
+        np.add.at(self._sum, place[mine], self.strain(frames.values[mine]))
+        np.add.at(self._count, place[mine], 1)
 
     def strain(self, values: np.ndarray) -> np.ndarray:
         """Strain [N, W, 2], horizontal and vertical, of the values of samples."""
@@ -55,7 +64,8 @@ class StrainMonitor:
 
         A period of which all samples were lost repeats the one before.
         """
-        whole = min((self._newest + 1 - self.first) // self.samples, len(self._count), most)
+        passed = 0 if self._newest is None else (self._newest + 1 - self.first) // self.samples
+        whole = min(passed, len(self._count), most)
         count = self._count[:whole]
         mean = self._sum[:whole] / np.maximum(count, 1)[:, None, None]
         known = np.maximum.accumulate(np.where(count > 0, np.arange(whole), 0))
@@ -82,3 +92,9 @@ class StrainMonitor:
         flat = strain.reshape(len(strain), -1).T
         filled = np.stack([np.interp(wanted, frames.sequence, channel) for channel in flat], axis=1)
         return filled.reshape(len(wanted), *strain.shape[1:])
+
+    def _reserve(self, rows: int) -> None:
+        """Makes room for this many rows."""
+        while len(self._count) < rows:
+            self._sum = np.concatenate([self._sum, np.zeros_like(self._sum)])
+            self._count = np.concatenate([self._count, np.zeros_like(self._count)])

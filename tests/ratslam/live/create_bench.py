@@ -36,9 +36,11 @@ class CreateBench:
             stdout=subprocess.PIPE,
             bufsize=0,
         )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline().split()[-1] == b"ready"
         self.whiskers = Faults(self.process, host, HEAD_FAULTS)
+        assert self.process.stdout is not None
+        if not self.process.stdout.readline().endswith(b"ready\n"):
+            self.close()
+            raise AssertionError(f"the emulator does not start; does another one hold {host}?")
 
     def robot(self, do: str, **request: Any) -> dict[str, Any]:
         """Executes a request of the robot and its line."""

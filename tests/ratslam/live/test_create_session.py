@@ -13,7 +13,10 @@ import pytest
 
 from ratslam.config.run_config import load_config
 from ratslam.pipeline.run import run
+from robot.live.config import LiveConfig
+from robot.live.create_selftest import check_create
 from robot.recordings.mcap_reader import Recording
+from tactile.base.errors import InputError
 from tactile.base.types import MotionKind, StepEnd
 from tests.helpers.live import PATIENCE, until
 from tests.ratslam.live.bench import Session, SessionServer
@@ -108,6 +111,38 @@ def test_a_lifted_wheel_and_an_interrupt(robot: CreateBench, server: SessionServ
         session.process.send_signal(signal.SIGINT)
         check_end(robot, session, "interrupted")
         assert session.report()["standing"]
+
+
+def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench, server: SessionServer) -> None:
+    """The robot stands meanwhile; the motion so far is recorded without a touch."""
+    with rolling(robot, server) as session:
+        robot.whiskers(do="unplug")
+        until(lambda: not robot.rolls(), "the robot stands")
+        robot.whiskers(do="plug")
+        until(robot.rolls, "the robot goes on")
+        session.process.send_signal(signal.SIGINT)
+        recording = check_end(robot, session, "interrupted")
+    unfelt = [sample.reading for sample in recording if not sample.reading.alive.any()]
+    assert len(unfelt) == 1
+    assert not unfelt[0].contact.any()
+    assert [event.name for event in recording.events][:2] == ["held", "resumed"]
+
+
+def test_the_self_test_moves_nothing(robot: CreateBench, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("robot.live.selftest.LISTEN_TIME", 0.3)
+    monkeypatch.setattr("robot.live.selftest.MIN_RATE_SHARE", 0.0)
+    before = robot.state()
+    lines = list(check_create(LiveConfig.model_validate(robot.live(**SLACK)), tmp_path / "run"))
+    after = robot.state()
+    assert (before["x"], before["y"], before["speeds"]) == (after["x"], after["y"], after["speeds"])
+    assert after["mode"] == "PASSIVE"
+    text = "\n".join(lines)
+    for part in ("disk: ", "can be opened", "4 whiskers at 2000 Hz", "safe mode", "4 of 4 alive", "clocks: "):
+        assert part in text
+    robot.robot("bump")
+    with pytest.raises(InputError, match="left pressed"):
+        list(check_create(LiveConfig.model_validate(robot.live(**SLACK)), tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_unplugged_and_plugged_in_again(robot: CreateBench, server: SessionServer) -> None:

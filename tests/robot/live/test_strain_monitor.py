@@ -51,6 +51,29 @@ def test_rows_do_not_depend_on_the_pieces(sizes: list[int]) -> None:
     assert len(pieces.rows(2)) == min(count, 2)
 
 
+def test_a_head_that_has_run_for_long_or_is_connected_again() -> None:
+    """Numbers may start anywhere and jump by 2^32."""
+    late = StrainMonitor(RATE, PERIOD, SCALE, WHISKERS)
+    late.begin()
+    late.add(frames(10**9, SIZE))
+    assert len(late.rows(9)) == 1
+    late.restart()
+    assert len(late.rows(9)) == 0
+    late.add(frames(10**9 + 2**32, 3 * SIZE))
+    late.begin()
+    late.add(frames(10**9 + 2**32 + 3 * SIZE, 2 * SIZE))
+    assert len(late.rows(9)) == 2
+    assert late.first == 10**9 + 2**32 + 3 * SIZE
+
+
+def test_many_rows_are_kept() -> None:
+    made = monitor()
+    made.add(frames(33, 300 * SIZE))
+    assert len(made.rows(10**6)) == 300
+    expected = made.strain(frames(33, 300 * SIZE).values).reshape(300, SIZE, WHISKERS, 2).mean(axis=1)
+    assert np.allclose(made.rows(10**6), expected, rtol=0, atol=1e-18)
+
+
 def test_a_row_of_lost_samples_repeats_the_one_before() -> None:
     block = frames(33, 4 * SIZE)
     lossy = monitor()
