@@ -24,7 +24,7 @@ def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     live = commands.add(
         "live", _live, "map with an arm and its whisker head, or a Create",
-        "live live_create --set live.create.port=/dev/ttyUSB0", "live",
+        "live live_create --set live.create.plan.minutes=1", "live",
     )  # fmt: skip
     add_config(live)
     add_run_directory(live)
@@ -37,7 +37,7 @@ def add_commands(commands: Commands) -> None:
 
     emulate = commands.add(
         "emulate", _emulate, "emulate the arm's controller, the head or a Create",
-        "emulate ur10 live_maze", "live",
+        "emulate create live_create", "live",
     )  # fmt: skip
     emulate.add_argument(
         "device", choices=("ur10", "head", "create"),
