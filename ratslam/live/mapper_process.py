@@ -77,11 +77,14 @@ class MappedSample(NamedTuple):
 class Mapper:
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
+    Args:
+        process: its main function; None: `run_mapper`. view: target of a live view, or None.
+
     Attributes:
         mapped: results of all samples mapped so far, in order.
     """
 
-    def __init__(self, process: Any = None) -> None:
+    def __init__(self, process: Any = None, view: str | None = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
         target = process or run_mapper
@@ -89,6 +92,7 @@ class Mapper:
         self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
+        self._view = view
         self._stages, self._failed = 0, ""
         self._refusal: InputError | None = None
         self._card: Scorecard | None = None
@@ -99,7 +103,7 @@ class Mapper:
 
     def compile(self, job: MappingJob) -> None:
         """Sends the job, for which the process compiles. Returns at once; see `compiled`."""
-        self._outbox.put(job)
+        self._outbox.put(job._replace(view=self._view))
 
     def begin(self, calibration: Calibration | None) -> None:
         """Sends the head's calibration, if it has one: the process makes its directory. Returns at once; see

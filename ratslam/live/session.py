@@ -58,7 +58,7 @@ def run_live_session(
     if directory.exists():
         raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping) as mapper:
+    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
         robot = open_robot(stopped)
         with robot.rig as rig:
             try:
