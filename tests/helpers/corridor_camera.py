@@ -189,6 +189,16 @@ def write_video(
     return count
 
 
+def stored_frames(path: Path) -> Iterator[bytes]:
+    """The frames of a video as they are stored: of `MJPG`, JPEG files."""
+    import cv2
+
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    while (frame := video.read())[0]:
+        yield frame[1].tobytes()
+    video.release()
+
+
 def write_csv(path: Path, **columns: np.ndarray) -> Path:
     """Writes columns of equal length as a CSV file."""
     table = np.column_stack(list(columns.values()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,11 @@ import pytest
 from PIL import Image
 
 from robot.recordings.bags.images import COMPRESSED, RAW, grey_image
+from robot.recordings.formats import RecordingConfig, open_recording
+from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
-from tests.helpers.ros_bags import ROS2, built
+from tests.helpers.corridor_camera import Camera, CorridorLoop, stored_frames, write_video
+from tests.helpers.ros_bags import ROS2, Entry, built, header, write_bag
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
 GREY = np.asarray(Image.fromarray(COLOUR).convert("L"))
@@ -95,3 +99,36 @@ def test_images_that_cannot_be_read_are_refused(refused: Refused) -> None:
     Image.fromarray(COLOUR).save(file, "PNG")
     cut = {"format": "png", "data": np.frombuffer(file.getvalue(), np.uint8)[:60]}
     refused(lambda: read(built(ROS2, COMPRESSED, cut), COMPRESSED), "cannot be decoded")
+
+
+def test_a_bag_of_jpegs_gives_the_rows_of_their_video(tmp_path: Path) -> None:
+    """The same JPEG bytes as MJPG frames and as CompressedImage; only the decoders differ."""
+    world = CorridorLoop(seed=5, length=5.0, depth=4.0, breadth=1.4, laps=0.12)
+    video = tmp_path / "walk.avi"
+    write_video(video, Camera(fov_deg=90, width=96, height=64).frames(world), world.rate)
+    images = [
+        Entry(
+            "/camera/image/compressed",
+            COMPRESSED,
+            time,
+            {"header": header(time), "format": "jpeg", "data": np.frombuffer(data, np.uint8)},
+        )
+        for data, time in zip(stored_frames(video), range(10**9, 10**12, 10**8), strict=False)
+    ]
+    bag = write_bag(tmp_path, "mcap", images)
+    shared = {"image": {"rows": 4, "columns": 12}, "visual_odometry": {"fov_deg": 90}}
+    of_video, of_bag = (
+        open_recording(RecordingConfig.model_validate(shared | recording), pytest.fail)
+        for recording in (
+            {"file": video, "video": {"rate": world.rate}},
+            {"file": bag, "topics": {"views": "/camera/image/compressed"}},
+        )
+    )
+    assert isinstance(of_video, InMemorySource)
+    assert isinstance(of_bag, InMemorySource)
+    assert np.diff(of_bag.time) == pytest.approx(np.diff(of_video.time), abs=1e-9)
+    assert of_bag.views == pytest.approx(of_video.views, abs=3 / 255)  # grey levels
+    distance, turn = of_video.motion[:, 0], of_video.motion[:, 2]
+    assert distance[1:].min() > 0.01
+    assert of_bag.motion[:, 0] == pytest.approx(distance, rel=0.02)  # a grey level of the mean is 0.8 %
+    assert of_bag.motion[:, 2] == pytest.approx(turn, abs=np.deg2rad(0.02))  # a column is 0.94 degrees
