@@ -99,6 +99,7 @@ def test_visual_odometry_goes_round_a_loop(fov_deg: int, tmp_path: Path) -> None
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("exposure", [0.4, 1.0, 1.8])
 @pytest.mark.parametrize("fov_deg", [60, 360])
 def test_a_camera_alone_maps_a_loop(fov_deg: int, exposure: float, tmp_path: Path) -> None:
@@ -106,19 +107,20 @@ def test_a_camera_alone_maps_a_loop(fov_deg: int, exposure: float, tmp_path: Pat
     world = CorridorLoop(seed=2, length=9.0, depth=5.5, breadth=1.8)
     config = write_loop(tmp_path, world, Camera(fov_deg, exposure=exposure), "loop.avi")
     alone = run_errors(config, tmp_path / "alone")
-    assert alone.odometry < 1.5
-    assert alone.trajectory < alone.odometry * 1.1
+    assert alone.odometry < 1.2
+    assert alone.trajectory < alone.odometry * 0.7
     beside = ("recording.video.odometry=wheels.csv", "recording.table.velocity.forward=vx")
     wheels = run_errors(config, tmp_path / "wheels", *beside, "presets=[]", "templates.patch=2")
-    assert wheels.trajectory < wheels.odometry * 1.1
-    assert wheels.trajectory < alone.trajectory * 1.1
+    assert wheels.trajectory < wheels.odometry * 0.2
+    assert wheels.trajectory < alone.trajectory * 0.5
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1200)
 def test_codecs_give_the_same_map(tmp_path: Path) -> None:
     world = CorridorLoop(seed=2, length=9.0, depth=5.5, breadth=1.8)
     errors = [
         run_errors(write_loop(tmp_path, world, Camera(60), name, codec), tmp_path / codec)
         for name, codec in (("loop.avi", "MJPG"), ("loop.mp4", "mp4v"))
     ]
-    assert errors[0] == pytest.approx(errors[1], abs=0.2)
+    assert errors[0] == pytest.approx(errors[1], abs=0.05)  # m, m, rad
