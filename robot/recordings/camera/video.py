@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -41,6 +42,36 @@ class VideoConfig(Settings):
     """Largest time between a frame and its nearest odometry row, s; null: the median step."""
 
 
+class VideoDescription(NamedTuple):
+    """A video file, as it describes itself.
+
+    Attributes:
+        frames: number. rate: frames per second, 0 if it does not say. width, height: pixels.
+    """
+
+    frames: int
+    rate: float
+    width: int
+    height: int
+
+
+def describe_video(path: Path) -> VideoDescription:
+    """What a video file says about itself.
+
+    Raises:
+        InputError: it is no video, or opencv is missing.
+    """
+    with _opened(path) as (cv2, video):
+        keys = (
+            cv2.CAP_PROP_FRAME_COUNT,
+            cv2.CAP_PROP_FPS,
+            cv2.CAP_PROP_FRAME_WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT,
+        )
+        frames, rate, width, height = (float(video.get(key)) for key in keys)
+    return VideoDescription(int(frames), rate, int(width), int(height))
+
+
 def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
     """Errors of a file of stamps: no such column, numbers that are not finite, times that do not increase."""
     errors = file.absences([(column, "video.time")])
@@ -60,12 +91,7 @@ def video_frames(
         InputError: the file is no video, opencv is missing, there is no rate, or the numbers of frames and
             stamps differ.
     """
-    require_file(path)
-    cv2 = _opencv()
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        if not video.isOpened():
-            raise InputError(str(path), "cannot be decoded", "a video", "was it copied completely?")
+    with _opened(path) as (cv2, video):
         times = _times(path, config, stamps, float(video.get(cv2.CAP_PROP_FPS)))
         announced, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
         while video.grab():
@@ -73,14 +99,26 @@ def video_frames(
             if time is not None and count % config.every == 0:
                 yield Frame(time, _grey(cv2, video, f"{path}, frame {count}"))
             count += 1
-    finally:
-        video.release()
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")
     if stamps is not None and count != len(stamps.lines):
         raise InputError(
             str(stamps.path), f"{len(stamps.lines)} times", f"{count}, one for each frame of {path}"
         )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[ModuleType, Any]]:
+    """OpenCV, and the opened video."""
+    require_file(path)
+    cv2 = _opencv()
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not video.isOpened():
+            raise InputError(str(path), "cannot be decoded", "a video", "was it copied completely?")
+        yield cv2, video
+    finally:
+        video.release()
 
 
 def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: float) -> Iterator[float]:

@@ -1,0 +1,78 @@
+"""The command doctor."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ratslam.cli.common import Commands, add_set, prepare_jax
+from tactile.base.atomic_write import write_text_atomically
+from tactile.base.errors import InputError
+
+if TYPE_CHECKING:
+    from ratslam.doctor.diagnosis import Diagnosis
+
+FAULTY = 1
+"""Exit code if a fault was found."""
+
+
+def add_commands(commands: Commands) -> None:
+    """Registers the commands of this module."""
+    doctor = commands.add(
+        "doctor", _doctor, "say what a recording, run or robot is, and what to do",
+        "doctor my_bag -o mine.yaml", "look",
+    )  # fmt: skip
+    doctor.add_argument(
+        "path", type=Path, metavar="FILE", help="recording, run directory, or with --live a configuration"
+    )
+    doctor.add_argument(
+        "-o", "--output", type=Path, metavar="YAML", help="write the configuration that reads the recording"
+    )
+    doctor.add_argument(
+        "--live",
+        action="store_true",
+        help="check the robot of a live session; moves nothing",
+    )
+    add_set(doctor)
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from ratslam.doctor.diagnosis import render
+
+    if arguments.live:
+        diagnosis = _check_live(arguments)
+    elif (arguments.path / "manifest.json").exists():
+        from ratslam.doctor.run_check import diagnose_run
+
+        diagnosis = diagnose_run(arguments.path)
+    else:
+        diagnosis = _check_recording(arguments)
+    print(render(diagnosis))
+    return FAULTY if diagnosis.faults else 0
+
+
+def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
+    """What the recording is; writes its configuration."""
+    from ratslam.config.strict_yaml import dump_data
+    from ratslam.doctor.recording_check import diagnose_recording
+
+    diagnosis = diagnose_recording(arguments.path)
+    output = arguments.output
+    if output is None or not diagnosis.config:
+        return diagnosis
+    if output.exists():
+        raise InputError(str(output), "exists already", "a new file", "choose another with -o")
+    first = f"# Reads {arguments.path}; written by `python -m ratslam doctor`.\n"
+    write_text_atomically(output, first + dump_data(diagnosis.config))
+    return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
+
+
+def _check_live(arguments: argparse.Namespace) -> Diagnosis:
+    """Whether a live session could start."""
+    from ratslam.config.run_config import load_config
+    from ratslam.doctor.live_check import diagnose_live
+
+    prepare_jax()
+    config = load_config(arguments.path, arguments.set)
+    return diagnose_live(config, str(arguments.path), Path("runs"))

@@ -1,0 +1,36 @@
+"""A diagnosis: what something is, what it holds, what is wrong with it, and what to do next; as text."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class Diagnosis(NamedTuple):
+    """What was found.
+
+    Attributes:
+        what: one line. table: rows of cells, the first row the heading; may be empty. notes: facts.
+            faults: what prevents a run, or speaks against a map. advice: what to do next.
+            config: sections of a configuration that reads the recording, {} if there is none.
+    """
+
+    what: str
+    table: tuple[tuple[str, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    config: dict[str, Any] = {}  # noqa: RUF012
+
+
+def render(diagnosis: Diagnosis) -> str:
+    """The diagnosis as lines of text."""
+    lines = [diagnosis.what]
+    if diagnosis.table:
+        widths = [max(map(len, column)) for column in zip(*diagnosis.table, strict=True)]
+        for row in diagnosis.table:
+            lines.append(
+                "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            )
+    for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
+        lines += [f"{mark}{text}" for text in texts]
+    return "\n".join(lines)

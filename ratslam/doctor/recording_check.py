@@ -1,0 +1,136 @@
+"""What a recording holds, whether it can be read, and the configuration that reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.config.strict_yaml import Document, validate
+from ratslam.doctor.diagnosis import Diagnosis
+from ratslam.doctor.recording_kinds import describe_file
+from ratslam.pipeline.source import open_source
+from robot.recordings.unit_check import MotionTrack, TypicalMotion, typical_motion
+from robot.sources.source import Source
+from tactile.base.errors import InputError
+from tactile.base.types import Observation
+
+CELLS_IN_RANGE = 13
+"""Pose cells in the range of the sensor, as in the configurations of real buildings."""
+STEP_CELLS = 0.5
+"""Median motion between two views, cells, where the sensor has no range."""
+DEFAULT_CELL = 0.1  # m
+TORUS = 61
+"""Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
+FEWEST_VIEWS = 400
+"""Views without which recall learns nothing: it knows the scale of view errors after as many."""
+
+
+class Contents(NamedTuple):
+    """What a source holds.
+
+    Attributes:
+        samples, views: numbers of samples, and of those with a view or label. motion: typical; None for
+            a single sample. path: m. step: median motion between two views, m. truth: share of the samples
+            with a true pose. view_shape: of the views. whiskers: number.
+    """
+
+    samples: int
+    views: int
+    motion: TypicalMotion | None
+    path: float
+    step: float
+    truth: float
+    view_shape: tuple[int, int, int]
+    whiskers: int
+
+
+def diagnose_recording(path: Path) -> Diagnosis:
+    """What a recording is, whether it can be read, and the configuration that reads it.
+
+    Raises:
+        InputError: it is missing, or of no known format.
+    """
+    found = describe_file(path)
+    if found.recording is None:
+        return Diagnosis(found.what, found.table, found.notes, found.faults)
+    sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
+    try:
+        with open_source(validate(Document(sections, {}), RunConfig)) as source:
+            contents = summarise(source)
+    except InputError as error:
+        return Diagnosis(found.what, found.table, found.notes, (*found.faults, *str(error).splitlines()))
+    if not contents.whiskers:
+        cell = cell_size(contents.step, found.max_range)
+        sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
+    notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
+    return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
+
+
+def summarise(source: Source) -> Contents:
+    """Reads all samples of a source."""
+    motions, times, truths, views = [], [], 0, []
+    for sample in source:
+        motions.append(np.asarray(sample.reading.odometry, float))
+        times.append(sample.time)
+        truths += sample.truth is not None
+        seen = not isinstance(sample.reading, Observation) or (
+            bool(sample.reading.view_seen) or int(sample.reading.label) >= 0
+        )
+        views.append(seen)
+    motion, time, seen = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
+    length = np.hypot(motion[:, 0], motion[:, 1])
+    between = np.diff(np.cumsum(length)[seen]) if seen.any() else np.zeros(0)
+    moved = between[between > 0]
+    typical = (
+        typical_motion(MotionTrack(time, np.ones(len(time), bool), motion, None)) if len(time) > 1 else None
+    )
+    return Contents(
+        len(time), int(seen.sum()), typical, float(length.sum()), float(np.median(moved)) if len(moved) else 0.0,
+        truths / max(len(time), 1), source.view_shape, source.whiskers,
+    )  # fmt: skip
+
+
+def cell_size(step: float, max_range: float) -> float:
+    """Side of a pose cell, m, to two digits: a share of the sensor's range, else twice a view's motion.
+
+    Args:
+        step: median motion between two views, m. max_range: of the sensor, m, NaN without one.
+    """
+    if np.isfinite(max_range):
+        size = max_range / CELLS_IN_RANGE
+    else:
+        size = step / STEP_CELLS if step > 0 else DEFAULT_CELL
+    return float(f"{size:.2g}")
+
+
+def facts(contents: Contents) -> tuple[str, ...]:
+    """The contents in words."""
+    notes = []
+    if contents.motion is not None:
+        notes.append(
+            f"odometry: {contents.path:.3g} m, typically {contents.motion.speed:.2g} m/s and "
+            f"{contents.motion.turn_rate:.2g} rad/s, a sample every {contents.motion.interval:.2g} s"
+        )
+    shape = " x ".join(map(str, contents.view_shape[:2]))
+    kind = f"of {contents.whiskers} whiskers" if contents.whiskers else f"of {shape} values"
+    notes.append(f"views: {contents.views} {kind}, {contents.step:.2g} m apart")
+    notes.append(f"truth: for {contents.truth:.0%} of the samples" if contents.truth else "truth: unknown")
+    return tuple(notes)
+
+
+def shortcomings(contents: Contents) -> tuple[str, ...]:
+    """What the recording lacks for a good map, in words."""
+    advice = []
+    if not contents.views:
+        advice.append("without views or place labels no place is recognised: the map is the odometry")
+    elif not contents.whiskers and contents.views < FEWEST_VIEWS:
+        advice.append(
+            f"{contents.views} views are few: places are recognised after some {FEWEST_VIEWS} comparisons of "
+            "views, and only where the robot comes back"
+        )
+    if contents.path == 0:
+        advice.append("the odometry does not move: check its topic or columns")
+    return tuple(advice)

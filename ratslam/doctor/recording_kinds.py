@@ -1,0 +1,211 @@
+"""The kinds of recordings, and what a file of each kind holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot.recordings.bags.description import (
+    BagDescription,
+    CloudShape,
+    ImageShape,
+    MotionShape,
+    ScanShape,
+    Shape,
+    Times,
+    ValueShape,
+)
+from robot.recordings.camera.video import SUFFIXES as VIDEOS
+from tactile.base.errors import InputError
+
+LONG_GAP = 5.0
+"""Steps of a topic after which a pause is a gap."""
+USUAL = 4.0
+"""Range of the views over the median range: the far end of most scans in real buildings."""
+Rows = tuple[tuple[str, ...], ...]
+
+
+class FileContents(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        what: one line. recording: settings of `recording` that read it, besides `file`; None if none do.
+        table, notes, faults: as in `Diagnosis`. max_range: of its ranges, m, NaN without ranges.
+    """
+
+    what: str
+    recording: dict[str, Any] | None
+    table: Rows = ()
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+    max_range: float = np.nan
+
+
+def describe_file(path: Path) -> FileContents:
+    """What a recording holds.
+
+    Raises:
+        InputError: it is missing, damaged, or of no known format.
+    """
+    if not path.exists():
+        raise InputError(str(path), "no such file or folder", "a recording or a run directory")
+    if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
+        return _bag(path)
+    describe = KINDS.get(path.suffix.lower())
+    if describe is None:
+        found = f"no reader for {path.suffix!r} files" if path.suffix else "a file without a suffix"
+        raise InputError(
+            str(path), found, f"one of {', '.join([*KINDS, '.bag', '.db3'])}, or the folder of a bag"
+        )
+    return describe(path)
+
+
+def _csv(path: Path) -> FileContents:
+    from robot.recordings.csv_description import describe_csv
+
+    found = describe_csv(path)
+    rows = (
+        ("column", "from", "to"),
+        *((name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns),
+    )
+    notes, faults = list(found.parts.values()), []
+    what = f"{path}: a CSV file, {found.rows} rows"
+    if found.clock is not None:
+        clock = found.clock
+        what += f" over {clock.last - clock.first:.6g} s"
+        if clock.step <= 0 or not clock.gap > 0:
+            faults.append("its times do not increase")
+        elif clock.gap > 10 * clock.step:
+            notes.append(f"longest gap: {clock.gap:.3g} s after t = {clock.gap_at:.6g} s")
+    if found.missing:
+        notes.append(f"missing: {'; '.join(found.missing)}")
+    table = {"table": found.table} if found.table else None
+    rows = (("column", "from", "to"), *cells)
+    return FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
+
+
+def _npz(path: Path) -> FileContents:
+    with np.load(path, allow_pickle=False) as arrays:
+        rows = (
+            ("array", "shape"),
+            *((name, " x ".join(map(str, arrays[name].shape))) for name in arrays.files),
+        )
+    return FileContents(f"{path}: arrays of a reference trace", {}, rows)
+
+
+def _mcap(path: Path) -> FileContents:
+    from robot.recordings.mcap_scanner import is_foreign
+
+    if is_foreign(path):
+        return _bag(path)
+    return FileContents(f"{path}: a recording of ratslam", {})
+
+
+def _bag(path: Path) -> FileContents:
+    from robot.recordings.bags.description import describe_bag
+    from robot.recordings.bags.suggestion import suggested_topics
+
+    found = describe_bag(path)
+    rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]
+    notes, faults = [], []
+    for topic in found.topics:
+        clock = topic.stamped or topic.received
+        roles = ", ".join(topic.roles) or "-"
+        rows.append(
+            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", in_words(topic.shape), roles)
+        )
+        if topic.fault:
+            notes.append(f"{topic.name}: {topic.fault}")
+        if topic.roles:
+            notes += clock_notes(topic.name, clock)
+    links = [f"{link.parent} -> {link.child}{' (fixed)' if link.fixed else ''}" for link in found.links]
+    if links:
+        notes.append(f"frames: {', '.join(links)}")
+    topics = suggested_topics(found)
+    if not topics:
+        faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
+        return FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
+    notes += [
+        f"missing: {name}"
+        for name in ("views", "truth")
+        if name not in topics and not (name == "views" and "touch" in topics)
+    ]
+    start = min(topic.received.first for topic in found.topics)
+    end = max(topic.received.last for topic in found.topics)
+    what = f"{path}: a bag of {len(found.topics)} topics over {end - start:.4g} s"
+    recording: dict[str, Any] = {"topics": topics}
+    if "odometry" not in topics:
+        recording["visual_odometry"] = {}
+    return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(found, topics))
+
+
+def clock_notes(name: str, clock: Times) -> list[str]:
+    """What is remarkable about the stamps of a topic."""
+    counts = {
+        "a stamp of 0": clock.zero,
+        "the stamp of the message before": clock.repeated,
+        "an earlier stamp than the message before": clock.backwards,
+    }
+    notes = [f"{name}: {count} messages have {words}" for words, count in counts.items() if count]
+    if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
+        notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")
+    return notes
+
+
+def in_words(shape: Shape | None) -> str:
+    """What the messages of a topic hold."""
+    match shape:
+        case ScanShape():
+            turn = "all around" if shape.ring else f"over {np.degrees(abs(shape.fov)):.0f} degrees"
+            return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
+        case CloudShape():
+            return f"{shape.points} points, median {shape.reach:.2g} m away"
+        case ImageShape():
+            return f"{shape.width} x {shape.height} {shape.encoding}, mean grey {shape.grey:.0f}"
+        case ValueShape():
+            return f"{' x '.join(map(str, shape.sizes))} values from {shape.low:.3g} to {shape.high:.3g}"
+        case MotionShape():
+            poses, twists = (shape.pose_path, shape.pose_speed), (shape.twist_path, shape.twist_speed)
+            path, speed = poses if np.isfinite(shape.pose_path) else twists
+            return f"{path:.3g} m at {speed:.2g} m/s"
+    return ""
+
+
+def _reach(bag: BagDescription, topics: dict[str, Any]) -> float:
+    """The range of the views, m: as far as the sensor sees, at most `USUAL`; NaN for images."""
+    views = topics.get("views")
+    name = views if isinstance(views, str) or views is None else views["topic"]
+    shapes = [topic.shape for topic in bag.topics if topic.name == name]
+    shape = shapes[0] if shapes else None
+    if isinstance(shape, ScanShape) and np.isfinite(shape.median):
+        return min(shape.high, USUAL * shape.median)
+    return USUAL * shape.reach if isinstance(shape, CloudShape) else np.nan
+
+
+def _video(path: Path) -> FileContents:
+    from robot.recordings.camera.video import describe_video
+
+    found = describe_video(path)
+    what = (
+        f"{path}: a video of {found.frames} frames, {found.width} x {found.height}, {found.rate:g} a second"
+    )
+    if not found.rate > 0:
+        fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
+        return FileContents(what, None, faults=(fault,))
+    recording = {"video": {"rate": found.rate}, "visual_odometry": {}}
+    notes = (
+        "odometry: from the images, without scale; give wheel odometry as video.odometry if there is any",
+    )
+    return FileContents(what, recording, notes=notes)
+
+
+KINDS: dict[str, Callable[[Path], FileContents]] = {
+    ".csv": _csv,
+    ".npz": _npz,
+    ".mcap": _mcap,
+    **dict.fromkeys(VIDEOS, _video),
+}
+"""By suffix; a folder, `.bag` and `.db3` are bags."""

@@ -1,0 +1,185 @@
+"""Whether to believe the map of a run, and which settings to try first."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.artifacts.run_directory import read_run
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.trajectory import ate
+from ratslam.config.run_config import RunConfig, load_config
+from ratslam.doctor.diagnosis import Diagnosis
+from ratslam.pose_graph.io import read_json
+from tactile.base.errors import InputError
+from tactile.base.se2 import between
+
+BELIEVED = 0.3
+"""Probability of a map worse than odometry, below which the map is believed."""
+FAST, SLOW = 2.0, 0.02
+"""Median motion of a step, cells, above which views differ too much from step to step, and below which a
+keyframe takes tens of steps."""
+
+
+class Closures(NamedTuple):
+    """Loop closures of a run: proposed and accepted ones, and sequences of both."""
+
+    proposed: int
+    accepted: int
+    sequences: int
+    accepted_sequences: int
+
+
+def diagnose_run(path: Path) -> Diagnosis:
+    """Whether to believe the map of a run directory.
+
+    Raises:
+        InputError: it is not a run directory, or has no steps.
+    """
+    manifest = read_manifest(path)
+    run, config = read_run(path), load_config(path / "config.yaml")
+    closures, outcomes = count_closures(path), count_outcomes(path)
+    what = f"{path}: a run of {len(run.time)} steps ({manifest['status']}), backend {config.backend}"
+    notes = [judgement(run.doubt)]
+    notes += error_notes(run)
+    if closures is not None:
+        notes.append(
+            f"loop closures: {closures.accepted} of {closures.proposed} accepted, "
+            f"in {closures.accepted_sequences} of {closures.sequences} sequences"
+        )
+    pieces = count_pieces(path)
+    if pieces > 1:
+        notes.append(f"the map has {pieces} pieces; nothing determines their relative poses")
+    faults = outcome_faults(outcomes, len(run.time))
+    advice = settings_to_try(run, config, closures)
+    if (path / "calibration.yaml").exists():
+        advice.append(f"copy {path}/calibration.yaml into the configuration of this robot's next session")
+    if manifest["status"] != "complete" and (path / "map.npz").exists():
+        advice.insert(0, f"continue it: python -m ratslam run {path}/config.yaml --continue {path}/map.npz")
+    return Diagnosis(what, (), tuple(notes), tuple(faults), tuple(advice))
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a run directory.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        manifest: dict[str, Any] = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+        return manifest | {"status": str(manifest["status"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(
+            str(path), "a folder without a manifest.json", "a run directory, or the folder of a bag"
+        ) from None
+
+
+def judgement(doubt: float) -> str:
+    """Whether to believe the map, by the probability that it is worse than odometry; NaN: not estimated."""
+    if not np.isfinite(doubt):
+        return "health: not estimated by this method; compare the map with the odometry yourself"
+    worse = f"{doubt:.0%} likely worse than odometry"
+    if doubt > DOUBTED:
+        return f"health: do not believe the map ({worse}); the trajectory is odometry"
+    if doubt > BELIEVED:
+        return f"health: undecided ({worse}); look at its closures in the report"
+    return f"health: believe the map ({worse})"
+
+
+def error_notes(run: RunArrays) -> list[str]:
+    """Position errors of map and odometry, if truth is known."""
+    rows = truth_rows(run)
+    if run.truth is None or len(rows) < 2:
+        return ["truth: unknown, so nothing but the health tells how good the map is"]
+    final, odometry = ate(run.final[rows], run.truth[rows]), ate(run.odometry[rows], run.truth[rows])
+    better = "better" if final < odometry else "no better"
+    return [f"truth: map {final:.3g} m off, odometry {odometry:.3g} m (ATE): {better} than odometry"]
+
+
+def count_closures(path: Path) -> Closures | None:
+    """The loop closures in closures.csv; None without the file."""
+    file = path / "closures.csv"
+    if not file.exists():
+        return None
+    with file.open(encoding="utf-8", newline="") as lines:
+        rows = [(row["sequence"], row["verdict"] == "accepted") for row in csv.DictReader(lines)]
+    accepted = [sequence for sequence, good in rows if good]
+    return Closures(len(rows), len(accepted), len({sequence for sequence, _ in rows}), len(set(accepted)))
+
+
+def count_outcomes(path: Path) -> Counter[str]:
+    """Number of steps by outcome, and of those that were lost."""
+    counts: Counter[str] = Counter()
+    with (path / "steps.csv").open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            counts[row["outcome"] or "ok"] += 1
+            counts["lost"] += row["lost"] == "1"
+    return counts
+
+
+def count_pieces(path: Path) -> int:
+    """Number of connected components of the map; 0 without a graph."""
+    import networkx
+
+    file = path / "map.json"
+    return networkx.number_weakly_connected_components(read_json(file)) if file.exists() else 0
+
+
+CAUSES = {
+    "too_fast": "the odometry of a step is over 190 cells: is it in metres and radians, is a stamp wrong?",
+    "not_finite": "odometry or a view is NaN or infinite",
+    "full": "a capacity was exceeded",
+    "reseeded": "the pose cells lost their packet: the odometry jumps, or global_inhibition is too large",
+    "lost": "the filter lost the pose: views that match nothing, or odometry that does not fit them",
+}
+"""Causes of outcomes."""
+
+
+def outcome_faults(outcomes: Counter[str], steps: int) -> list[str]:
+    """Outcomes other than ok, with their causes."""
+    found = {name: count for name, count in outcomes.items() if name != "ok" and count}
+    return [
+        f"{count} of {steps} steps: {name.replace('_', ' ')}"
+        + (f" ({CAUSES[name]})" if name in CAUSES else "")
+        for name, count in sorted(found.items())
+    ]
+
+
+def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None) -> list[str]:
+    """Settings to try first, each with its reason."""
+    advice = []
+    moved = np.hypot(*between(run.odometry[:-1], run.odometry[1:])[:, :2].T)
+    moved = moved[moved > 0]
+    cells = float(np.median(moved)) / config.pose_cells.cell_size if len(moved) else 0.0
+    if not len(moved):
+        advice.append("the odometry does not move: check its topic or columns")
+    elif config.backend != "grid" and not SLOW <= cells <= FAST:
+        size = float(f"{2 * float(np.median(moved)):.2g}")
+        how = "more than the network tells apart" if cells > FAST else "many steps to a keyframe"
+        advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells, {how}")
+    if closures is not None and not closures.accepted:
+        advice += _without_closures(closures)
+    elif run.doubt > BELIEVED:
+        advice.append(
+            f"--set keyframes.min_score={2 * config.keyframes.min_score:g}, or a larger keyframes.noise: a map "
+            "that trusts its odometry too much bends to false closures"
+        )
+    return advice
+
+
+def _without_closures(closures: Closures) -> list[str]:
+    if closures.proposed:
+        return [
+            "no loop closure was accepted: the odometry contradicts those proposed, or places look alike; see "
+            "the verdicts in the report; is the sensor mounted the other way round?"
+        ]
+    return [
+        "no place was recognised: did the robot come back to any? Do the views vary? Try another number of "
+        "rows and columns, or another max_range"
+    ]

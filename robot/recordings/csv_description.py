@@ -1,0 +1,272 @@
+"""What a CSV file of a robot holds, guessed from its columns, and the settings of `table` that read it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot.recordings.csv_file import CsvFile, read_csv
+from tactile.base.errors import InputError
+
+TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "time_s", "t_s")
+FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
+LEFT_SPEEDS = ("vy", "v_y", "linear_y")
+TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
+DISTANCES = ("distance", "dist", "ds", "forward")
+TURNS = ("turn", "dtheta", "dth", "rotation")
+HEADINGS = ("heading", "theta", "th", "yaw")
+LABELS = ("label", "place", "place_id")
+"""Names of columns, in lower case."""
+TRUE = re.compile(r"gt|true|truth|ground|mocap|vicon|reference")
+"""Names of columns and files with true poses."""
+FEWEST_PIXELS = 4
+"""Least number of numbered columns that make a view."""
+COLUMNS = (18, 36, 24, 20, 30, 16, 12, 32, 15, 10, 9, 8, 6)
+"""Columns of a view of ranges, the first that divides their number."""
+RANGE_QUANTILE, RANGE_MARGIN = 0.9, 1.25
+"""The largest range of a view is this quantile of all ranges, times the margin."""
+
+
+class Clock(NamedTuple):
+    """Times of a file: first, last, median step, longest step, and where that begins; in the file's unit."""
+
+    first: float
+    last: float
+    step: float
+    gap: float
+    gap_at: float
+
+
+class Column(NamedTuple):
+    """A column: its name, and its least and greatest value."""
+
+    name: str
+    low: float
+    high: float
+
+
+class CsvDescription(NamedTuple):
+    """A file and its companions.
+
+    Attributes:
+        rows: number of lines with values. clock: of its time column, None without one.
+        columns: all, but numbered ones are joined: `r0 .. r179`. parts: what was found for each setting.
+        table: the settings that read it, {} if it has no time or no odometry.
+        max_range: of the views, m; NaN without ranges. missing: what it lacks, in words.
+    """
+
+    path: Path
+    rows: int
+    clock: Clock | None
+    columns: tuple[Column, ...]
+    parts: dict[str, str]
+    table: dict[str, Any]
+    max_range: float
+    missing: tuple[str, ...]
+
+
+def describe_csv(path: Path) -> CsvDescription:
+    """Reads a file and the files beside it whose names begin alike.
+
+    Raises:
+        InputError: it is not a CSV file of numbers.
+    """
+    file = read_csv(path)
+    time = time_column(file)
+    parts, table, missing = dict[str, str](), dict[str, Any](), list[str]()
+    if time is None:
+        missing.append("a column of times (t, time, stamp)")
+        return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
+    odometry = _odometry(file)
+    files = [file, *companions(file, time)]
+    if odometry is None:
+        missing.append("odometry: columns x, y, heading, or v, w, or distance, turn")
+    else:
+        table = {"time": time} | odometry
+        parts["odometry"] = _words(odometry)
+    max_range = np.nan
+    for other in files:
+        views, ranges = _views(file, other)
+        if views is not None and "views" not in table:
+            table |= views
+            parts["views"] = _words({"views": views["views"]})
+            max_range = ranges
+        given = {"truth": _truth(file, other), "labels": _labels(file, other), "pairs": _pairs(file, other)}
+        for name, part in given.items():
+            if part is not None and name not in table:
+                table[name] = part
+                parts[name] = _words({name: part})
+    if "pairs" in table and "labels" in table:
+        del table["pairs"], parts["pairs"]
+    if not {"views", "labels", "pairs"} & table.keys():
+        missing.append("views: numbered columns (r0, r1, ...), here or in a file whose name begins alike")
+    if "truth" not in table:
+        missing.append("true poses (a run then has no score, but a health)")
+    clock = _clock(file.column(time))
+    return CsvDescription(
+        path,
+        len(file.values),
+        clock,
+        _columns(file),
+        parts,
+        table if odometry else {},
+        max_range,
+        tuple(missing),
+    )
+
+
+def time_column(file: CsvFile) -> str | None:
+    """The column of times, None if there is none."""
+    return _named(file, TIMES)
+
+
+def companions(file: CsvFile, time: str) -> list[CsvFile]:
+    """CSV files beside it whose names share its first word, with times that overlap."""
+    word = re.split(r"[_\-. ]", file.path.stem)[0]
+    first, last = file.column(time)[[0, -1]]
+    found = []
+    for path in sorted(file.path.parent.glob(f"{word}*.csv")):
+        if path == file.path:
+            continue
+        try:
+            other = read_csv(path)
+        except InputError:
+            continue
+        column = time_column(other) or (other.names[0] if "t2" in other.names else None)
+        times = other.column(column) if column else np.zeros(0)
+        if len(times) and times.min() <= last and times.max() >= first:
+            found.append(other)
+    return found
+
+
+def _named(file: CsvFile, names: Sequence[str]) -> str | None:
+    """The column with one of these names, in any case."""
+    lower = {name.lower(): name for name in file.names}
+    return next((lower[name] for name in names if name in lower), None)
+
+
+def _poses(file: CsvFile) -> dict[str, dict[str, str]]:
+    """Columns x, y, heading by their common prefix."""
+    lower = {name.lower(): name for name in file.names}
+    found = {}
+    for name in lower:
+        prefix, end = name[:-1], name[-1:]
+        if end != "x" or f"{prefix}y" not in lower:
+            continue
+        heading = next((prefix + word for word in HEADINGS if prefix + word in lower), None)
+        if heading is not None:
+            found[prefix] = {"x": lower[name], "y": lower[f"{prefix}y"], "heading": lower[heading]}
+    return found
+
+
+def _odometry(file: CsvFile) -> dict[str, Any] | None:
+    only_true = bool(TRUE.search(file.path.stem))
+    poses = {prefix: columns for prefix, columns in _poses(file).items() if not TRUE.search(prefix)}
+    if only_true:
+        poses.pop("", None)
+    if poses:
+        return {"pose": next(iter(poses.values()))}
+    forward, turn = _named(file, FORWARD_SPEEDS), _named(file, TURN_RATES)
+    if forward is not None and turn is not None:
+        left = _named(file, LEFT_SPEEDS)
+        return {"velocity": {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
+    forward, turn = _named(file, DISTANCES), _named(file, TURNS)
+    return (
+        {"motion": {"forward": forward, "turn": turn}} if forward is not None and turn is not None else None
+    )
+
+
+def _truth(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
+    poses = _poses(other)
+    if other is file or not TRUE.search(other.path.stem):
+        poses = {prefix: columns for prefix, columns in poses.items() if TRUE.search(prefix)}
+    columns = next(iter(poses.values()), None)
+    return None if columns is None else _file(file, other) | columns
+
+
+def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]:
+    """The settings of views from this file, and their largest range, NaN without ranges."""
+    prefixes = {name.rstrip("0123456789") for name in other.names if name[-1:].isdecimal()}
+    found = [(len(other.numbered(prefix)), prefix) for prefix in prefixes]
+    count, prefix = max(found, default=(0, ""))
+    if count < FEWEST_PIXELS:
+        return None, np.nan
+    values = other.block(prefix)[0]
+    known = values[np.isfinite(values) & (values > 0)]
+    columns = next((columns for columns in COLUMNS if count % columns == 0), count)
+    shape = {"rows": 3, "columns": 6} if columns == 18 else {"rows": 1, "columns": columns}
+    views = _file(file, other) | {"prefix": prefix}
+    if not len(known) or known.max() <= 1.0:
+        return {"rows": 1, "columns": count, "views": views}, np.nan
+    reach = _round(RANGE_MARGIN * float(np.quantile(known, RANGE_QUANTILE)))
+    return shape | {"views": views | {"max_range": reach}}, reach
+
+
+def _labels(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
+    column = _named(other, LABELS)
+    return None if column is None else _file(file, other) | {"column": column}
+
+
+def _pairs(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
+    if other is file or not {"t1", "t2", "score"} <= set(other.names):
+        return None
+    return {"file": str(other.path)}
+
+
+def _file(file: CsvFile, other: CsvFile) -> dict[str, Any]:
+    """The settings that name another file and its times."""
+    if other is file:
+        return {}
+    time = time_column(other) or ""
+    return {"file": str(other.path)} | ({"time": time} if time != "t" else {})
+
+
+def _columns(file: CsvFile) -> tuple[Column, ...]:
+    found, joined = list[Column](), set[str]()
+    for name in file.names:
+        prefix = name.rstrip("0123456789")
+        values = file.column(name)
+        if prefix != name and len(numbers := list(file.numbered(prefix))) >= FEWEST_PIXELS:
+            if prefix in joined:
+                continue
+            joined.add(prefix)
+            name, values = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}", file.block(prefix)[0]
+        known = values[np.isfinite(values)]
+        found.append(
+            Column(name, *((float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)))
+        )
+    return tuple(found)
+
+
+def _clock(time: np.ndarray) -> Clock:
+    steps = np.diff(time)
+    if not len(steps):
+        return Clock(float(time[0]), float(time[0]), 0.0, 0.0, float(time[0]))
+    longest = int(np.argmax(steps))
+    return Clock(
+        float(time[0]), float(time[-1]), float(np.median(steps)), float(steps[longest]), float(time[longest])
+    )
+
+
+def _words(settings: dict[str, Any]) -> str:
+    """Settings in one line: `pose: x, y, heading`."""
+    named = ("prefix", "max_range")
+    lines = []
+    for name, part in settings.items():
+        words = []
+        for key, value in part.items():
+            word = Path(value).name if key == "file" else str(value)
+            words.append(f"{key} {word}" if key in named else word)
+        lines.append(f"{name}: {', '.join(words)}")
+    return "; ".join(lines)
+
+
+def _round(value: float) -> float:
+    """To one and a half significant digits: 0.5, 1, 1.5, 2, 3, 4, ..., 10, 15, 20, 30 ..."""
+    scale = 10.0 ** np.floor(np.log10(value))
+    steps = np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    return float(f"{scale * steps[np.argmin(np.abs(steps - value / scale))]:.3g}")
