@@ -65,6 +65,8 @@ def diagnose_recording(path: Path) -> Diagnosis:
     if not contents.whiskers:
         cell = cell_size(contents.step, found.max_range)
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
+        if found.field_of_view is not None:
+            sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
     notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
     return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
 
@@ -80,17 +82,21 @@ def summarise(source: Source) -> Contents:
             bool(sample.reading.view_seen) or int(sample.reading.label) >= 0
         )
         views.append(seen)
-    motion, time, seen = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
+    motion, time, viewed = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
     length = np.hypot(motion[:, 0], motion[:, 1])
-    between = np.diff(np.cumsum(length)[seen]) if seen.any() else np.zeros(0)
+    between = np.diff(np.cumsum(length)[viewed])
     moved = between[between > 0]
-    typical = (
-        typical_motion(MotionTrack(time, np.ones(len(time), bool), motion, None)) if len(time) > 1 else None
-    )
+    track = MotionTrack(time, np.ones(len(time), bool), motion, None)
     return Contents(
-        len(time), int(seen.sum()), typical, float(length.sum()), float(np.median(moved)) if len(moved) else 0.0,
-        truths / max(len(time), 1), source.view_shape, source.whiskers,
-    )  # fmt: skip
+        samples=len(time),
+        views=int(viewed.sum()),
+        motion=typical_motion(track) if len(time) > 1 else None,
+        path=float(length.sum()),
+        step=float(np.median(moved)) if len(moved) else 0.0,
+        truth=truths / max(len(time), 1),
+        view_shape=source.view_shape,
+        whiskers=source.whiskers,
+    )
 
 
 def cell_size(step: float, max_range: float) -> float:

@@ -34,6 +34,7 @@ class FileContents(NamedTuple):
     Attributes:
         what: one line. recording: settings of `recording` that read it, besides `file`; None if none do.
         table, notes, faults: as in `Diagnosis`. max_range: of its ranges, m, NaN without ranges.
+        field_of_view: of its ranges, rad, counter-clockwise positive; None if unknown.
     """
 
     what: str
@@ -42,6 +43,7 @@ class FileContents(NamedTuple):
     notes: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
     max_range: float = np.nan
+    field_of_view: float | None = None
 
 
 def describe_file(path: Path) -> FileContents:
@@ -83,7 +85,6 @@ def _csv(path: Path) -> FileContents:
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
     table = {"table": found.table} if found.table else None
-    rows = (("column", "from", "to"), *cells)
     return FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
 
 
@@ -91,7 +92,11 @@ def _npz(path: Path) -> FileContents:
     with np.load(path, allow_pickle=False) as arrays:
         rows = (
             ("array", "shape"),
-            *((name, " x ".join(map(str, arrays[name].shape))) for name in arrays.files),
+            *(
+                (name, " x ".join(map(str, arrays[name].shape)))
+                for name in arrays.files
+                if name.startswith(("in_", "truth"))
+            ),
         )
     return FileContents(f"{path}: arrays of a reference trace", {}, rows)
 
@@ -121,9 +126,9 @@ def _bag(path: Path) -> FileContents:
             notes.append(f"{topic.name}: {topic.fault}")
         if topic.roles:
             notes += clock_notes(topic.name, clock)
-    links = [f"{link.parent} -> {link.child}{' (fixed)' if link.fixed else ''}" for link in found.links]
-    if links:
-        notes.append(f"frames: {', '.join(links)}")
+    moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
+    if found.links:
+        notes.append(f"frames: {', '.join(moving)}; {len(found.links) - len(moving)} fixed links")
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
@@ -139,7 +144,11 @@ def _bag(path: Path) -> FileContents:
     recording: dict[str, Any] = {"topics": topics}
     if "odometry" not in topics:
         recording["visual_odometry"] = {}
-    return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(found, topics))
+    shape = _shape_of_views(found, topics)
+    fov = shape.fov if isinstance(shape, ScanShape) else None
+    if isinstance(shape, ScanShape) and shape.ring:
+        fov = 2 * np.pi
+    return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
 
 
 def clock_notes(name: str, clock: Times) -> list[str]:
@@ -174,12 +183,15 @@ def in_words(shape: Shape | None) -> str:
     return ""
 
 
-def _reach(bag: BagDescription, topics: dict[str, Any]) -> float:
-    """The range of the views, m: as far as the sensor sees, at most `USUAL`; NaN for images."""
+def _shape_of_views(bag: BagDescription, topics: dict[str, Any]) -> Shape | None:
+    """What the topic of the views holds."""
     views = topics.get("views")
     name = views if isinstance(views, str) or views is None else views["topic"]
-    shapes = [topic.shape for topic in bag.topics if topic.name == name]
-    shape = shapes[0] if shapes else None
+    return next((topic.shape for topic in bag.topics if topic.name == name), None)
+
+
+def _reach(shape: Shape | None) -> float:
+    """The range of the views, m: as far as the sensor sees, at most `USUAL` medians; NaN for images."""
     if isinstance(shape, ScanShape) and np.isfinite(shape.median):
         return min(shape.high, USUAL * shape.median)
     return USUAL * shape.reach if isinstance(shape, CloudShape) else np.nan

@@ -167,8 +167,8 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
         advice += _without_closures(closures)
     elif run.doubt > BELIEVED:
         advice.append(
-            f"--set keyframes.min_score={2 * config.keyframes.min_score:g}, or a larger keyframes.noise: a map "
-            "that trusts its odometry too much bends to false closures"
+            f"--set keyframes.min_score={2 * config.keyframes.min_score:g}, or a larger keyframes.noise: a "
+            "map that trusts its odometry too much bends to false closures"
         )
     return advice
 
@@ -176,8 +176,8 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
 def _without_closures(closures: Closures) -> list[str]:
     if closures.proposed:
         return [
-            "no loop closure was accepted: the odometry contradicts those proposed, or places look alike; see "
-            "the verdicts in the report; is the sensor mounted the other way round?"
+            "no loop closure was accepted: the odometry contradicts those proposed, or places look alike; "
+            "the report shows them; is the sensor mounted the other way round?"
         ]
     return [
         "no place was recognised: did the robot come back to any? Do the views vary? Try another number of "

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
+    BeforeValidator,
     Field,
     GetJsonSchemaHandler,
     NonNegativeFloat,
@@ -15,6 +16,14 @@ from pydantic import (
 from pydantic_core import CoreSchema
 
 from tactile.base.config import Settings
+
+
+def _as_tuple(value: Any) -> Any:
+    """A list as a tuple: after a validator of the whole section, lists no longer count as tuples."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+FromList = BeforeValidator(_as_tuple)
 
 
 class Topic(Settings):
@@ -37,7 +46,7 @@ class PoseTopic(Topic):
 
     topic: str | None = None
     """Topic of Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped messages."""
-    tf: tuple[str, str] | None = None
+    tf: Annotated[tuple[str, str] | None, FromList] = None
     """Or two frames of /tf and /tf_static: the pose of the second in the first, such as [map, base_link]."""
 
     @model_validator(mode="after")
@@ -70,7 +79,7 @@ class ViewsTopic(Topic):
     """Range that becomes 1, m; null: `range_max` of the first scan, at most 8 m."""
     yaw: float | None = None
     """Direction of the sensor in the frame of the robot, rad, counter-clockwise; null: from /tf_static."""
-    heights: tuple[float, float] = (0.1, 1.0)
+    heights: Annotated[tuple[float, float], FromList] = (0.1, 1.0)
     """Point clouds: lowest and highest point that counts, m, in the frame of the robot."""
     tolerance: NonNegativeFloat | None = None
     """Largest time between a view and its nearest sample, s; null: the median step of the odometry."""
@@ -87,7 +96,7 @@ class TouchTopic(Topic):
     """C, columns of the sensors; null: the values divided by the rows."""
     use: Literal["position", "velocity", "effort"] = "position"
     """Which values of JointState messages."""
-    joints: tuple[str, ...] = ()
+    joints: Annotated[tuple[str, ...], FromList] = ()
     """Joints of JointState messages, in the order of the pixels; messages without them are for others. Empty:
     all joints of the first message."""
     low: float = 0.0
