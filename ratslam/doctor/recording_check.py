@@ -19,7 +19,7 @@ from tactile.base.types import Observation
 
 CELLS_IN_RANGE = 13
 """Pose cells in the range of the sensor, as in the configurations of real buildings."""
-STEP_CELLS = 0.5
+STEP_CELLS = 1.0
 """Median motion between two views, cells, where the sensor has no range."""
 DEFAULT_CELL = 0.1  # m
 TORUS = 61
@@ -100,7 +100,7 @@ def summarise(source: Source) -> Contents:
 
 
 def cell_size(step: float, max_range: float) -> float:
-    """Side of a pose cell, m, to two digits: a share of the sensor's range, else twice a view's motion.
+    """Side of a pose cell, m, to two digits: a share of the sensor's range, else the motion between views.
 
     Args:
         step: median motion between two views, m. max_range: of the sensor, m, NaN without one.

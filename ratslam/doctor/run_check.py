@@ -22,9 +22,10 @@ from tactile.base.se2 import between
 
 BELIEVED = 0.3
 """Probability of a map worse than odometry, below which the map is believed."""
-FAST, SLOW = 2.0, 0.02
-"""Median motion of a step, cells, above which views differ too much from step to step, and below which a
-keyframe takes tens of steps."""
+SAME = 0.99
+"""Share of the odometry's error above which the map's is no better."""
+FAST = 2.0
+"""Median motion of a step, cells, above which the views of successive steps differ too much."""
 
 
 class Closures(NamedTuple):
@@ -98,7 +99,7 @@ def error_notes(run: RunArrays) -> list[str]:
     if run.truth is None or len(rows) < 2:
         return ["truth: unknown, so nothing but the health tells how good the map is"]
     final, odometry = ate(run.final[rows], run.truth[rows]), ate(run.odometry[rows], run.truth[rows])
-    better = "better" if final < odometry else "no better"
+    better = "better" if final < SAME * odometry else "no better"
     return [f"truth: map {final:.3g} m off, odometry {odometry:.3g} m (ATE): {better} than odometry"]
 
 
@@ -159,10 +160,9 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
     cells = float(np.median(moved)) / config.pose_cells.cell_size if len(moved) else 0.0
     if not len(moved):
         advice.append("the odometry does not move: check its topic or columns")
-    elif config.backend != "grid" and not SLOW <= cells <= FAST:
+    elif config.backend != "grid" and cells > FAST:
         size = float(f"{2 * float(np.median(moved)):.2g}")
-        how = "more than the network tells apart" if cells > FAST else "many steps to a keyframe"
-        advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells, {how}")
+        advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells")
     if closures is not None and not closures.accepted:
         advice += _without_closures(closures)
     elif run.doubt > BELIEVED:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,8 +14,11 @@ from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.startup_checks import check_controller
 from robot.live.config import LiveConfig
 from robot.live.head_stream import HeadStream
+from robot.live.polling import TICK, SessionFault
 from robot.live.rig import Rig
+from robot.live.route import check_targets, plan_path
 from tactile.base.errors import InputError
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 LISTEN_TIME = 1.5
 """Time for which both streams are observed, s."""
@@ -110,3 +114,34 @@ def start_head(head: HeadReader) -> str:
 def _listen(rig: Rig) -> None:
     end = rig.now() + LISTEN_TIME
     rig.wait_until(lambda: rig.now() >= end, LISTEN_TIME + 5.0, SessionOutcome.HEAD_SILENT, "the self-test")
+
+
+def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
+    """Checks what a session needs without starting a program on the arm, which then cannot move; yields
+    a line of text for each passed check.
+
+    Args:
+        head: geometry of the whisker head. directory: in which the session would make its run directory.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+        robot.live.polling.SessionFault: the head failed meanwhile.
+    """
+    yield check_disk(config, directory)
+    path = plan_path(config, ur10_head(head))
+    check_targets(config, path)
+    yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
+    with Rig(config, head, lambda: False) as rig:
+        yield from find_devices(rig)
+        check_stream(rig.head, rig.stream, config.residual, lambda: _listen_to_head(rig.stream))
+        yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
+
+
+def _listen_to_head(stream: HeadStream) -> None:
+    end = time.monotonic() + LISTEN_TIME
+    while time.monotonic() < end:
+        for _ in stream.take():
+            pass
+        if stream.fault:
+            raise SessionFault(stream.fault)
+        time.sleep(TICK)
