@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import Document, validate
+from ratslam.config.strict_yaml import dump_data, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
 from ratslam.pipeline.source import open_source
@@ -26,6 +26,9 @@ TORUS = 61
 """Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
 FEWEST_VIEWS = 400
 """Views without which recall learns nothing: it knows the scale of view errors after as many."""
+
+
+UNREADABLE = "no configuration reads it: see what is missing"
 
 
 class Contents(NamedTuple):
@@ -55,10 +58,12 @@ def diagnose_recording(path: Path) -> Diagnosis:
     """
     found = describe_file(path)
     if found.recording is None:
-        return Diagnosis(found.what, found.table, found.notes, found.faults)
+        return Diagnosis(found.what, found.table, found.notes, found.faults or (UNREADABLE,))
     sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
+    if "visual_odometry" in found.recording:
+        sections["presets"] = ["visual_odometry"]
     try:
-        with open_source(validate(Document(sections, {}), RunConfig)) as source:
+        with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
             contents = summarise(source)
     except InputError as error:
         return Diagnosis(found.what, found.table, found.notes, (*found.faults, *str(error).splitlines()))

@@ -25,6 +25,12 @@ LONG_GAP = 5.0
 """Steps of a topic after which a pause is a gap."""
 USUAL = 4.0
 """Range of the views over the median range: the far end of most scans in real buildings."""
+USUAL_FOV = 60.0
+"""Horizontal field of view of most cameras, degrees."""
+NO_WHEELS = (
+    f"odometry: from the images, without scale, for a camera of {USUAL_FOV:g} degrees; set "
+    "recording.visual_odometry.fov_deg to yours, or give wheel odometry"
+)
 Rows = tuple[tuple[str, ...], ...]
 
 
@@ -143,7 +149,8 @@ def _bag(path: Path) -> FileContents:
     what = f"{path}: a bag of {len(found.topics)} topics over {end - start:.4g} s"
     recording: dict[str, Any] = {"topics": topics}
     if "odometry" not in topics:
-        recording["visual_odometry"] = {}
+        recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
+        notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
     fov = shape.fov if isinstance(shape, ScanShape) else None
     if isinstance(shape, ScanShape) and shape.ring:
@@ -207,7 +214,7 @@ def _video(path: Path) -> FileContents:
     if not found.rate > 0:
         fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
         return FileContents(what, None, faults=(fault,))
-    recording = {"video": {"rate": found.rate}, "visual_odometry": {}}
+    recording = {"video": {"rate": found.rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
     notes = (
         "odometry: from the images, without scale; give wheel odometry as video.odometry if there is any",
     )

@@ -1,0 +1,157 @@
+"""The doctor names what a recording holds, and writes the configuration that reads it."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from ratslam.config.run_config import RunConfig, load_config
+from ratslam.pipeline.source import open_source
+from robot.recordings.mcap_reader import record_source
+from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from tests.helpers.corridor_camera import Camera, CorridorLoop, write_video
+from tests.helpers.ros_bags import odometry, scan, write_bag
+
+START, STEP = 1_700_000_000_000_000_000, 100_000_000  # ns
+STEPS = 40
+
+
+def write_table(path: Path, **columns: np.ndarray) -> None:
+    lines = [
+        ",".join(columns),
+        *(",".join(map(repr, row)) for row in np.stack(list(columns.values()), 1).tolist()),
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Recordings of a robot that drives along an arc at 1 m/s, one of each kind."""
+    time = np.arange(STEPS) / 10
+    heading = 0.05 * np.arange(STEPS)
+    x, y = np.cumsum(0.1 * np.cos(heading)), np.cumsum(0.1 * np.sin(heading))
+    ranges = 1 + np.abs(np.sin(time[:, None] + np.arange(36)))
+    beams = {f"r{k}": ranges[:, k] for k in range(36)}
+    write_table(tmp_path / "lab_odometry.csv", t=time, x=x, y=y, theta=heading)
+    write_table(tmp_path / "lab_scans.csv", time=time, **beams)
+    write_table(tmp_path / "lab_truth.csv", t=time, x=x, y=y, yaw=heading)
+    write_table(tmp_path / "speeds.csv", Time=time, V=np.full(STEPS, 1.0), omega=np.full(STEPS, 0.5))
+    write_table(tmp_path / "degrees.csv", t=time, x=x, y=y, heading=np.rad2deg(20 * heading))
+    write_table(tmp_path / "walls.csv", x1=x, y1=y)
+    messages = []
+    for k in range(STEPS):
+        stamp = START + k * STEP
+        messages.append(odometry(stamp, x[k], y[k], heading[k]))
+        messages.append(scan(stamp, ranges[k], -np.pi, np.pi / 18))
+    write_bag(tmp_path, "sqlite3", messages)
+    world = CorridorLoop(seed=5, length=5.0, depth=4.0, breadth=1.4, laps=0.05)
+    write_video(tmp_path / "loop.avi", Camera(fov_deg=90, width=96, height=64).frames(world), 10, "MJPG")
+    record_source(
+        HeadSimulation(SimulationConfig.model_validate({"path": {"explore": 5}})), tmp_path / "touch.mcap"
+    )
+    return tmp_path
+
+
+def written(folder: Path, name: str) -> RunConfig:
+    """The configuration that the doctor writes for a recording."""
+    output = folder / "elsewhere.yaml"
+    assert main(["doctor", str(folder / name), "-o", str(output)]) == 0
+    return load_config(output)
+
+
+@pytest.mark.parametrize(
+    ("name", "samples", "shape", "whiskers"),
+    [
+        ("lab_odometry.csv", STEPS, (3, 6, 1), 0),
+        ("speeds.csv", STEPS, (3, 6, 1), 0),
+        ("run", STEPS, (3, 6, 1), 0),
+        ("loop.avi", None, None, 0),
+        ("touch.mcap", 5, (3, 6, 1), 18),
+    ],
+)
+def test_the_configuration_reads_the_recording(
+    folder: Path, name: str, samples: int | None, shape: tuple[int, int, int] | None, whiskers: int
+) -> None:
+    with open_source(written(folder, name)) as source:
+        assert source.whiskers == whiskers
+        assert samples is None or len(list(source)) == samples
+        assert shape is None or source.view_shape == shape
+        assert len(list(islice(source, 5))) == 5
+
+
+def test_a_table_is_put_together_from_the_files_beside_it(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = written(folder, "lab_odometry.csv")
+    said = capsys.readouterr().out
+    assert "lab_scans.csv" in said
+    assert "lab_truth.csv" in said
+    table = config.recording and config.recording.table
+    assert table is not None
+    assert table.pose is not None
+    assert table.pose.heading == "theta"
+    assert table.views is not None
+    assert table.views.time == "time"
+    assert table.views.max_range == 2.5  # 1.25 times the 90 % quantile, rounded
+    assert table.truth is not None
+    assert table.truth.heading == "yaw"
+    assert config.pose_cells.cell_size == 0.19  # 13 cells in the range
+    with open_source(config) as source:
+        samples = list(source)
+    assert all(sample.truth is not None and sample.reading.view_seen for sample in samples)
+
+
+def test_a_ring_of_beams_has_its_field_of_view(folder: Path) -> None:
+    assert written(folder, "run").recall.sector_fov == pytest.approx(2 * np.pi, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [("degrees.csv", "multiply by pi/180"), ("walls.csv", "no configuration reads it")],
+)
+def test_a_recording_that_cannot_be_read_has_a_fault(
+    folder: Path, name: str, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = folder / "mine.yaml"
+    assert main(["doctor", str(folder / name), "-o", str(output)]) == 1
+    assert fault in capsys.readouterr().out
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("nothing.bag", "no such file"), ("notes.txt", "no reader for '.txt'")]
+)
+def test_a_file_of_no_known_kind_is_an_error(
+    folder: Path, name: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "notes.txt").write_text("notes")
+    assert main(["doctor", str(folder / name)]) == 2
+    assert error in capsys.readouterr().err
+
+
+def test_a_file_is_never_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = folder / "mine.yaml"
+    output.write_text("mine")
+    assert main(["doctor", str(folder / "speeds.csv"), "-o", str(output)]) == 2
+    assert output.read_text() == "mine"
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_the_turtlebot_bag_runs_as_the_doctor_says(reference_data: Path, tmp_path: Path) -> None:
+    bag = reference_data / "bags" / "turtlebot4_first_floor"
+    if not bag.is_dir():
+        pytest.skip(f"no bag {bag}")
+    output = tmp_path / "mine.yaml"
+    assert main(["doctor", str(bag), "-o", str(output)]) == 0
+    config = load_config(output)
+    assert config.recording is not None
+    assert config.recording.topics is not None
+    assert config.recording.topics.odometry is not None
+    assert config.recording.topics.odometry.topic == "/odom"
+    with open_source(config) as source:
+        assert source.length == 920
+        assert sum(bool(sample.reading.view_seen) for sample in source) == 355
