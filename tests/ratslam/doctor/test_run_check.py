@@ -73,7 +73,7 @@ def test_bad_steps_are_faults(run: Path, capsys: pytest.CaptureFixture[str]) -> 
     cells[column] = "too_fast"
     lines[7] = ",".join(cells)
     (run / "steps.csv").write_text("\n".join([header, *lines]) + "\n")
-    assert "fault: 1 of 349 steps are too_fast" in said(run, capsys, 1)
+    assert "fault: 1 of 349 steps: too fast" in said(run, capsys, 1)
 
 
 def test_the_advice_is_a_setting_of_the_program(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -123,8 +123,8 @@ def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench, server: Ses
         session.process.send_signal(signal.SIGINT)
         recording = check_end(robot, session, "interrupted")
     unfelt = [sample.reading for sample in recording if not sample.reading.alive.any()]
-    assert len(unfelt) == 1
-    assert not unfelt[0].contact.any()
+    assert 1 <= len(unfelt) <= 2  # the motion that Ctrl-C ends at once may have no sample either
+    assert not any(reading.contact.any() for reading in unfelt)
     assert [event.name for event in recording.events][:2] == ["held", "resumed"]
 
 
