@@ -76,7 +76,9 @@ def _become_session(order: dict[str, Any], program: Any) -> None:
     mapping = None if takes is None else partial(stub_mapper.mapping, directory, takes)
     run = ratslam.live.session.run_live_session
     # Without the process that draws the map.
-    ratslam.live.session.run_live_session = lambda *given, armed: run(*given, mapping=mapping)
+    ratslam.live.session.run_live_session = lambda *given, armed, view: run(
+        *given, mapping=mapping, view=view
+    )
     if not order["rate_check"]:
         selftest.LISTEN_TIME = 0.3
         selftest.MIN_RATE_SHARE = 0.0  # on a busy machine the emulated head may be late in so short a time
