@@ -53,7 +53,7 @@ class Program(argparse.ArgumentParser):
     commands: Commands
 
     def format_help(self) -> str:
-        lines = ["usage: ratslam COMMAND ...", "", DESCRIPTION, ""]
+        lines = ["usage: ratslam COMMAND ...", DESCRIPTION, ""]
         for group in GROUPS:
             heading = group
             for name, parser in self.commands.parsers.items():
