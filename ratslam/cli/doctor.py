@@ -40,6 +40,8 @@ def add_commands(commands: Commands) -> None:
 def _doctor(arguments: argparse.Namespace) -> int:
     from ratslam.doctor.diagnosis import render
 
+    if arguments.set and not arguments.live:
+        raise InputError("--set", "settings without --live", "the configuration of a live session")
     if arguments.live:
         diagnosis = _check_live(arguments)
     elif (arguments.path / "manifest.json").exists():

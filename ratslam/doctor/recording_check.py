@@ -19,15 +19,12 @@ from tactile.base.types import Observation
 
 CELLS_IN_RANGE = 13
 """Pose cells in the range of the sensor, as in the configurations of real buildings."""
-STEP_CELLS = 1.0
-"""Median motion between two views, cells, where the sensor has no range."""
-DEFAULT_CELL = 0.1  # m
+DEFAULT_CELL = 0.1
+"""Side of a pose cell of a robot that does not move, m."""
 TORUS = 61
 """Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
 FEWEST_VIEWS = 400
 """Views without which recall learns nothing: it knows the scale of view errors after as many."""
-
-
 UNREADABLE = "no configuration reads it: see what is missing"
 
 
@@ -110,10 +107,7 @@ def cell_size(step: float, max_range: float) -> float:
     Args:
         step: median motion between two views, m. max_range: of the sensor, m, NaN without one.
     """
-    if np.isfinite(max_range):
-        size = max_range / CELLS_IN_RANGE
-    else:
-        size = step / STEP_CELLS if step > 0 else DEFAULT_CELL
+    size = max_range / CELLS_IN_RANGE if np.isfinite(max_range) else step or DEFAULT_CELL
     return float(f"{size:.2g}")
 
 

@@ -18,13 +18,12 @@ from robot.recordings.bags.description import (
     Times,
     ValueShape,
 )
+from robot.recordings.bags.views import LONGEST
 from robot.recordings.camera.video import SUFFIXES as VIDEOS
 from tactile.base.errors import InputError
 
 LONG_GAP = 5.0
 """Steps of a topic after which a pause is a gap."""
-USUAL = 4.0
-"""Range of the views over the median range: the far end of most scans in real buildings."""
 USUAL_FOV = 60.0
 """Horizontal field of view of most cameras, degrees."""
 NO_WHEELS = (
@@ -74,7 +73,7 @@ def describe_file(path: Path) -> FileContents:
 def _csv(path: Path) -> FileContents:
     from robot.recordings.csv_description import describe_csv
 
-    found = describe_csv(path)
+    found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
     rows = (
         ("column", "from", "to"),
         *((name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns),
@@ -198,10 +197,10 @@ def _shape_of_views(bag: BagDescription, topics: dict[str, Any]) -> Shape | None
 
 
 def _reach(shape: Shape | None) -> float:
-    """The range of the views, m: as far as the sensor sees, at most `USUAL` medians; NaN for images."""
-    if isinstance(shape, ScanShape) and np.isfinite(shape.median):
-        return min(shape.high, USUAL * shape.median)
-    return USUAL * shape.reach if isinstance(shape, CloudShape) else np.nan
+    """The range that becomes 1 in the views, m; NaN for images."""
+    if isinstance(shape, ScanShape):
+        return min(shape.high, LONGEST)
+    return LONGEST if isinstance(shape, CloudShape) else np.nan
 
 
 def _video(path: Path) -> FileContents:
@@ -215,10 +214,7 @@ def _video(path: Path) -> FileContents:
         fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
         return FileContents(what, None, faults=(fault,))
     recording = {"video": {"rate": found.rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
-    notes = (
-        "odometry: from the images, without scale; give wheel odometry as video.odometry if there is any",
-    )
-    return FileContents(what, recording, notes=notes)
+    return FileContents(what, recording, notes=(NO_WHEELS,))
 
 
 KINDS: dict[str, Callable[[Path], FileContents]] = {

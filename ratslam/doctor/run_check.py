@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.run_directory import check_run_directory, read_run
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
-from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import ate
+from evaluation.report.verdict import CAUTION, judge_map
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.pose_graph.io import read_json
-from tactile.base.errors import InputError
 from tactile.base.se2 import between
 
-BELIEVED = 0.3
-"""Probability of a map worse than odometry, below which the map is believed."""
 SAME = 0.99
 """Share of the odometry's error above which the map's is no better."""
 FAST = 2.0
@@ -43,12 +41,13 @@ def diagnose_run(path: Path) -> Diagnosis:
     Raises:
         InputError: it is not a run directory, or has no steps.
     """
-    manifest = read_manifest(path)
+    check_run_directory(path)
+    status = read_manifest(path).status
     run, config = read_run(path), load_config(path / "config.yaml")
     closures, outcomes = count_closures(path), count_outcomes(path)
-    what = f"{path}: a run of {len(run.time)} steps ({manifest['status']}), backend {config.backend}"
-    notes = [judgement(run.doubt)]
-    notes += error_notes(run)
+    what = f"{path}: a run of {len(run.time)} steps ({status}), backend {config.backend}"
+    verdict = judge_map(run.doubt)
+    notes = [f"{verdict.headline}. {verdict.reason}", *error_notes(run)]
     if closures is not None:
         notes.append(
             f"loop closures: {closures.accepted} of {closures.proposed} accepted, "
@@ -61,36 +60,9 @@ def diagnose_run(path: Path) -> Diagnosis:
     advice = settings_to_try(run, config, closures)
     if (path / "calibration.yaml").exists():
         advice.append(f"copy {path}/calibration.yaml into the configuration of this robot's next session")
-    if manifest["status"] != "complete" and (path / "map.npz").exists():
+    if status != "complete" and (path / "map.npz").exists():
         advice.insert(0, f"continue it: python -m ratslam run {path}/config.yaml --continue {path}/map.npz")
     return Diagnosis(what, (), tuple(notes), tuple(faults), tuple(advice))
-
-
-def read_manifest(path: Path) -> dict[str, Any]:
-    """The manifest of a run directory.
-
-    Raises:
-        InputError: there is none.
-    """
-    try:
-        manifest: dict[str, Any] = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
-        return manifest | {"status": str(manifest["status"])}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(
-            str(path), "a folder without a manifest.json", "a run directory, or the folder of a bag"
-        ) from None
-
-
-def judgement(doubt: float) -> str:
-    """Whether to believe the map, by the probability that it is worse than odometry; NaN: not estimated."""
-    if not np.isfinite(doubt):
-        return "health: not estimated by this method; compare the map with the odometry yourself"
-    worse = f"{doubt:.0%} likely worse than odometry"
-    if doubt > DOUBTED:
-        return f"health: do not believe the map ({worse}); the trajectory is odometry"
-    if doubt > BELIEVED:
-        return f"health: undecided ({worse}); look at its closures in the report"
-    return f"health: believe the map ({worse})"
 
 
 def error_notes(run: RunArrays) -> list[str]:
@@ -104,14 +76,15 @@ def error_notes(run: RunArrays) -> list[str]:
 
 
 def count_closures(path: Path) -> Closures | None:
-    """The loop closures in closures.csv; None without the file."""
-    file = path / "closures.csv"
-    if not file.exists():
+    """The loop closures in closures.csv; None if there are none, as of a method that proposes none."""
+    if not (path / "closures.csv").exists():
         return None
-    with file.open(encoding="utf-8", newline="") as lines:
-        rows = [(row["sequence"], row["verdict"] == "accepted") for row in csv.DictReader(lines)]
-    accepted = [sequence for sequence, good in rows if good]
-    return Closures(len(rows), len(accepted), len({sequence for sequence, _ in rows}), len(set(accepted)))
+    table = read_closure_table(path)
+    accepted = table.accepted()
+    sequence = table.evidence.get("sequence", np.arange(len(accepted)))
+    return Closures(
+        len(accepted), int(accepted.sum()), len(np.unique(sequence)), len(np.unique(sequence[accepted]))
+    )
 
 
 def count_outcomes(path: Path) -> Counter[str]:
@@ -165,11 +138,16 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
         advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells")
     if closures is not None and not closures.accepted:
         advice += _without_closures(closures)
-    elif run.doubt > BELIEVED:
-        advice.append(
-            f"--set keyframes.min_score={2 * config.keyframes.min_score:g}, or a larger keyframes.noise: a "
-            "map that trusts its odometry too much bends to false closures"
-        )
+    elif run.doubt > CAUTION:
+        advice += _for_a_doubtful_map(config)
+    return advice
+
+
+def _for_a_doubtful_map(config: RunConfig) -> list[str]:
+    advice = ["python -m ratslam report RUN_DIR -o report.html: shows each closure with its two views"]
+    if config.recall.sector_fov == "auto":
+        advice.append("recall.sector_fov: the sensor's field of view, rad, instead of an estimate")
+    advice.append("keyframes.noise: the noise of this robot's odometry, instead of the preset's")
     return advice
 
 

@@ -105,6 +105,20 @@ def test_a_table_is_put_together_from_the_files_beside_it(
     assert all(sample.truth is not None and sample.reading.view_seen for sample in samples)
 
 
+def test_the_configuration_may_stand_in_another_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "configs").mkdir()
+    monkeypatch.chdir(folder)
+    assert main(["doctor", "lab_odometry.csv", "-o", "configs/mine.yaml"]) == 0
+    monkeypatch.chdir(folder.parent)
+    with open_source(load_config(folder / "configs" / "mine.yaml")) as source:
+        assert sum(sample.truth is not None and bool(sample.reading.view_seen) for sample in source) == STEPS
+
+
+def test_settings_belong_to_live_sessions(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", str(folder / "speeds.csv"), "--set", "seed=1"]) == 2
+    assert "--set" in capsys.readouterr().err
+
+
 def test_a_ring_of_beams_has_its_field_of_view(folder: Path) -> None:
     assert written(folder, "run").recall.sector_fov == pytest.approx(2 * np.pi, abs=1e-3)
 

@@ -33,14 +33,18 @@ def said(run: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> str:
 
 def test_a_good_map_is_believed(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = said(run, capsys)
-    assert "health: believe the map" in text
+    assert "Believe this map." in text
     assert "better than odometry" in text
     assert "no better" not in text
 
 
 @pytest.mark.parametrize(
     ("doubt", "words"),
-    [(0.9, "do not believe the map (90%"), (0.5, "undecided (50%"), (0.1, "believe the map (10%")],
+    [
+        (0.9, "Do not believe this map. It is 90%"),
+        (0.5, "Take this map with care. It is 50%"),
+        (0.1, "Believe this map. It is 90%"),
+    ],
 )
 def test_the_health_decides(run: Path, capsys: pytest.CaptureFixture[str], doubt: float, words: str) -> None:
     (run / "health.json").write_text(json.dumps({"worse_than_odometry": doubt}))
@@ -87,4 +91,4 @@ def test_the_advice_is_a_setting_of_the_program(run: Path, capsys: pytest.Captur
 def test_a_folder_that_is_no_run_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "manifest.json").write_text("{}")
     assert main(["doctor", str(tmp_path)]) == 2
-    assert "a run directory, or the folder of a bag" in capsys.readouterr().err
+    assert "not a manifest" in capsys.readouterr().err
