@@ -29,11 +29,15 @@ def judge_map(doubt: float) -> Verdict:
     """The verdict on a map.
 
     Args:
-        doubt: probability that its error is worse than odometry's; NaN if the method does not judge its map.
+        doubt: probability that its error is worse than odometry's; exactly 0 if no loop closure was accepted,
+            because the map is then the odometry; NaN if the method does not judge its map.
     """
     if np.isnan(doubt):
         reason = "This method does not say how far its map can be trusted."
         return Verdict("unjudged", "The map is not judged", reason)
+    if doubt == 0:
+        reason = "No loop closure was accepted, so nothing corrects the drift of the odometry."
+        return Verdict("unjudged", "This map is the odometry", reason)
     worse, better = _percent(doubt), _percent(1 - doubt)
     if doubt > DOUBTED:
         reason = f"It is {worse} likely worse than odometry, so the trajectory given is that of odometry."

@@ -23,8 +23,6 @@ DEFAULT_CELL = 0.1
 """Side of a pose cell of a robot that does not move, m."""
 TORUS = 61
 """Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
-FEWEST_VIEWS = 400
-"""Views without which recall learns nothing: it knows the scale of view errors after as many."""
 UNREADABLE = "no configuration reads it: see what is missing"
 
 
@@ -131,11 +129,6 @@ def shortcomings(contents: Contents) -> tuple[str, ...]:
     advice = []
     if not contents.views:
         advice.append("without views or place labels no place is recognised: the map is the odometry")
-    elif not contents.whiskers and contents.views < FEWEST_VIEWS:
-        advice.append(
-            f"{contents.views} views are few: places are recognised after some {FEWEST_VIEWS} comparisons of "
-            "views, and only where the robot comes back"
-        )
     if contents.path == 0:
         advice.append("the odometry does not move: check its topic or columns")
     return tuple(advice)

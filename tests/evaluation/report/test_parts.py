@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[3]
 @pytest.mark.parametrize(
     ("doubt", "level", "words"),
     [
-        (0.0, "believed", "100% likely no worse"),
+        (0.0, "unjudged", "nothing corrects the drift"),
         (0.001, "believed", "over 99% likely no worse"),
         (0.29, "believed", "71% likely no worse"),
         (0.5, "uncertain", "leaves 50%"),
