@@ -123,6 +123,8 @@ def render_health(card: Scorecard) -> str:
         return ""
     if found.value > DOUBTED:
         return f"health: map_doubted, {found.value:.0%} likely worse than odometry, which is given instead"
+    if found.value == 0:
+        return "health: no loop closure was accepted, the map is the odometry"
     return f"health: map {1 - found.value:.0%} likely no worse than odometry"
 
 
