@@ -42,7 +42,7 @@ class MotionReport(NamedTuple):
     """Report on a motion that was passed on.
 
     Attributes:
-        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end. felt: whether
+        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end. sampled: whether
             the whiskers sent samples to its end.
     """
 
@@ -50,16 +50,16 @@ class MotionReport(NamedTuple):
     time: float
     state: CreateState
     moment: StepEnd
-    felt: bool
+    sampled: bool
 
 
 class _Motion(NamedTuple):
-    """Attributes: end: of the motion; contact: [W] at its end; strain: [T, W, 2]; felt: as above."""
+    """Attributes: end: of the motion; contact: [W] at its end; strain: [T, W, 2]; sampled: as above."""
 
     end: MotionEnd
     contact: np.ndarray
     strain: np.ndarray
-    felt: bool
+    sampled: bool
 
 
 def run_create_loop(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
@@ -89,7 +89,7 @@ def _explore(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport],
             odometry=odometry,
             motion=int(doing.state.motion),
             moment=int(motion.end.moment),
-            alive=rig.alive & motion.felt,
+            alive=rig.alive & motion.sampled,
             contact=motion.contact,
             time=np.arange(len(motion.strain)) / plan.whiskers.rate,
             strain=motion.strain,
@@ -98,8 +98,8 @@ def _explore(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport],
         if rig.recorder is not None:
             rig.recorder.add_sample(sample)
         mapper.offer(sample)
-        tell(MotionReport(number, stamp, doing.state, motion.end.moment, motion.felt))
-        if not motion.felt:
+        tell(MotionReport(number, stamp, doing.state, motion.end.moment, motion.sampled))
+        if not motion.sampled:
             _wait_for_whiskers(rig)
         doing = next_state(plan.behaviour, doing, motion.end.moment, odometry.dtheta, random, LEAST_TURN)
         touching, number = motion.contact, number + 1
@@ -142,7 +142,7 @@ def _execute(rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: n
     else:
         rig.robot.stop()
     contact = np.abs(_known(rig, rows)[end.row, :, 0]) > behaviour.contact
-    return _Motion(end, contact, _strain_series(rig, doing.state, end.row + 1), felt=True)
+    return _Motion(end, contact, _strain_series(rig, doing.state, end.row + 1), sampled=True)
 
 
 def _drive(rig: CreateRig, command: WheelCommand) -> float:
@@ -177,7 +177,7 @@ def _strain_series(rig: CreateRig, state: CreateState, rows: int) -> np.ndarray:
 def _unfelt_motion(rig: CreateRig) -> _Motion:
     whiskers = len(rig.alive)
     return _Motion(
-        MotionEnd(0, StepEnd.FREE), np.zeros(whiskers, bool), np.zeros((0, whiskers, 2)), felt=False
+        MotionEnd(0, StepEnd.FREE), np.zeros(whiskers, bool), np.zeros((0, whiskers, 2)), sampled=False
     )
 
 

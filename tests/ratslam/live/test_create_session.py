@@ -122,9 +122,9 @@ def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench, server: Ses
         until(robot.rolls, "the robot goes on")
         session.process.send_signal(signal.SIGINT)
         recording = check_end(robot, session, "interrupted")
-    unfelt = [sample.reading for sample in recording if not sample.reading.alive.any()]
-    assert 1 <= len(unfelt) <= 2  # the motion that Ctrl-C ends at once may have no sample either
-    assert not any(reading.contact.any() for reading in unfelt)
+    unsampled = [sample.reading for sample in recording if not sample.reading.alive.any()]
+    assert 1 <= len(unsampled) <= 2  # the motion that Ctrl-C ends at once may have no sample either
+    assert not any(reading.contact.any() for reading in unsampled)
     assert [event.name for event in recording.events][:2] == ["held", "resumed"]
 
 
