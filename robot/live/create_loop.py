@@ -42,8 +42,8 @@ class MotionReport(NamedTuple):
     """Report on a motion that was passed on.
 
     Attributes:
-        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end. sampled: whether
-            the whiskers sent samples to its end.
+        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end.
+        sampled: whether the whiskers sent samples to its end.
     """
 
     number: int
