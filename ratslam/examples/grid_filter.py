@@ -42,13 +42,14 @@ def draw(maps: dict[int, np.ndarray], paths: dict[str, np.ndarray], cell: float)
     line = f"probability of an obstacle in each cell of {100 * cell:g} cm; bright: occupied"
     figure = new_figure(4.4, "The grid filter", line)
     for column, (steps, grid) in enumerate(maps.items()):
-        axes = add_axes(figure, 0.62 + 2.45 * column, 1.0, 2.25, 2.25)
+        axes = add_axes(figure, 0.75 + 2.4 * column, 1.0, 2.25, 2.25)
         half = len(grid) * cell / 2
         axes.imshow(grid, origin="lower", cmap="inferno", vmin=0, vmax=1, extent=(-half, half, -half, half))
         for (name, path), color in zip(paths.items(), (GREEN, BLUE, GREY), strict=True):
             axes.plot(*path[:steps, :2].T, color=color, lw=0.8, label=name)
         axes.set_title(f"{steps} reports", fontsize=10)
         name_axes(axes, "x (m)", "y (m)" if column == 0 else "")
+        axes.tick_params(labelleft=column == 0)
     add_legend(figure, axes)
     return figure
 

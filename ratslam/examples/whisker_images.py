@@ -41,7 +41,7 @@ def draw(images: dict[str, np.ndarray]) -> Figure:
             axes.imshow(views[whisk], cmap="Greys", vmin=0, vmax=1)
             axes.set(xticks=(), yticks=(), title=f"whisk {whisk + 1}" if row == 0 else "")
             axes.spines[:].set_visible(True)
-            name_axes(axes, "", transform if column == 0 else "")
+            name_axes(axes, "", transform.replace("_", "\n") if column == 0 else "")
     figure.text(
         0.08,
         0.06,
