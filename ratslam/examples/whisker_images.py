@@ -33,7 +33,7 @@ def main() -> None:
 
 def draw(images: dict[str, np.ndarray]) -> Figure:
     """Some images of both transforms."""
-    line = "a pixel a whisker; dark: the whisker was stopped early, by a near or a tall wall"
+    line = "a pixel a whisker: the height of the wall that it touches, dark for tall; white: no contact"
     figure = new_figure(3.2, "Whisker images", line)
     for row, (transform, views) in enumerate(images.items()):
         for column, whisk in enumerate(SHOWN):
