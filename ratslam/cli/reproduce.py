@@ -68,6 +68,15 @@ def add_commands(commands: Commands) -> None:
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
     add_tables(Commands(tables))
+    real = names.add(
+        "real", _real, "figures on recordings of real whiskers and wheels",
+        "reproduce real --rows contact -o runs/real",
+    )  # fmt: skip
+    real.add_argument("--rows", nargs="+", metavar="ROW", help="only these figures")
+    real.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
+        help="folder for real.md and a picture per figure (default runs/real)",
+    )  # fmt: skip
     train = commands.add(
         "train-templates", _train, "record strain templates of a simulated Create",
         "train-templates create_arena -o runs/templates.npz", "papers",
@@ -190,6 +199,22 @@ def _train(arguments: argparse.Namespace) -> int:
     templates = train_to_file(create_simulation, arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
+    return 0
+
+
+def _real(arguments: argparse.Namespace) -> int:
+    from ratslam.experiments.real.reproduction import NAMES, reproduce_real
+    from ratslam.experiments.tables.markdown import select_rows
+    from ratslam.experiments.tables.recordings import DATA, real_recordings
+
+    data = real_recordings()
+    if data is None:
+        raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
+    prepare_jax(keep_compiled=False)
+    names = select_rows(arguments.rows, dict.fromkeys(NAMES), NAMES)
+    for line in reproduce_real(names, data, arguments.output):
+        print(line, flush=True)
+    print(f"wrote {arguments.output / 'real.md'}")
     return 0
 
 

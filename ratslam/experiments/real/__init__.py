@@ -1,0 +1,1 @@
+"""Figures on recordings of real whiskers and real wheels (see README.md)."""

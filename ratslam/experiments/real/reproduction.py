@@ -1,0 +1,41 @@
+"""Measures figures on real recordings and writes them as one page with pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+
+from ratslam.experiments.real.figure import RealFigure
+from tactile.base.atomic_write import write_text_atomically
+
+NAMES: tuple[str, ...] = ()
+"""The figures: names of modules of this room."""
+
+
+def find_figure(name: str) -> RealFigure:
+    """The figure of a name in `NAMES`."""
+    return import_module(f"ratslam.experiments.real.{name}").FIGURE
+
+
+def reproduce_real(names: Sequence[str], data: Path, output: Path) -> Iterator[str]:
+    """The lines of the page, each table as soon as it is measured; writes `real.md` and a PNG per figure.
+
+    Args:
+        data: folder of the real recordings. output: folder for the page, made if it does not exist.
+
+    Raises:
+        InputError: a recording is missing or damaged.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    page = []
+    for name in names:
+        figure = find_figure(name)
+        result = figure.measure(data)
+        picture = output / f"{name}.png"
+        figure.draw(result, picture)
+        shown = f"![{figure.title}]({picture.name})"
+        lines = [f"## {figure.title}", "", *figure.table(result), "", shown, ""]
+        yield from lines
+        page += lines
+        write_text_atomically(output / "real.md", "\n".join(page))
