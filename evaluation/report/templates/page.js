@@ -9,7 +9,12 @@
 
   const theme = () => root.dataset.theme ?? (dark.matches ? "dark" : "light");
   const make = (name, text = "", options = {}) => Object.assign(document.createElement(name), { textContent: text }, options);
-  const number = (value) => (value === null ? "–" : typeof value === "string" ? value.replace("inf", "∞") : value.toLocaleString("en", { maximumSignificantDigits: 4 }));
+  const number = (value) => {
+    if (value === null) return "–";
+    if (typeof value === "string") return value.replace("inf", "∞");
+    const notation = value !== 0 && Math.abs(value) < 1e-4 ? "scientific" : "standard";
+    return value.toLocaleString("en", { maximumSignificantDigits: 4, notation });
+  };
 
   // Charts
 
@@ -193,7 +198,8 @@
         part(`.${name}-caption`).textContent = `step ${step}${when === null ? "" : `, ${number(when)} s`}`;
       }
       const reduced = views && (views.rows !== views.shape[0] || views.columns !== views.shape[1]);
-      part(".views-note").textContent = !views ? "The run kept no views." : reduced ? `Views of ${views.shape.join(" × ")} pixels, shown at ${views.rows} × ${views.columns}.` : `Views of ${views.shape.join(" × ")} pixels.`;
+      const shownAs = [reduced ? `at ${views.rows} × ${views.columns}` : "", views?.gain > 1 ? `${number(views.gain)} times as bright` : ""].filter(Boolean);
+      part(".views-note").textContent = views ? `Views of ${views.shape.join(" × ")} pixels${shownAs.length ? `, shown ${shownAs.join(", ")}` : ""}.` : "The run kept no views.";
       const facts = closures.evidence.map((each) => [each.label, number(each.values[k])]);
       if (truth) facts.push(["apart in truth, m", number(closures.apart[k])]);
       part(".evidence").replaceChildren(...facts.flatMap(([label, value]) => [make("dt", label), make("dd", value)]));

@@ -103,13 +103,25 @@ def test_half_the_resolution_keeps_the_brightness(image: np.ndarray) -> None:
     assert image.min() <= small.min() <= small.max() <= image.max()
 
 
+def test_dim_views_are_brightened_and_full_ones_are_not() -> None:
+    full = np.arange(256, dtype=np.uint8).repeat(4).reshape(2, 8, 64)
+    dim = full // 3
+    for view, gain in ((full, 255 / 253), (dim, 255 / 84), (np.zeros_like(full), 1.0)):
+        record = view_records(ClosureViews(np.array([3, 7]), view))
+        assert record is not None
+        assert record["gain"] == pytest.approx(gain, rel=0.01)
+        shown = np.frombuffer(b64decode(record["pixels"]), np.uint8).reshape(view.shape)
+        assert (shown == 0).tolist() == (view == 0).tolist()
+        assert shown.max() == (255 if view.any() else 0)
+
+
 def test_views_are_reduced_only_to_fit_the_page() -> None:
     rng = np.random.default_rng(0)
     small = ClosureViews(np.array([3, 7]), rng.integers(0, 256, (2, 3, 6), np.uint8))
     record = view_records(small)
     assert record is not None
     assert (record["rows"], record["columns"], record["steps"]) == (3, 6, [3, 7])
-    assert b64decode(record["pixels"]) == small.view.tobytes()
+    assert len(b64decode(record["pixels"])) == small.view.size
     many = ClosureViews(np.arange(10_000), np.zeros((10_000, 20, 60), np.uint8))
     record = view_records(many)
     assert record is not None
