@@ -30,10 +30,11 @@ _NORMAL_MEDIAN_SQUARE = 0.45493642311957283
 def window_variances(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> np.ndarray:
     """The noise variance of each short window of a record, from differences between samples `lag` apart.
 
-    Windows overlap by half; window j begins at sample j * (window // 2) and ends `window + lag` samples later.
+    Windows overlap by half; window j is of the `window + lag` samples from sample j * (window // 2) on.
 
     Args:
-        record: [T, ...] samples. lag: samples between the two of a difference. window: differences in a window.
+        record: [T, ...] samples. lag: samples between the two of a difference. window: differences in a
+            window.
 
     Returns:
         [J, ...] half the mean square of the differences of each window.
@@ -87,8 +88,9 @@ def estimate_noise(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> 
 def estimate_drift(record: np.ndarray, block: int = 100) -> np.ndarray:
     """The drift of each channel, as the growth of a random walk: its standard deviation after one sample.
 
-    After n samples the walk has the standard deviation `drift * sqrt(n)`. Of the means of blocks of L samples,
-    differences over two blocks have a variance larger by drift^2 L than those over one; the noise cancels.
+    After n samples the walk has the standard deviation `drift * sqrt(n)`. Of the means of blocks of L
+    samples, differences over two blocks have a variance larger by drift^2 L than those over one; the noise
+    cancels.
     The variances are medians of squares, so contacts in fewer than half of the differences do not raise them
     much. A steady slope counts as a walk.
 
