@@ -4,7 +4,8 @@ A whisker that touches is deflected to one side of its baseline for longer than 
 one that was let go, or is shaken, swings through it. So the departure of a channel is the least of the last
 period's deviations on one side. The baseline follows the signal while the whisker is free and stands still
 during a contact. After a contact a whisker does not return to its baseline at once (creep of its mount): a
-share of the largest departure is allowed for, and the drift since the contact began; both fade.
+share of the largest departure is allowed for, and the drift since the contact began; both fade. It creeps
+towards a second, slow baseline, and between the two it is free.
 
 `find_contacts` is a pure function of a state and the next samples, however many: the decisions are the same
 bit for bit for a live stream and for its recording. Baselines and allowances change at the ends of blocks, at
@@ -39,10 +40,13 @@ class ContactStreamConfig(Settings):
     drift_sds: NonNegativeFloat = 4.5
     """Change of the baseline in a second of contact that is allowed for when the contact ends; it grows with
     the square root of time. Three standard deviations of a random walk of 1.5 in a second."""
-    tracking_time: PositiveFloat = 0.25
-    """Time constant of the baseline of a free whisker, s. A departure slower than `on_sds` in this time counts
-    as drift."""
-    block: PositiveFloat = 0.1
+    tracking_time: PositiveFloat = 0.1
+    """Time constant of the baseline of a free whisker, s. A departure slower than `on_sds` in this time is
+    taken for drift."""
+    home_time: PositiveFloat = 5.0
+    """Time constant of a second, slow baseline, s. A whisker that creeps back after contacts moves towards
+    it; between the two baselines it is free."""
+    block: PositiveFloat = 0.05
     """Interval at which baselines change, s."""
     bent_time: PositiveFloat = 30.0
     """A whisker that stays away from its baseline for this long while its base moves counts as bent, s."""
@@ -61,10 +65,11 @@ class StreamPlan(NamedTuple):
     """Settings in samples, and the noise: what does not change during a stream.
 
     Attributes:
-        noise: [W, K] in the unit of the signal. on, off: departures, in noise. window: samples of a vibration.
-        block: samples between changes of the baseline. gain: share of the way that a baseline goes in a block.
-        creep: share of a departure that may remain; drift: departure that may come about in a contact of one
-        sample, in noise; fading: decrease of both in a block. bent: samples.
+        noise: [W, K] in the unit of the signal. on, off: departures, in noise. window: samples of a
+            vibration. block: samples between changes of the baselines.
+        gain, home_gain: the way that the baseline and the slow one go in a block, as shares.
+        creep: share of a departure that may remain. drift: departure that may come about in a contact of one
+            sample, in noise. fading: decrease of both in a block. bent: samples.
     """
 
     noise: np.ndarray
@@ -73,6 +78,7 @@ class StreamPlan(NamedTuple):
     window: int
     block: int
     gain: float
+    home_gain: float
     creep: float
     drift: float
     fading: float
@@ -83,11 +89,12 @@ class StreamState(NamedTuple):
     """All that a stream remembers.
 
     Attributes:
-        row: samples so far in this block. recent: [window - 1, W, K] last samples. baseline: [W, K];
-        home: [W, K] the baseline before a whisker was bent. contact, bent: [W] bool. allowance: [W] departure
-        that creep and drift explain, in noise. held: [W] samples of contact so far; away: of these, while the
-        base moved.
-        Of this block: total: [W, K] sum of the deviations; touched: [W] bool; largest: [W] departure in contact.
+        row: samples so far in this block. recent: [window - 1, W, K] last samples.
+        baseline: [W, K]. home: [W, K] slow baseline; of a bent whisker, that before it was bent.
+        contact, bent: [W] bool. allowance: [W] departure that creep and drift explain, in noise.
+        held: [W] samples of contact so far. away: [W] of these, while the base moved.
+        total, touched, largest: of this block, [W, K] sum of the deviations, [W] whether there was a contact,
+            [W] departure in contact.
     """
 
     row: int
@@ -120,6 +127,7 @@ def start_stream(
         window=window,
         block=block,
         gain=1 - float(np.exp(-block / (config.tracking_time * rate))),
+        home_gain=1 - float(np.exp(-block / (config.home_time * rate))),
         creep=config.creep,
         drift=config.drift_sds / float(np.sqrt(rate)),
         fading=float(np.exp(-block / (config.creep_time * rate))),
@@ -145,11 +153,11 @@ def find_contacts(
         The state after the samples, and [T, W] int8, a `Touch` each.
     """
     touch = np.empty(samples.shape[:2], np.int8)
+    moves = np.ones(len(samples), bool) if moving is None else moving
     first = 0
     while first < len(samples):
         last = min(first + plan.block - state.row, len(samples))
-        pace = last - first if moving is None else int(np.count_nonzero(moving[first:last]))
-        state, contact = _continue_block(plan, state, samples[first:last], pace)
+        state, contact = _continue_block(plan, state, samples[first:last], moves[first:last])
         touch[first:last] = np.where(contact, Touch.CONTACT, np.where(state.bent, Touch.BENT, Touch.FREE))
         if state.row == plan.block:
             state = _end_block(plan, state)
@@ -158,7 +166,9 @@ def find_contacts(
 
 
 def date_back(plan: StreamPlan, touch: np.ndarray) -> np.ndarray:
-    """[T, W] states with each contact from its first sample on, which is known `plan.window - 1` samples later.
+    """[T, W] states with each contact from its first sample on.
+
+    In a live stream a contact is known `plan.window - 1` samples after that.
 
     Args:
         touch: [T, W] from `find_contacts`.
@@ -170,8 +180,9 @@ def date_back(plan: StreamPlan, touch: np.ndarray) -> np.ndarray:
 
 
 def find_fixed_contacts(free: np.ndarray, samples: np.ndarray, sds: float = 20.0) -> np.ndarray:
-    """[T, W] bool, contact by the rule of Salman & Pearson 2016, III-E: a channel further from the mean of a free
-    record than 20 of its standard deviations.
+    """[T, W] bool, contact by the rule of Salman & Pearson 2016, III-E.
+
+    A channel is further from the mean of a free record than 20 of its standard deviations.
 
     Args:
         free: [F, W, K] the free record. samples: [T, W, K].
@@ -180,53 +191,68 @@ def find_fixed_contacts(free: np.ndarray, samples: np.ndarray, sds: float = 20.0
 
 
 def _continue_block(
-    plan: StreamPlan, state: StreamState, samples: np.ndarray, pace: int
+    plan: StreamPlan, state: StreamState, samples: np.ndarray, moving: np.ndarray
 ) -> tuple[StreamState, np.ndarray]:
-    """Decides samples within a block; `pace` of them were taken in motion. Returns [T, W] bool, contact."""
-    count = len(samples)
+    """Decides samples within a block. Returns [T, W] bool, contact."""
     known = np.concatenate([state.recent, samples])
     deviation = (known - state.baseline) / plan.noise
+    departure = _departure(plan, state, deviation, len(samples))
+    sums = np.concatenate([state.total[None], deviation[plan.window - 1 :]])
+    later = state._replace(
+        row=state.row + len(samples), recent=known[len(samples) :], total=np.add.accumulate(sums)[-1]
+    )
+    begins = departure > plan.on + state.allowance
+    if not (state.contact.any() or begins.any()):
+        return later, begins
+    contact = _with_hysteresis(begins, departure < plan.off + state.allowance, state.contact)
+    return _count_contacts(later, contact, departure, moving), contact
+
+
+def _departure(plan: StreamPlan, state: StreamState, deviation: np.ndarray, count: int) -> np.ndarray:
+    """[count, W] least deviation of a window on one side of both baselines, in noise; the largest channel."""
     low = high = deviation[plan.window - 1 :]
     for earlier in range(plan.window - 1):
         part = deviation[earlier : earlier + count]
         low, high = np.minimum(low, part), np.maximum(high, part)
-    departure = np.maximum(low, -high).max(axis=-1)
-    begins = departure > plan.on + state.allowance
-    if state.contact.any() or begins.any():
-        decided = begins | (departure < plan.off + state.allowance)
-        latest = np.where(decided, np.arange(count)[:, None], -1)
-        latest = np.maximum.accumulate(latest, axis=0)
-        held = np.take_along_axis(begins, np.maximum(latest, 0), axis=0)
-        contact = np.where(latest >= 0, held, state.contact)
-        largest = np.maximum(state.largest, np.where(contact, departure, 0.0).max(axis=0))
-        touched = state.touched | contact.any(axis=0)
-    else:
-        contact, largest, touched = begins, state.largest, state.touched
-    sums = np.concatenate([state.total[None], deviation[plan.window - 1 :]])
-    later = state._replace(
-        row=state.row + count,
-        recent=known[count:],
+    home = np.where(state.bent[:, None], 0.0, (state.home - state.baseline) / plan.noise)
+    return np.maximum(low - np.maximum(home, 0.0), np.minimum(home, 0.0) - high).max(axis=-1)
+
+
+def _with_hysteresis(begins: np.ndarray, ends: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """[T, W] state that each beginning sets and each end clears, from the state [W] before."""
+    latest = np.where(begins | ends, np.arange(len(begins))[:, None], -1)
+    latest = np.maximum.accumulate(latest, axis=0)
+    return np.where(latest >= 0, np.take_along_axis(begins, np.maximum(latest, 0), axis=0), before)
+
+
+def _count_contacts(
+    state: StreamState, contact: np.ndarray, departure: np.ndarray, moving: np.ndarray
+) -> StreamState:
+    """The state after contacts [T, W]: how long they have lasted and how far they went."""
+    row = np.arange(1, len(contact) + 1)
+    free = np.where(contact, 0, row[:, None]).max(axis=0)
+    steps = np.concatenate([[0], np.cumsum(moving)])
+    return state._replace(
         contact=contact[-1],
-        held=np.where(contact[-1], state.held + count, 0),
-        away=np.where(contact[-1], state.away + pace, 0),
-        total=np.add.accumulate(sums)[-1],
-        touched=touched,
-        largest=largest,
+        held=np.where(free, row[-1] - free, state.held + row[-1]),
+        away=np.where(free, steps[-1] - steps[free], state.away + steps[-1]),
+        touched=state.touched | contact.any(axis=0),
+        largest=np.maximum(state.largest, np.where(contact, departure, 0.0).max(axis=0)),
     )
-    return later, contact
 
 
 def _end_block(plan: StreamPlan, state: StreamState) -> StreamState:
-    """Moves the baselines of free whiskers, lets allowances fade, and names whiskers that are bent or back."""
+    """Moves the baselines of free whiskers, lets allowances fade, names whiskers that are bent or back."""
     mean = state.total / plan.block
     follow = np.where(state.touched[:, None], 0.0, plan.gain * mean)
     baseline = state.baseline + follow * plan.noise
+    home = state.home + plan.home_gain * (baseline - state.home)
     fading = np.where(state.contact, state.allowance, plan.fading * state.allowance)
     explained = plan.creep * state.largest + plan.drift * np.sqrt(state.held)
     later = state._replace(
         row=0,
         baseline=baseline,
-        home=np.where(state.bent[:, None], state.home, baseline),
+        home=np.where(state.bent[:, None] | state.touched[:, None], state.home, home),
         allowance=np.maximum(fading, explained),
         total=np.zeros_like(state.total),
         touched=np.zeros_like(state.touched),

@@ -20,8 +20,8 @@ class DirtyRecordConfig(Settings):
     """Whiskers that touched something during a record of free whiskers."""
 
     on_dirty: Literal["refuse", "repair"] = "refuse"
-    """Whether such a whisker is an error, or is calibrated on the longest clean stretch of the record (an error
-    if there is none)."""
+    """Whether such a whisker is an error, or is calibrated on the longest clean stretch of the record; an
+    error if there is none."""
     max_ratio: PositiveFloat = 4.0
     """A whisker is dirty if its standard deviation over its noise, or its noise, exceeds that of the median
     whisker by this factor."""
@@ -84,8 +84,8 @@ def calibrate_free(config: DirtyRecordConfig, record: np.ndarray, where: str = "
         record: [T, W, K] samples. where: name of the record in errors.
 
     Raises:
-        InputError: the record is too short or has NaN; a whisker touched something, and is to be refused or has
-            no clean stretch.
+        InputError: the record is too short or has NaN; a whisker touched something, and is to be refused or
+            has no clean stretch.
     """
     noise, mean = estimate_noise(record), record.mean(axis=0)
     dirty = find_dirty_whiskers(record.std(axis=0), noise, config.max_ratio)

@@ -13,7 +13,8 @@ import numpy as np
 from tactile.base.errors import InputError
 
 FOLDER = Path(__file__).with_name("annotations")
-"""A CSV file for each annotator: whisker, start_row, end_row (exclusive), label; every row of every whisker."""
+"""A CSV file for each annotator: whisker, start_row, end_row (exclusive), label; it covers every row of every
+whisker."""
 
 
 class Label(IntEnum):

@@ -1,9 +1,11 @@
-"""Hours of drifting whiskers made from a short record: drift and noise fitted to its free whiskers, its contacts
-spliced in at known times."""
+"""Hours of drifting whiskers made from a short record.
+
+Drift and noise are fitted to its free whiskers, and its contacts are spliced in at known times.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +44,7 @@ class Snippet(NamedTuple):
 
 
 class Plant(NamedTuple):
-    """A snippet in a block of a stream: its first and last sample, and those of its contact (ends exclusive)."""
+    """A snippet in a block of a stream: its first and last sample, and its contact's; ends are exclusive."""
 
     first: int
     last: int
@@ -55,14 +57,15 @@ class StreamScore(NamedTuple):
 
     Attributes:
         contacts: planted, each longer than 0.1 s. missed: of them with less than half of it found.
-        false: stretches found in contact with no snippet at that time. false_share: their share of the samples
-            outside snippets.
+        false: stretches found in contact with no snippet at that time. wrong: their samples.
+        free: samples outside snippets.
     """
 
     contacts: int
     missed: int
     false: int
-    false_share: float
+    wrong: int
+    free: int
 
 
 def fit_free_model(record: np.ndarray) -> FreeModel:
@@ -106,16 +109,29 @@ def simulate_stream(
         yield walk + noise, planted
 
 
-def score_stream(decide: Decide, blocks: Iterator[tuple[np.ndarray, list[Plant]]]) -> StreamScore:
-    """Scores a rule on a stream of planted contacts."""
-    contacts = missed = false = outside = wrong = 0
+def score_stream(
+    rules: Mapping[str, Decide], blocks: Iterable[tuple[np.ndarray, list[Plant]]]
+) -> dict[str, StreamScore]:
+    """Scores rules by name on the same stream of planted contacts."""
+    scores = dict.fromkeys(rules, StreamScore(0, 0, 0, 0, 0))
     for samples, planted in blocks:
-        contact = decide(samples)
-        for whisker, plant in enumerate(planted):
-            found = contact[:, whisker].copy()
-            contacts, missed = contacts + 1, missed + int(found[plant.begin : plant.end].mean() < 0.5)
-            found[plant.first : plant.last] = False
-            outside += len(found) - (plant.last - plant.first)
-            wrong += int(found.sum())
-            false += int(np.count_nonzero(np.diff(found.astype(np.int8), prepend=0) == 1))
-    return StreamScore(contacts, missed, false, wrong / max(outside, 1))
+        for name, decide in rules.items():
+            scores[name] = add_scores(scores[name], _score_block(decide(samples), planted))
+    return scores
+
+
+def add_scores(*scores: StreamScore) -> StreamScore:
+    """The score of several parts of a stream together."""
+    return StreamScore(*(sum(column) for column in zip(*scores, strict=True)))
+
+
+def _score_block(contact: np.ndarray, planted: list[Plant]) -> StreamScore:
+    """Scores [T, W] contacts of a block."""
+    free = np.ones_like(contact)
+    missed = 0
+    for whisker, plant in enumerate(planted):
+        missed += int(contact[plant.begin : plant.end, whisker].mean() < 0.5)
+        free[plant.first : plant.last, whisker] = False
+    wrong = contact & free
+    false = np.count_nonzero(np.diff(wrong.astype(np.int8), prepend=0, axis=0) == 1)
+    return StreamScore(len(planted), missed, int(false), int(wrong.sum()), int(free.sum()))

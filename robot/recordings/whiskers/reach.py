@@ -1,9 +1,9 @@
 """An arm that reaches through clutter with two arrays of magnetic whiskers.
 
-From the recordings of "Navigation and 3D Surface Reconstruction from Passive Whisker Sensing" (arXiv 2406.06038).
-The CSV file has a row per reading: `row`, the pose of the end effector (position in m, quaternion in the order
-in which it was stored), and x, y, z (counts) of 8 whiskers on the left and 6 on the right. It has no time: the
-authors' tracker assumes 200 readings per second.
+From the recordings of "Navigation and 3D Surface Reconstruction from Passive Whisker Sensing" (arXiv
+2406.06038). The CSV file has a row per reading: `row`, the pose of the end effector (position in m,
+quaternion in the order in which it was stored), and x, y, z (counts) of 8 whiskers on the left and 6 on the
+right. It has no time: the authors' tracker assumes 200 readings per second.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ def read_reach(path: Path) -> ReachRecord:
         raise InputError(str(path), f"{len(header)} columns", f"these {len(COLUMNS)}: {', '.join(COLUMNS)}")
     if not content.endswith(b"\n"):
         raise InputError(str(path), "the last line is cut", cure="copy the file again")
+    if content.count(b"\n") == 1:
+        raise InputError(str(path), "no rows", "a recording", "was it copied completely?")
     try:
         table = np.loadtxt(BytesIO(content), delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
         raise InputError(str(path), str(error), f"{len(COLUMNS)} numbers in each line") from None
-    if not table.size:
-        raise InputError(str(path), "no rows", "a recording", "was it copied completely?")
     errors = [
         error
         for name, column in zip(COLUMNS, table.T, strict=True)
@@ -94,8 +94,10 @@ def read_reach(path: Path) -> ReachRecord:
 
 
 def open_reach(config: ReachConfig) -> InMemorySource:
-    """A reach as a source: odometry of the end effector over the plane, in axes that keep their directions, and
-    a view [1, 14, 1] that is 1 where a whisker touches. Whiskers that are bent at the end are not alive.
+    """A reach as a source.
+
+    Its odometry is the end effector's over the plane, in axes that keep their directions; its view [1, 14, 1]
+    is 1 where a whisker touches. Whiskers that are bent at the end are not alive.
 
     Raises:
         InputError: see `read_reach`; a whisker cannot be calibrated.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
@@ -35,17 +35,20 @@ def push(length: int, first: int, last: int, size: float) -> np.ndarray:
     return size * np.clip(np.minimum(row - first, last - row) / rise, 0, 1)[:, None]
 
 
+@settings(max_examples=15)
 @given(SEEDS, st.sampled_from([0.0, 0.45, 0.7]))
 def test_it_is_the_marginal_sd_of_coloured_noise(seed: int, coefficient: float) -> None:
     noise = estimate_noise(coloured(seed, 4000, coefficient))
     np.testing.assert_allclose(noise, 1.0, atol=0.12)
 
 
+@settings(max_examples=15)
 @given(SEEDS)
 def test_a_hundred_samples_give_it_within_a_third(seed: int) -> None:
     np.testing.assert_allclose(estimate_noise(coloured(seed, 400, channels=3)), 1.0, atol=0.34)
 
 
+@settings(max_examples=15)
 @given(SEEDS, st.floats(1e-6, 1e6), st.floats(-1e3, 1e3))
 def test_it_scales_with_the_record_and_ignores_its_level(seed: int, scale: float, level: float) -> None:
     record = coloured(seed, 300)
@@ -53,6 +56,7 @@ def test_it_scales_with_the_record_and_ignores_its_level(seed: int, scale: float
     np.testing.assert_allclose(moved, scale * estimate_noise(record), rtol=1e-6)
 
 
+@settings(max_examples=15)
 @given(SEEDS, st.floats(0.02, 0.6), st.floats(0, 0.4), st.floats(1, 1e5))
 def test_one_contact_cannot_fool_it(seed: int, share: float, start: float, size: float) -> None:
     length = 2000
@@ -69,6 +73,7 @@ def test_the_sd_of_the_record_and_of_its_differences_are_fooled() -> None:
     assert ((record + push(2000, 800, 1400, 1000.0)).std(axis=0) > 100).all()
 
 
+@settings(max_examples=15)
 @given(SEEDS)
 def test_a_slow_drift_adds_little(seed: int) -> None:
     record = coloured(seed, 2000)
@@ -91,6 +96,7 @@ def test_windows_with_a_contact_are_not_quiet() -> None:
     assert quiet[begin + WINDOW + LAG < 600].mean() > 0.97
 
 
+@settings(max_examples=15)
 @given(SEEDS, st.floats(0.02, 0.5))
 def test_drift_of_a_random_walk_beneath_noise(seed: int, rate: float) -> None:
     steps = rate * stream(seed, "walk").standard_normal((40_000, 6))
@@ -98,6 +104,7 @@ def test_drift_of_a_random_walk_beneath_noise(seed: int, rate: float) -> None:
     assert 0.75 * rate < np.median(drift) < 1.3 * rate
 
 
+@settings(max_examples=15)
 @given(SEEDS)
 def test_without_drift_it_is_small_and_a_contact_does_not_raise_it(seed: int) -> None:
     record = coloured(seed, 20_000) + push(20_000, 4000, 4400, 1e4)
