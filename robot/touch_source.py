@@ -116,8 +116,7 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
     if info.planar_whiskers is not None:
         templates = strain_templates_of(source, config.reports)
         return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
-    frontend = Frontend(config, info.calibration)
-    return TouchSource(source, lambda: frontend, "touch.head")
+    return TouchSource(source, lambda: Frontend(config, info.calibration), "touch.head")
 
 
 def _with_registered_frontend(source: Source, config: PluginConfig) -> TouchSource:

@@ -10,6 +10,13 @@ from tactile.base.plugins import PluginConfig
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.features.calibration import Calibration
 from tactile.features.contact import ContactConfig, detect_contacts
+from tactile.features.rest_baseline import (
+    RestBaseline,
+    RestBaselineConfig,
+    bent_whiskers,
+    follow_baseline,
+    start_baseline,
+)
 from tactile.features.whisker_image import ImageConfig, view_shape, whisk_observation
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
@@ -22,6 +29,8 @@ class TouchConfig(Settings):
     """The whisker head; a recording's own head replaces settings that are not given here."""
     contact: ContactConfig = ContactConfig()
     """Contact detection."""
+    baseline: RestBaselineConfig | None = RestBaselineConfig()
+    """Tracking of the whiskers' baselines; none keeps those of the calibration."""
     image: ImageConfig = ImageConfig()
     """Whisker image."""
     reports: ReportFrontendConfig = ReportFrontendConfig()
@@ -31,13 +40,15 @@ class TouchConfig(Settings):
 
 
 class Frontend:
-    """Turns readings of a whisker head into observations, without memory between readings.
+    """Turns readings of a whisker head into observations, in the order of the readings and each once.
+
+    Between readings it remembers the whiskers' baselines.
 
     Args:
         calibration: of the head; needed for raw readings.
 
     Attributes:
-        view_shape: shape of the views. whiskers: W.
+        view_shape: shape of the views. whiskers: W. baseline: of the whiskers, as last followed.
     """
 
     def __init__(self, config: TouchConfig, calibration: Calibration | None = None) -> None:
@@ -45,9 +56,10 @@ class Frontend:
         self.head = ur10_head(config.head)
         self.view_shape = view_shape(config.image, self.head)
         self.whiskers = len(self.head.length)
+        self.baseline = start_baseline(self.whiskers)
 
     def features(self, reading: Cycle | Whisk) -> Whisk:
-        """The contact features of a reading; whiskers configured as dead are not alive.
+        """The contact features of a reading; whiskers configured as dead or found bent are not alive.
 
         Raises:
             InputError: raw samples without a calibration, or with gaps.
@@ -56,9 +68,21 @@ class Frontend:
             if self.calibration is None:
                 found = "raw whisker samples without a calibration"
                 raise InputError("calibration", found, "a free-whisking record")
-            reading = detect_contacts(self.config.contact, self.calibration, reading)
+            reading = self._detect(self.calibration, reading)
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
+
+    def _detect(self, calibration: Calibration, cycle: Cycle) -> Whisk:
+        """The contacts of raw samples, relative to the baseline as the settings want it."""
+        config = self.config.baseline
+        if config is None:
+            return detect_contacts(self.config.contact, calibration, cycle)
+        self.baseline = follow_baseline(config, calibration, self.baseline, cycle)
+        here = calibration._replace(
+            mean=calibration.mean + self.baseline.offset,
+            alive=calibration.alive & ~bent_whiskers(config, self.baseline),
+        )
+        return detect_contacts(self.config.contact, here, cycle)
 
     def observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
         """The observation of a reading; an `Observation` is returned unchanged.
@@ -73,8 +97,9 @@ class Frontend:
         return whisk_observation(self.config.image, self.head, self.features(reading))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Nothing: the front end has no memory between readings."""
-        return {}
+        """The baselines of the whiskers, for a checkpoint."""
+        return self.baseline._asdict()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Changes nothing."""
+        """Replaces the baselines by those of `arrays`."""
+        self.baseline = RestBaseline(**{name: arrays[name] for name in RestBaseline._fields})

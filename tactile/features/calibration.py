@@ -12,15 +12,21 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
+from tactile.features.free_record import (
+    DirtyRecordConfig,
+    DirtyWhisker,
+    dirty_error,
+    find_dirty_whiskers,
+)
+from tactile.features.signal_noise import estimate_noise
 
 MIN_WINDOW_SAMPLES = 8
 """Least number of samples in a slope window; the slope of fewer is mostly noise."""
 
 
-class CalibrationConfig(Settings):
+class CalibrationConfig(DirtyRecordConfig):
     """Contact threshold of a calibration, and checks of its free-whisking record."""
 
     threshold_sds: PositiveFloat = 20.0
@@ -66,8 +72,9 @@ def calibrate(
         slope_window: window of the contact detection, s. where: name of the record in errors.
 
     Raises:
-        InputError: the record is too short, is sampled too slowly, has channels with NaN or at their limits,
-            or contacts, or no whisker is alive.
+        InputError: the record is too short, is sampled too slowly, or has channels with NaN or at their
+            limits; a whisker has contacts that are to be refused, or in half of the cycles; or no whisker is
+            alive.
     """
     rate = _rate(config, record, slope_window, where)
     angle = np.concatenate([cycle.angle for cycle in record])
@@ -85,15 +92,13 @@ def calibrate(
         found = f"deflections of {_list_whiskers(bad)} are constant or at their limits"
         raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
 
-    middle = np.median(deflection, axis=0)
-    robust = 1.4826 * np.median(np.abs(deflection - middle), axis=0)
-    outside = np.abs(deflection - middle) > config.outlier_sds * robust
-    touched = (outside.mean(axis=0) > config.max_outlier_share).any(axis=1)
-    sd = deflection.std(axis=0)
-    touched |= (sd > config.max_sd_ratio * np.median(sd[alive], axis=0)).any(axis=1)
-    if (touched & alive).any():
-        cure = "record again with nothing within reach"
-        raise InputError(where, f"contacts of {_list_whiskers(touched & alive)}", "free whisking", cure)
+    mean, sd = deflection.mean(axis=0), deflection.std(axis=0)
+    dirty = _find_touched(config, deflection, alive)
+    if dirty and config.on_dirty == "refuse":
+        cure = "record again with nothing within reach, or set on_dirty: repair"
+        raise dirty_error(where, dirty, cure)
+    for whisker, reason in dirty:
+        mean[whisker], sd[whisker] = _repair(config, record, whisker, reason, where)
     return Calibration(
         mean=np.where(alive[:, None], deflection.mean(axis=0), 0.0),
         sd=np.where(alive[:, None], sd, 0.0),
@@ -102,6 +107,46 @@ def calibrate(
         alive=alive,
         rate=rate,
     )
+
+
+def _find_touched(config: CalibrationConfig, deflection: np.ndarray, alive: np.ndarray) -> list[DirtyWhisker]:
+    """Whiskers with contacts in deflections [T, W, 2]: outliers, more than noise, or more than the others."""
+    outside = _outliers(config, deflection, deflection).mean(axis=0).max(axis=1)
+    sd, noise = deflection.std(axis=0), np.where(alive[:, None], estimate_noise(deflection), 0.0)
+    louder = (sd / np.maximum(np.median(sd[alive], axis=0), 1e-300)).max(axis=1)
+    found = {whisker: reason for whisker, reason in find_dirty_whiskers(sd, noise, config.max_ratio)}
+    for whisker in np.flatnonzero(alive & (louder > config.max_sd_ratio)).tolist():
+        found[whisker] = f"its standard deviation is {louder[whisker]:.2g} times the median whisker's"
+    for whisker in np.flatnonzero(alive & (outside > config.max_outlier_share)).tolist():
+        beyond = f"{config.outlier_sds:g} robust standard deviations"
+        found[whisker] = f"{outside[whisker]:.2%} of its samples are further than {beyond} from the median"
+    return [DirtyWhisker(whisker, found[whisker]) for whisker in sorted(found)]
+
+
+def _outliers(config: CalibrationConfig, part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Bool of the shape of `part`, whether its samples are outliers of the record `whole` [T, ...]."""
+    middle = np.median(whole, axis=0)
+    robust = 1.4826 * np.median(np.abs(whole - middle), axis=0)
+    return np.abs(part - middle) > config.outlier_sds * robust
+
+
+def _repair(
+    config: CalibrationConfig, record: Sequence[Cycle], whisker: int, reason: str, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation [2] of a whisker over the cycles in which it touched nothing."""
+    parts = [cycle.deflection[:, whisker] for cycle in record]
+    quiet = np.quantile([part.std(axis=0) for part in parts], 0.25, axis=0)
+    whole = np.concatenate(parts)
+    clean = [
+        part
+        for part in parts
+        if (part.std(axis=0) <= 2 * quiet).all()
+        and (_outliers(config, part, whole).mean(axis=0) <= config.max_outlier_share).all()
+    ]
+    if 2 * len(clean) <= len(parts):
+        found = [DirtyWhisker(whisker, f"{reason}, and most of its cycles are alike")]
+        raise dirty_error(where, found, "record again with nothing within reach")
+    return np.concatenate(clean).mean(axis=0), np.concatenate(clean).std(axis=0)
 
 
 def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:

@@ -150,15 +150,17 @@ def _sentences(result: ContactResult) -> list[str]:
     seconds = len(result.contact) / result.config.rate
     return [
         f"One record of {seconds:.0f} s at an assumed {result.config.rate:.0f} Hz. Settings were chosen on "
-        "the first half of its rows, but for the pace of the baselines: the first choice (0.25 s, and no slow "
-        "baseline) gave five false contacts with baselines times 3, all in the second half, where creep after "
-        "contacts is tripled too; it was then chosen on all rows, which moved the contacts of the record itself "
-        "by 11 rows in all. Contacts of the record with baselines times 3 are compared with its own. Spliced "
-        "hours: settings were tried on one hour of another seed with contacts of the first half.",
+        "the first half of its rows, but for the pace of the baselines: the first choice (0.25 s, and no "
+        "slow baseline) gave five false contacts with baselines times 3, all in the second half, where creep "
+        "after contacts is tripled too; it was then chosen on all rows, which moved the contacts of the "
+        "record itself by 11 rows in all. Contacts of the record with baselines times 3 are compared with "
+        "its own. Spliced hours: settings were tried on one hour of another seed with contacts of the first "
+        "half.",
         "",
         "The 20-sd rule cannot cross in whiskers that never touch: they are chosen by their departure. In "
-        "streams other than the record it has the noise for its standard deviation. A contact is noticed three "
-        "rows (15 ms) after its first row, from which it counts here. A whisker is said to be bent after "
+        "streams other than the record it has the noise for its standard deviation, and misses no contact "
+        "because it is in contact nearly always. A contact is noticed three rows (15 ms) after its first "
+        "row, from which it counts in the record. A whisker is said to be bent after "
         f"{result.config.contact.bent_time:.0f} s away, longer than this record, whose arm stops at its end.",
     ]
 
