@@ -100,7 +100,7 @@ def calibrate(
     for whisker, reason in dirty:
         mean[whisker], sd[whisker] = _repair(config, record, whisker, reason, where)
     return Calibration(
-        mean=np.where(alive[:, None], deflection.mean(axis=0), 0.0),
+        mean=np.where(alive[:, None], mean, 0.0),
         sd=np.where(alive[:, None], sd, 0.0),
         threshold=np.where(alive[:, None], config.threshold_sds * sd, np.inf),
         free=np.where(alive, np.mean([cycle.angle.max(axis=0) for cycle in record], axis=0), 0.0),

@@ -59,6 +59,31 @@ def test_a_record_with_a_contact_is_refused(size: float, axis: int) -> None:
     refused(cycles, "contacts of whisker 3")
 
 
+@pytest.mark.parametrize("size", [0.05, -0.2])
+def test_the_repair_leaves_the_cycle_with_the_contact_out(size: float) -> None:
+    cycles = record()
+    cycles[2].deflection[400:420, 3, 1] += size
+    found = calibrate(CONFIG.model_copy(update={"on_dirty": "repair"}), cycles)
+    clean = np.concatenate([cycle.deflection[:, 3] for k, cycle in enumerate(cycles) if k != 2])
+    np.testing.assert_allclose(found.sd[3], clean.std(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(found.mean[3], clean.mean(axis=0), rtol=1e-9)
+
+
+def test_contacts_in_most_cycles_are_not_repaired() -> None:
+    cycles = record()
+    for cycle in cycles[:3]:
+        cycle.deflection[400:440, 3, 1] += 0.1
+    with pytest.raises(InputError, match=r"whisker 3.*most of its cycles"):
+        calibrate(CONFIG.model_copy(update={"on_dirty": "repair"}), cycles)
+
+
+def test_each_whisker_with_a_contact_is_named_with_its_reason() -> None:
+    cycles = record()
+    cycles[2].deflection[400:420, 3] += 0.05
+    cycles[1].deflection[:, 5] += 0.05 * np.sin(2 * np.pi * np.arange(1000) / 1000)[:, None]
+    refused(cycles, "whisker 3: .*% of its samples are further than 6 robust .* whisker 5: .*%")
+
+
 def test_a_whisker_in_constant_contact_is_refused() -> None:
     cycles = record()
     for cycle in cycles:
