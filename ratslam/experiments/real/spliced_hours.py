@@ -101,7 +101,7 @@ def simulate_stream(
         memory = noise[-1]
         planted = []
         for whisker in range(whiskers):
-            snippet = snippets[random.integers(len(snippets))]
+            snippet = snippets[int(random.integers(len(snippets)))]
             length = len(snippet.deviation)
             first = int(random.integers(block - length))
             noise[first : first + length, whisker] = snippet.deviation
