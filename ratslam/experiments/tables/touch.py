@@ -28,6 +28,7 @@ from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
 from ratslam.pipeline.source import open_observations
+from robot.simulation.head.baseline import HALL_BASELINE
 from robot.sources.in_memory import load_into_memory
 from robot.sources.odometry import OdometryConfig
 
@@ -49,6 +50,7 @@ KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
 EXPLORATION = {"path": {"explore": 1500}}
 NOISE = OdometryConfig()
 OPEN_LOOP = {"whisking": {"mode": "open"}}
+HALL = {"mechanics": {"baseline": HALL_BASELINE.model_dump()}}
 
 
 class TouchRow(NamedTuple):
@@ -118,6 +120,8 @@ ROWS = {
     "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
     "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
+    "raw": TouchRow("main from raw samples", MAIN | {"raw": True}),
+    "drift": TouchRow("main from raw samples with drift, colour and creep", MAIN | HALL),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),

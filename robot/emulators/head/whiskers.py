@@ -11,10 +11,11 @@ from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.emulators.head.sensor_array import Block, block_samples
 from robot.emulators.head.servo_drives import ServoDrives
+from robot.simulation.head.baseline import Baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import advance_balance, whiskers_at_rest
-from robot.simulation.head.whisk_stream import WallSweep, sensor_readings, sweep_walls
+from robot.simulation.head.whisk_stream import WallSweep, draw_noise, sensor_readings, sweep_walls
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, ur10_head
@@ -39,8 +40,10 @@ class Whiskers:
         place: PoseSource,
         random: np.random.Generator,
         samples: int,
+        baseline: Baseline | None = None,
     ) -> None:
         self.config, self.mechanics, self.head = config, mechanics, head
+        self.baseline = baseline
         self.walls, self.place, self.random, self.samples = walls, place, random, samples
         self.drives = ServoDrives(head, config.rate)
         self.balance = whiskers_at_rest(1, len(head.length))
@@ -94,7 +97,7 @@ class Whiskers:
         before = self.pose
         self.pose, self.lift = self.place.at(end)
         pose = np.stack([before, self.pose])[None]
-        noise = self.mechanics.noise * self.random.standard_normal((1, size, len(self.head.length), 3))
+        noise = draw_noise(self.mechanics, (1, size, self.count), self.random, self.baseline)
         begins, parts, done = np.zeros(size, bool), [], 0
         while done < size:
             share = done / size
@@ -109,7 +112,7 @@ class Whiskers:
             truth, self.balance = advance_balance(
                 self.config, self.mechanics, self.drives.law, sweep, self.balance
             )
-            parts.append(sensor_readings(self.config, self.head, truth, sweep.noise))
+            parts.append(sensor_readings(self.config, self.head, truth, sweep.noise, self.baseline))
             self.drives.sample = 0 if left is None else first + count
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
@@ -132,13 +135,14 @@ class Whiskers:
 
 def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> Whiskers:
     """The whiskers of an emulated head among the walls of its maze."""
-    samples = block_samples(config.stream.rate)
+    rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
     return Whiskers(
         config.stream,
-        config.mechanics,
-        ur10_head(config.head),
+        mechanics,
+        head,
         walls,
         place,
         stream(config.seed, "sensor"),
-        samples,
+        block_samples(rate),
+        make_baseline(mechanics.baseline, mechanics.noise, rate, len(head.length), config.seed),
     )

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
+from robot.simulation.head.baseline import BaselineConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import Surroundings
@@ -49,6 +50,8 @@ class MechanicsConfig(Settings):
     """Standard deviation of the contact position along the shaft, as a fraction of its length."""
     poses: PositiveInt = 8
     """Number of head poses per protraction at which contacts are computed."""
+    baseline: BaselineConfig = BaselineConfig()
+    """Coloured noise, drift and creep of the deflections; only the raw fidelities have them."""
 
 
 class HeadSetup(NamedTuple):

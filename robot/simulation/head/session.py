@@ -1,18 +1,20 @@
 """A simulated session of the whisker head as a source, bit-identical for the same settings.
 
 Every part draws from its own random stream (maze.loop, maze.walls, maze.heights, path, motion, sensor,
-odometry), so that changing one part leaves the others unchanged.
+colour, drift, odometry), so that changing one part leaves the others unchanged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path as File
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeInt
 
+from robot.simulation.head.baseline import has_baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.dynamic import simulate_dynamic
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
@@ -87,13 +89,17 @@ def choose_tier(config: SimulationConfig) -> ChosenTier:
     """The fidelity in the configuration, or for `auto` the cheapest one that gives the requested data.
 
     Raises:
-        InputError: raw samples are requested, but the configured fidelity has none.
+        InputError: raw samples, or a baseline that acts on them, are requested, but the configured fidelity
+            has none.
     """
-    if config.fidelity == "kinematic" and config.raw:
-        found = "kinematic, which has no raw samples"
+    on = has_baseline(config.mechanics.baseline)
+    if config.fidelity == "kinematic" and (config.raw or on):
+        found = "kinematic, which has no raw samples" + (" for mechanics.baseline to act on" if on else "")
         raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
     if config.fidelity != "auto":
         return ChosenTier(config.fidelity, "set by simulation.fidelity")
+    if on:
+        return ChosenTier("quasistatic", "mechanics.baseline acts on raw samples")
     if config.raw:
         return ChosenTier("quasistatic", "raw samples are wanted, without bending modes and overshoot")
     return ChosenTier("kinematic", "only contact features are wanted")
@@ -135,6 +141,10 @@ class HeadSimulation(SimulatedSource):
         random = stream(seed, "odometry")
         self.odometry = simulate_odometry(config.odometry, self.time, pose, random, self.kidnapped)
         self._parts = self._surroundings()
+        mechanics = config.mechanics
+        self._baseline = make_baseline(
+            mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
+        )
         self.calibration = None if self.tier.name == "kinematic" else self._calibrate()
         self.features = self._kinematic() if self.calibration is None else None
 
@@ -192,7 +202,8 @@ class HeadSimulation(SimulatedSource):
         config = self.config
         count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
         random = stream(config.seed, "calibration")
-        record = simulate_free_cycles(RAW_TIERS[self.tier.name], self._setup, count, random)
+        model = RAW_TIERS[self.tier.name]
+        record = simulate_free_cycles(model, self._setup, count, random, self._baseline)
         return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
@@ -203,8 +214,10 @@ class HeadSimulation(SimulatedSource):
     def _cycles(self) -> Iterator[Cycle]:
         """Raw samples of each cycle, without odometry."""
         assert self.calibration is not None
-        random = stream(self.config.seed, "sensor")
+        random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
         model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]
         for surroundings, rows in self._parts:
             path, start = self.scene.path, self.start[rows]
-            yield from simulate_cycles(model, self._setup, surroundings, path, start, random, threshold)
+            yield from simulate_cycles(
+                model, self._setup, surroundings, path, start, random, threshold, baseline
+            )

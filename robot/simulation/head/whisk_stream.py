@@ -7,8 +7,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from robot.simulation.head.baseline import Baseline
 from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import HeadSetup
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
 from robot.sources.simulated import NO_ODOMETRY
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings
@@ -52,11 +53,13 @@ def simulate_cycles(
     start: np.ndarray,
     random: np.random.Generator,
     threshold: np.ndarray,
+    baseline: Baseline | None = None,
 ) -> Iterator[Cycle]:
     """Raw cycles that start at times [N] s along a path, without odometry and each with whiskers at rest.
 
     Args:
-        threshold: [W] contact threshold of y from a calibration, rad.
+        threshold: [W] contact threshold of y from a calibration, rad. baseline: coloured noise, drift and
+            creep of the deflections, which go on from its state; None: none.
     """
     config, whisking = setup.config, setup.whisking
     knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
@@ -64,14 +67,23 @@ def simulate_cycles(
     for k in range(0, len(start), config.batch):
         some = start[k : k + config.batch]
         pose = poses_at(path, some[:, None] + knots)
-        sweep = sweep_walls(surroundings, pose, knots, time, _noise(setup, len(some), random))
-        yield from _run(tier, setup, sweep, threshold, some)
+        noise = draw_noise(setup.mechanics, _shape(setup, len(some)), random, baseline)
+        sweep = sweep_walls(surroundings, pose, knots, time, noise)
+        yield from _run(tier, setup, sweep, threshold, some, baseline)
 
 
 def simulate_free_cycles(
-    tier: MechanicsModel, setup: HeadSetup, count: int, random: np.random.Generator
+    tier: MechanicsModel,
+    setup: HeadSetup,
+    count: int,
+    random: np.random.Generator,
+    baseline: Baseline | None = None,
 ) -> list[Cycle]:
-    """A calibration record: `count` cycles in free air with open-loop whisking."""
+    """A calibration record: `count` cycles in free air with open-loop whisking.
+
+    Args:
+        baseline: as in `simulate_cycles`.
+    """
     setup = setup._replace(whisking=setup.whisking.model_copy(update={"mode": "open"}))
     start, time = np.arange(count) / setup.whisking.rate, _times(setup)
     threshold = np.full(len(setup.head.length), np.inf)
@@ -79,17 +91,22 @@ def simulate_free_cycles(
     for k in range(0, count, setup.config.batch):
         some = start[k : k + setup.config.batch]
         nothing = np.zeros((len(time), len(some), len(setup.head.length)))
-        noise = _noise(setup, len(some), random)
+        noise = draw_noise(setup.mechanics, _shape(setup, len(some)), random, baseline)
         sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
-        record += _run(tier, setup, sweep, threshold, some)
+        record += _run(tier, setup, sweep, threshold, some, baseline)
     return record
 
 
 def _run(
-    tier: MechanicsModel, setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray, start: np.ndarray
+    tier: MechanicsModel,
+    setup: HeadSetup,
+    sweep: WallSweep,
+    threshold: np.ndarray,
+    start: np.ndarray,
+    baseline: Baseline | None,
 ) -> Iterator[Cycle]:
     truth = tier(setup, sweep, threshold)
-    angle, deflection = sensor_readings(setup.config, setup.head, truth, sweep.noise)
+    angle, deflection = sensor_readings(setup.config, setup.head, truth, sweep.noise, baseline)
     for k in range(len(start)):
         yield Cycle(start[k] + sweep.time, angle[k], deflection[k], NO_ODOMETRY)
 
@@ -99,18 +116,45 @@ def _times(setup: HeadSetup) -> np.ndarray:
     return np.arange(round(setup.config.rate / setup.whisking.rate)) / setup.config.rate
 
 
-def _noise(setup: HeadSetup, cycles: int, random: np.random.Generator) -> np.ndarray:
-    """Sensor noise [N, T, W, 3], rad."""
-    shape = (cycles, len(_times(setup)), len(setup.head.length), 3)
-    return setup.mechanics.noise * random.standard_normal(shape)
+def _shape(setup: HeadSetup, cycles: int) -> tuple[int, int, int]:
+    """Numbers of cycles, of samples of a cycle and of whiskers."""
+    return cycles, len(_times(setup)), len(setup.head.length)
+
+
+def draw_noise(
+    mechanics: MechanicsConfig,
+    shape: tuple[int, int, int],
+    random: np.random.Generator,
+    baseline: Baseline | None,
+) -> np.ndarray:
+    """Sensor noise of angle, x and y of the next samples, [N, T, W, 3] rad.
+
+    Args:
+        shape: successive parts N of T samples of W whiskers. baseline: colours the noise of x and y.
+    """
+    noise = mechanics.noise * random.standard_normal((*shape, 3))
+    if baseline is not None:
+        noise[..., 1:] = baseline.colour(noise[..., 1:])
+    return noise
 
 
 def sensor_readings(
-    config: StreamConfig, head: Head, truth: tuple[np.ndarray, np.ndarray, np.ndarray], noise: np.ndarray
+    config: StreamConfig,
+    head: Head,
+    truth: tuple[np.ndarray, np.ndarray, np.ndarray],
+    noise: np.ndarray,
+    baseline: Baseline | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad."""
+    """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad.
+
+    Args:
+        noise: [N, T, W, 3] rad. baseline: its drift and creep are added to the deflections.
+    """
+    seen = np.stack([part.swapaxes(0, 1) for part in truth], axis=-1)
+    if baseline is not None:
+        seen[..., 1:] += baseline.wander(seen[..., 1:])
     # A dead whisker sends zeros.
-    seen = (np.stack([part.swapaxes(0, 1) for part in truth], axis=-1) + noise) * head.alive[:, None]
+    seen = (seen + noise) * head.alive[:, None]
     return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
 
 

@@ -21,6 +21,7 @@ from robot.drivers.ur10.pose_listener import ToolPose
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
 from robot.emulators.head.sensor_array import BLOCK
+from robot.simulation.head.baseline import HALL_BASELINE, BaselineConfig, make_baseline
 from robot.simulation.head.kinematic import HeadSetup
 from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.whisk_stream import simulate_cycles
@@ -51,10 +52,17 @@ class Arm:
 
 
 @pytest.mark.parametrize("mode", [FeedbackMode.OPEN, FeedbackMode.RCP])
-@pytest.mark.parametrize("frequency", [1.0, 2.0])
-def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequency: float) -> None:
+@pytest.mark.parametrize(("frequency", "baseline"), [(1.0, HALL_BASELINE), (2.0, BaselineConfig())])
+def test_samples_along_a_path_agree_with_the_simulator(
+    mode: FeedbackMode, frequency: float, baseline: BaselineConfig
+) -> None:
     config = HeadEmulatorConfig(
-        follow=True, path={"explore": 9}, seed=3, stream={"rate": ODD}, head={"dead": (4,)}
+        follow=True,
+        path={"explore": 9},
+        seed=3,
+        stream={"rate": ODD},
+        head={"dead": (4,)},
+        mechanics={"baseline": baseline},
     )
     scene = world(config)
     head = HostedHead(config, scene.surroundings.walls, AlongPath(scene.path))
@@ -79,6 +87,7 @@ def test_samples_along_a_path_agree_with_the_simulator(mode: FeedbackMode, frequ
         start,
         stream(config.seed, "sensor"),
         command.numbers * ANGLE,
+        make_baseline(baseline, config.mechanics.noise, ODD, 18, config.seed),
     )
     expected = np.concatenate([frame_values(cycle.angle, cycle.deflection) for cycle in raw])
     off = np.abs(expected.astype(int) - frames.values)
