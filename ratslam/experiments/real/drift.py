@@ -55,7 +55,7 @@ BLOCK = 100
 AXIS = 1
 """The axis into which these whiskers are bent."""
 SIMULATED, COPIES = 200, 20
-"""Simulated free whiskers, and simulated ones for each real one that bends."""
+"""Simulated free whiskers, and simulated copies of each real whisker that bends."""
 
 
 class FreeFigures(NamedTuple):
@@ -113,7 +113,7 @@ def measure_drift(folder: Path) -> DriftResult:
     for name, config in (("simulated", HALL_BASELINE), ("control: white noise", BaselineConfig())):
         noise = simulate_free(config, len(signal))
         free[name] = free_figures(noise.reshape(len(signal), -1), RATE)
-        bent = np.repeat(signal[:, CHECK.bent], COPIES, axis=1)
+        bent = np.repeat(signal[:, FIT.bent + CHECK.bent], COPIES, axis=1)
         creep[name] = creep_figures(simulate_bent(config, bent), creep["fitted"].time)
     held = np.loadtxt(camera, delimiter=",", skiprows=1)
     held = held[(held[:, 0] > 19) & (held[:, 0] < 23.5)]  # pressed without moving
@@ -260,7 +260,7 @@ def draw_drift(result: DriftResult, png: Path) -> None:
     colours.set(xlabel="lag (ms)", ylabel="autocorrelation", title="Noise of free whiskers")
     drift.set(xlabel="time span (s)", ylabel="rms change (noise sd)", title="Drift of free whiskers")
     creep.axvspan(0, SETTLING, color="0.9", lw=0)
-    creep.set(xlim=(0, 3.4), ylim=(-1, 4), xlabel="time after the last contact (s)")
+    creep.set(xlim=(0, 3.4), ylim=(-0.5, 2.5), xlabel="time after the last contact (s)")
     creep.set(ylabel="offset (% of the deflection)", title="Creep after a contact (grey: swinging)")
     colours.legend()
     for axes in (colours, drift, creep):

@@ -12,7 +12,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
-from scipy.signal import lfilter
 
 from tactile.base.config import Settings
 from tactile.base.random_streams import stream
@@ -83,8 +82,13 @@ def _recur(keep: float, value: np.ndarray, before: np.ndarray) -> tuple[np.ndarr
     """The recursion y = value + keep * last y over the samples of [N, T, W, 2].
 
     Args:
-        before: [1, W, 2] keep * y of the sample before. Returns: y, and `before` of the next samples.
+        before: [1, W, 2] keep * y of the sample before.
+
+    Returns:
+        y, and `before` of the next samples.
     """
+    from scipy.signal import lfilter  # slow to import
+
     flat = value.reshape(-1, *value.shape[2:])
     found, after = lfilter([1.0], [1.0, -keep], flat, axis=0, zi=before)
     return found.reshape(value.shape), after

@@ -46,7 +46,7 @@ def test_coloured_noise_keeps_its_sd_and_has_the_correlation_of_its_settings(
     assert (noise[0] * noise[lag]).mean() == pytest.approx(expected, abs=TOLERANCE)
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(st.floats(0.1, 10), st.sampled_from([20.0, 100.0]), st.integers(0, 2**32))
 def test_the_variance_of_the_drift_grows_evenly_by_that_of_a_second(
     drift: float, rate: float, seed: int
