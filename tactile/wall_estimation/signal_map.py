@@ -56,19 +56,6 @@ class SignalMap(NamedTuple):
     left_out: np.ndarray
 
 
-class Prediction(NamedTuple):
-    """Signals expected at M positions.
-
-    Attributes:
-        mean: [M, C]. covariance: [C, M, M] of the errors of the map at these positions, without the noise of
-            the sensor. Errors at neighbouring positions are alike: more samples there do not average them
-            out.
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
-
-
 def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -> SignalMap:
     """Learns the map; length scales and noise are the most likely ones.
 
@@ -111,26 +98,26 @@ def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -
     )  # fmt: skip
 
 
-def predict_signal(known: SignalMap, position: np.ndarray) -> Prediction:
-    """The signals expected at positions [M, 3], m."""
-    there, here = (_features(place - known.base, known.length) for place in (position, known.position))
-    between = _covariance(there, here)
-    solved = solve_triangular(known.factor, between.T, lower=True)
-    covariance = _covariance(there, there) - solved.T @ solved
-    mean = known.offset + known.scale * (between @ known.weight)
-    return Prediction(mean, known.scale[:, None, None] ** 2 * covariance)
+def predict_signal(known: SignalMap, position: np.ndarray) -> np.ndarray:
+    """The signals [M, C] expected at positions [M, 3], m."""
+    between = _covariance(*_both(known, position))
+    signal: np.ndarray = known.offset + known.scale * (between @ known.weight)
+    return signal
 
 
-def predict_mean(known: SignalMap, position: np.ndarray) -> np.ndarray:
-    """The mean of `predict_signal` alone, [M, C]: much faster."""
-    there, here = (_features(place - known.base, known.length) for place in (position, known.position))
-    mean: np.ndarray = known.offset + known.scale * (_covariance(there, here) @ known.weight)
-    return mean
+def signal_variance(known: SignalMap, position: np.ndarray) -> np.ndarray:
+    """Variances [M, C] of the map's errors at positions [M, 3]; large beyond the calibration."""
+    there, here = _both(known, position)
+    solved = solve_triangular(known.factor, _covariance(here, there), lower=True)
+    prior = 1.0 + TREND**2 * (1.0 + (there**2).sum(axis=1))
+    share = np.maximum(prior - (solved**2).sum(axis=0), 0.0)
+    variance: np.ndarray = share[:, None] * known.scale**2
+    return variance
 
 
 def signal_slope(known: SignalMap, position: np.ndarray) -> np.ndarray:
     """The derivatives [M, C, 3] of the expected signals by position, 1/m."""
-    there, here = (_features(place - known.base, known.length) for place in (position, known.position))
+    there, here = _both(known, position)
     distance = np.sqrt(5.0) * cdist(there, here)
     radial = -5.0 / 3.0 * (1.0 + distance) * np.exp(-distance)
     # The sum over rows n of radial[m, n] (there[m] - here[n]) weight[n], plus the trend's slope.
@@ -144,6 +131,12 @@ def signal_slope(known: SignalMap, position: np.ndarray) -> np.ndarray:
     turn = (np.eye(3) - ahead.swapaxes(1, 2) * ahead) / reach / known.length[0]
     result: np.ndarray = slope @ np.concatenate([turn, ahead / known.length[1]], axis=1)
     return result
+
+
+def _both(known: SignalMap, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Features of positions [M, 3] and of the calibration's."""
+    here = _features(known.position - known.base, known.length)
+    return _features(position - known.base, known.length), here
 
 
 def _features(away: np.ndarray, length: np.ndarray) -> np.ndarray:
