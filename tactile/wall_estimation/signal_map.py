@@ -74,28 +74,22 @@ def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -
     offset, scale = signal.mean(axis=0), signal.std(axis=0)
     size = np.linalg.norm(signal, axis=1) / np.linalg.norm(scale)
     share = np.maximum(size, SHARE_FLOOR * np.median(size))
-    value = (signal - offset) / scale
-    some = np.unique(np.linspace(0, len(value) - 1, MAX_FITTED_ROWS).astype(int))
-    length, noise = _most_likely(position[some] - base, value[some], share[some])
-    where = _features(position - base, length)
+    value, away = (signal - offset) / scale, position - base
     use = np.ones(len(value), bool)
     for _ in range(OUTLIER_ROUNDS):
+        length, noise = _most_likely(away[use], value[use], share[use])
+        where = _features(away, length)
         factor = _factor(where[use], noise * share[use])
-        weight = cho_solve((factor, True), value[use])
-        amplitude = np.sqrt((value[use] * weight).mean(axis=0))
-        inverse = cho_solve((factor, True), np.eye(use.sum()))
-        error = np.abs(weight / np.sqrt(np.diag(inverse))[:, None] / amplitude).max(axis=1)
-        error /= max(1.0, float(np.median(error)))
+        error = _left_out_error(factor, value[use])
         if not (error > MAX_MISFIT).any():
             break
         use[np.flatnonzero(use)[error > MAX_MISFIT]] = False
-        factor = _factor(where[use], noise * share[use])
-        weight = cho_solve((factor, True), value[use])
-        amplitude = np.sqrt((value[use] * weight).mean(axis=0))
-    return SignalMap(
-        position[use], base, length, noise, offset, scale * amplitude, factor,
-        weight / amplitude, np.flatnonzero(~use),
-    )  # fmt: skip
+    factor = _factor(where[use], noise * share[use])
+    weight = cho_solve((factor, True), value[use])
+    amplitude = np.sqrt((value[use] * weight).mean(axis=0))
+    scale = scale * amplitude
+    left_out = np.flatnonzero(~use)
+    return SignalMap(position[use], base, length, noise, offset, scale, factor, weight / amplitude, left_out)
 
 
 def predict_signal(known: SignalMap, position: np.ndarray) -> np.ndarray:
@@ -155,8 +149,20 @@ def _factor(where: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return factor
 
 
+def _left_out_error(factor: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Largest leave-one-out error [N] over the channels, in the usual one or in standard deviations, the
+    larger (Rasmussen and Williams 2006, eq. 5.12)."""
+    weight = cho_solve((factor, True), value)
+    variance = 1.0 / np.diag(cho_solve((factor, True), np.eye(len(value))))
+    amplitude = np.sqrt((value * weight).mean(axis=0))
+    error = np.abs(weight * np.sqrt(variance)[:, None] / amplitude).max(axis=1)
+    return np.asarray(error / max(1.0, float(np.median(error))))
+
+
 def _most_likely(away: np.ndarray, value: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, float]:
     """Length scales and noise of largest marginal likelihood; the amplitude of each channel is its best."""
+    some = np.unique(np.linspace(0, len(value) - 1, MAX_FITTED_ROWS).astype(int))
+    away, value, share = away[some], value[some], share[some]
     reach = float(np.linalg.norm(away, axis=1).std())
 
     def unpack(logs: np.ndarray) -> tuple[np.ndarray, float]:

@@ -29,12 +29,15 @@ SLIP_ROWS = 4
 """Samples at the end of a contact in which a fall is a slip."""
 MIN_ROWS = 8
 """Least number of samples in contact."""
-SPEED_LENGTH = 0.75
+SPEED_LENGTH = 3.0
 """Distance over which the contact's velocity along the object changes by the whisker's own velocity, as a
 share of the longest calibrated reach: a random walk."""
 TIP_SD = 0.05
 """Standard deviation of a slipping contact's reach about the longest calibrated one, as a share of it."""
-START_SHARES = ((0.4, 0.7), (0.7, 0.85), (0.85, 1.0))
+OTHER_DAY = 4.0
+"""Error of the map in a sweep, in repeatabilities within the calibration: the whisker is mounted again, and
+rubs differently."""
+START_SHARES = ((0.4, 0.6), (0.6, 0.75), (0.75, 0.87), (0.87, 1.0))
 """Signals are alike at two reaches: the search starts from the likeliest contact within each of these shares
 of the longest calibrated reach."""
 ROUNDS, STEPS = 3, 20
@@ -134,7 +137,7 @@ class _Search:
         step = float(np.linalg.norm(np.diff(place, axis=0), axis=1).mean())
         change_sd = step * np.sqrt(step / (SPEED_LENGTH * self.reach))
         self.smooth = np.kron(np.diff(np.eye(len(place)), n=2, axis=0), np.eye(3)) / change_sd
-        share = known.noise * np.linalg.norm(touch.signal, axis=1)[:, None]
+        share = OTHER_DAY * known.noise * np.linalg.norm(touch.signal, axis=1)[:, None]
         self.sample_variance = touch.noise**2 + share**2
 
     def starts(self) -> list[np.ndarray]:

@@ -25,6 +25,8 @@ COLUMNS = ["px", "py", "pz", "sx", "sy", "sz"]
 """Columns after the index."""
 MILLIMETRE = 1e-3
 """m."""
+UNEVEN = 3.0
+"""A step this many times as long or as short as the median is not part of a sweep."""
 SAME_PLACE = 1e-6
 """Stage positions closer than this are the same, m."""
 
@@ -83,6 +85,18 @@ def read_stage(path: Path) -> StageRecording:
         raise InputError(str(path), "no rows", expected)
     table = np.array(rows)
     return StageRecording(table[:, :3] * MILLIMETRE, table[:, 3:])
+
+
+def cut_sweep(recording: StageRecording) -> StageRecording:
+    """The longest stretch of even steps: without the way to the start, and the row of zeros there."""
+    step = np.linalg.norm(np.diff(recording.position, axis=0), axis=1)
+    usual = np.median(step)
+    even = (step <= UNEVEN * usual) & (step >= usual / UNEVEN)
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], even, [False]]))).reshape(-1, 2)
+    if not len(runs):
+        return recording
+    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return StageRecording(recording.position[first : last + 1], recording.signal[first : last + 1])
 
 
 def read_stage_calibration(path: Path) -> StageCalibration:
