@@ -37,14 +37,14 @@ TIP_SD = 0.05
 OTHER_DAY = 4.0
 """Error of the map in a sweep, in repeatabilities within the calibration: the whisker is mounted again, and
 rubs differently."""
-START_SHARES = ((0.4, 0.6), (0.6, 0.75), (0.75, 0.87), (0.87, 1.0))
+START_SHARES = ((0.4, 0.7), (0.7, 0.85), (0.85, 1.0))
 """Signals are alike at two reaches: the search starts from the likeliest contact within each of these shares
 of the longest calibrated reach."""
-ROUNDS, STEPS = 3, 20
+ROUNDS, STEPS = 3, 15
 """Times the variance of the map is computed anew; largest number of Gauss-Newton steps each time."""
 DAMPING = (1e-6, 1e-3, 1e8)
 """Least, first and largest damping, as a share of the diagonal."""
-CONVERGED = 1e-4
+CONVERGED = 1e-3
 """Relative change of the cost at which a round ends."""
 
 
