@@ -200,8 +200,8 @@ def table(result: TangentResult) -> list[str]:
     lines += [
         "",
         "True tangents are those of a circle of 15 mm about the centre fitted to the other days' sweeps, "
-        "where the ray through the estimated contact meets it. All rows in contact count. The truth is no better "
-        "than its centre (1 mm is 4°): fitted to each day's own sweeps it moves by "
+        "where the ray through the estimated contact meets it. All rows in contact count. The truth is no "
+        "better than its centre (1 mm is 4°): fitted to each day's own sweeps it moves by "
         f"{_own_centres(result):.1f} mm between days.",
         "",
         "| other objects | sweeps (without contact) | tangent beside direction of motion, median (90 %) "
@@ -219,7 +219,8 @@ def table(result: TangentResult) -> list[str]:
         *lines,
         "",
         "The files give no true outline or direction of these objects. The flat one was mounted along the "
-        "motion as well as the bench allows: there motion alone is right and the row is only a check. Contacts taken at the tip repeat well because "
+        "motion as well as the bench allows: there motion alone is right and the row is only a check. Contacts taken "
+        "at the tip repeat well because "
         "they follow from one signal, not because they are right: see the cylinder.",
     ]
 
