@@ -14,7 +14,7 @@ from tactile.base.errors import InputError
 GROUPS = ("run", "live", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
-RETIRED = {"tune": "reproduce threshold", **studies.REPLACED}
+RETIRED = {"tune": "reproduce threshold", "train-templates": "reproduce templates", **studies.REPLACED}
 """Commands of earlier versions, and the replacement of each."""
 
 

@@ -1,4 +1,4 @@
-"""The command `reproduce`, for figures of the whisker papers and tables of results; and `train-templates`."""
+"""The command `reproduce`, for figures of the whisker papers and tables of results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Lines = Callable[[argparse.Namespace], Iterator[str]]
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers `reproduce` with a command for each figure and table, and `train-templates`."""
+    """Registers `reproduce` with a command for each figure and table, and for strain templates."""
     reproduce = commands.add(
         "reproduce", None, "reproduce a figure or table, with controls", "reproduce fig2 --sets 1", "papers"
     )
@@ -77,9 +77,9 @@ def add_commands(commands: Commands) -> None:
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
-    train = commands.add(
-        "train-templates", _train, "record strain templates of a simulated Create",
-        "train-templates create_arena -o runs/templates.npz", "papers",
+    train = names.add(
+        "templates", _train, "Fox et al.: strain templates of a simulated Create",
+        "reproduce templates create_arena -o runs/templates.npz",
     )  # fmt: skip
     add_config(train)
     train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")

@@ -23,7 +23,7 @@ FILE_VERSION = 1
 """Version of the file format."""
 TEMPLATES = "templates"
 """Name of the templates in errors."""
-TRAIN_HINT = "make one with `python -m ratslam train-templates`"
+TRAIN_HINT = "make one with `python -m ratslam reproduce templates`"
 ANGLE_TOLERANCE = np.radians(0.5)
 """Largest difference between the angle of a drive and that of its template, rad."""
 SQUARE_MEDIAN = 0.4549

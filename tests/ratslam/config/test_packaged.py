@@ -77,7 +77,7 @@ def test_nothing_is_suggested_for_an_unlike_name() -> None:
     [
         "run {}", "simulate {} -o new.mcap", "live {}", "emulate ur10 {}", "emulate head {}", "size {}",
         "study {}", "study --preset ablate {}", "study --preset growth {}", "reproduce threshold {}",
-        "train-templates {} -o new.npz",
+        "reproduce templates {} -o new.npz",
     ],
 )  # fmt: skip
 def test_every_command_takes_a_name(

@@ -219,7 +219,7 @@ def test_observations_stack(templates: StrainTemplates) -> None:
 def test_other_whiskers_and_sample_rates_are_refused(templates: StrainTemplates, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="3 whiskers"):
         ReportFrontend(ReportFrontendConfig()).observe(report()._replace(contact=np.zeros(3, bool)))
-    with pytest.raises(InputError, match="train-templates"):
+    with pytest.raises(InputError, match="reproduce templates"):
         ReportFrontend(ReportFrontendConfig(walls="template"))
     with pytest.raises(InputError, match=r"nowhere\.npz: no such file"):
         ReportFrontend(ReportFrontendConfig(templates=tmp_path / "nowhere.npz"))

@@ -157,7 +157,9 @@ def _other_shape(path: Path) -> None:
 def test_other_files_are_refused(make: object, tmp_path: Path) -> None:
     path = tmp_path / "wrong.npz"
     make(path)  # type: ignore[operator]
-    with pytest.raises(InputError, match=r"wrong\.npz: (no such file|another kind of file).*train-templates"):
+    with pytest.raises(
+        InputError, match=r"wrong\.npz: (no such file|another kind of file).*reproduce templates"
+    ):
         read_templates(path)
 
 

@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration and the templates made from it by the program."""
     folder = tmp_path_factory.mktemp("templates")
     (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
-    arguments = ["train-templates", str(folder / "create.yaml"), "-o", str(folder / "new" / "t.npz")]
+    arguments = ["reproduce", "templates", str(folder / "create.yaml"), "-o", str(folder / "new" / "t.npz")]
     assert main(arguments) == 0
     return folder
 
@@ -117,7 +117,7 @@ def test_sessions_use_the_file(folder: Path, templates: StrainTemplates) -> None
 def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = folder / "new" / "t.npz"
     before = file.read_bytes()
-    assert main(["train-templates", str(folder / "create.yaml"), "-o", str(file)]) == 2
+    assert main(["reproduce", "templates", str(folder / "create.yaml"), "-o", str(file)]) == 2
     error = capsys.readouterr().err
     assert error.count("ratslam: error:") == 1
     assert "exists" in error
@@ -137,6 +137,6 @@ def test_invalid_sessions_are_refused(
 ) -> None:
     config = tmp_path / "c.yaml"
     config.write_text(text)
-    assert main(["train-templates", str(config), "-o", str(tmp_path / "t.npz")]) == 2
+    assert main(["reproduce", "templates", str(config), "-o", str(tmp_path / "t.npz")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "t.npz").exists()
