@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
+from ratslam.config.includes import merge_includes
 from ratslam.config.packaged import find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin
 from ratslam.config.presets import PresetName
@@ -84,6 +85,9 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
     """A run: `python -m ratslam run config.yaml`. `ratslam.backends.config` has the methods' sections."""
 
     renamed_keys = RENAMED
+    include: tuple[Path, ...] = ()
+    """Files of settings to use where this file leaves them open, such as `rig.yaml` of `fit` or
+    `calibration.yaml` of a run; a later one comes before an earlier one."""
     backend: Annotated[str, Field(json_schema_extra={"examples": ["recall", "classic", "grid"]})] = "recall"
     """The method: `recall` is RatSLAM with Bayesian recall and a keyframe map, `classic` RatSLAM as
     published, `grid` a grid particle filter; or a registered one (`ratslam.backends`)."""
@@ -134,7 +138,7 @@ def load_config(
         InputErrors: all errors in it, each with file, line and column.
     """
     path = find_config(path)
-    document = load(path, assignments)
+    document = merge_includes(load(path, assignments), path.parent)
     config = validate(document, RunConfig if source_required else LoopConfig)
     check_plugins(document, config)
     return config.with_absolute_paths(path.parent.resolve())

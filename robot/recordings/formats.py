@@ -13,6 +13,7 @@ from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
 from robot.sources.input_files import require_file
+from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_odometry
 from robot.sources.registry import SOURCES, SourceEntry, Warn
 from robot.sources.source import Source
 from tactile.base.config import Settings
@@ -36,6 +37,8 @@ class RecordingConfig(Settings):
     """How images become views."""
     visual_odometry: VisualOdometryConfig | None = None
     """Odometry from the images of a recording that has no other."""
+    odometry: OdometryCorrection = UNCORRECTED
+    """Systematic errors to take out of the odometry, of any format; the unit check comes first."""
     limits: UnitLimits = DEFAULT_LIMITS
     """Limits of the unit check, beyond which a recording is refused."""
 
@@ -134,6 +137,11 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     Raises:
         InputError: the file is missing, its format is unknown, or it has errors.
     """
+    return correct_odometry(_open(config, warn), config.odometry)
+
+
+def _open(config: RecordingConfig, warn: Warn) -> Source:
+    """The recording as it is."""
     suffix = config.file.suffix.lower()
     if config.topics is not None or (config.file / "metadata.yaml").is_file():
         return _open_bag(config, warn)
