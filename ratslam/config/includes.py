@@ -33,14 +33,14 @@ def merge_includes(document: Document, folder: Path) -> Document:
         if KEY in below.data:
             raise InputError(below.at_key((KEY,)), "files that an included file includes", "settings only")
         places: dict[KeyPath, Place] = {**below.places, **merged.places}
-        merged = Document(_merge(below.data, merged.data), places)
+        merged = Document(merge_settings(below.data, merged.data), places)
     return merged
 
 
-def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merge_settings(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """The settings of both; those of `above` where both have them."""
     merged = below | above
     for key in below.keys() & above.keys():
         if isinstance(below[key], dict) and isinstance(above[key], dict):
-            merged[key] = _merge(below[key], above[key])
+            merged[key] = merge_settings(below[key], above[key])
     return merged

@@ -214,10 +214,22 @@ def read_maze(path: Path) -> Maze:
         InputError: the file is unreadable, has an unexpected character, or lacks an outer wall.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(str(path), f"cannot be read ({error})", "a micromouse maze as text") from None
-    lines = [line.rstrip() for line in lines]
+    return parse_maze(text, path)
+
+
+def parse_maze(text: str, path: Path) -> Maze:
+    """The maze in a text.
+
+    Args:
+        path: of the text, for errors.
+
+    Raises:
+        InputError: the text has an unexpected character, or lacks an outer wall.
+    """
+    lines = [line.rstrip() for line in text.splitlines()]
     skipped = next((number for number, line in enumerate(lines) if line), 0)
     while lines and not lines[-1]:
         lines.pop()
