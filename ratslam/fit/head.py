@@ -19,9 +19,12 @@ from tactile.frontend import Frontend
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 DELAY = (
-    "head: the rest angle holds the delay of contact detection, which no contact tells apart from it (0.9 degrees for "
-    "15 mrad)"
+    "head: the rest angle holds the delay of contact detection, which no contact tells apart from it "
+    "(0.9 degrees for 15 mrad)"
 )
+
+STEEPEST_REST = 90.0
+"""Largest rest angle of a head, degrees."""
 
 
 def fit_head_of(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig:
@@ -60,7 +63,8 @@ def walls_of(info: SourceInfo) -> Walls:
 
 def head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
     """The geometry as a rig; rings whose radius is unknown keep theirs."""
-    quantities = [Quantity("rest angle", assumed.rest_deg, *fit.rest_deg, "degrees")]
+    rest, sd = min(fit.rest_deg[0], STEEPEST_REST), fit.rest_deg[1]
+    quantities = [Quantity("rest angle", assumed.rest_deg, rest, sd, "degrees", "touch.head.rest_deg")]
     unknown, radii = [], []
     for number, (ring, radius) in enumerate(zip(assumed.rings, fit.radius, strict=True)):
         radii.append(ring.radius if radius is None else radius[0])
@@ -68,11 +72,11 @@ def head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
             unknown.append(f"radius of ring {number}: too few of its contacts are against edges")
         else:
             quantities.append(Quantity(f"radius of ring {number}", ring.radius, *radius, "m"))
-    found = head_with(assumed, np.array([min(fit.rest_deg[0], 90.0), *radii]))
+    found = head_with(assumed, np.array([rest, *radii]))
     rings = [{key: float(f"{value:.6g}") for key, value in ring.model_dump().items()} for ring in found.rings]
     note = (
         f"head: {fit.contacts} contacts; their protractions err by {1e3 * fit.error[0]:.1f} mrad, "
-        f"{1e3 * fit.error[1]:.1f} with the head assumed"
+        f"{1e3 * fit.error[1]:.1f} with the head assumed; the radii are set in touch.head.rings"
     )
-    settings = {"touch": {"head": {"rest_deg": float(f"{found.rest_deg:.6g}"), "rings": rings}}}
+    settings = {"touch": {"head": {"rings": rings}}}
     return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))

@@ -1,6 +1,8 @@
-"""The rig from the record of a configuration: its wheels, its head and its whiskers, as far as they are in it."""
+"""The rig from the record of a configuration: wheels, head and whiskers, as far as they are in it."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from ratslam.pipeline.source import open_source
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
+from tactile.base.types import Observation
 
 
 def fit_record(config: RunConfig, seed: int = 0) -> Rig:
@@ -55,7 +58,7 @@ def fit_wheels_of(config: RunConfig, completed: RunConfig, samples: list[Sample]
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     if not np.isfinite(truth).any():
-        return _from_revisits(without_correction(config), assumed)
+        return _from_revisits(without_correction(config), samples, assumed)
     try:
         fit = fit_wheels(time, motion, truth, seed)
     except InputError as error:
@@ -87,10 +90,14 @@ def _from_truth(fit: WheelFit, assumed: OdometryCorrection, completed: RunConfig
     return Rig(tuple(quantities), notes=(note,), unknown=tuple(unknown))
 
 
-def _from_revisits(config: RunConfig, assumed: OdometryCorrection) -> Rig:
-    scale = "length scale: no true poses, and a map closes its loops at any scale"
+def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCorrection) -> Rig:
     if config.recording is None:
         return Rig(unknown=("wheels: the record has no true poses",))
+    scale = "length scale: no true poses, and a map closes its loops at any scale"
+    if not any(_shows_place(sample.reading) for sample in samples):
+        return Rig(
+            unknown=(scale, "turn scale, heading bias: no true poses, and no views that tell revisits")
+        )
     found = fit_revisits(config)
     if found is None:
         reason = "no true poses, and the map closes no loops or is doubted"
@@ -98,8 +105,16 @@ def _from_revisits(config: RunConfig, assumed: OdometryCorrection) -> Rig:
     quantities = [_bias(assumed.heading_bias, found.heading_bias)]
     if found.turn_scale is not None:
         quantities.insert(0, _scale("turn", assumed.turn_scale, found.turn_scale))
-    note = f"wheels: from the revisits of a map (doubt {found.doubt:.2f}), which holds other sessions' usual errors as a prior"
+    note = (
+        f"wheels: from the {found.closures} loop closures of a map (doubt {found.doubt:.2f}); the standard "
+        "deviations take these closures as true"
+    )
     return Rig(tuple(quantities), notes=(note,), unknown=(scale,))
+
+
+def _shows_place(reading: Any) -> bool:
+    """Whether a place may be recognised by a reading."""
+    return not isinstance(reading, Observation) or bool(reading.view_seen) or int(reading.label) >= 0
 
 
 def _scale(name: str, assumed: float, found: tuple[float, float]) -> Quantity:

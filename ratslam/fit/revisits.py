@@ -23,16 +23,18 @@ class RevisitFit(NamedTuple):
 
     Attributes:
         heading_bias: rad/m. turn_scale: true turn over that of the odometry; None where the map has no error
-            of turns. doubt: probability that the map is worse than the odometry.
+            of turns. doubt: probability that the map is worse than the odometry. closures: number of accepted
+        loop closures.
     """
 
     heading_bias: tuple[float, float]
     turn_scale: tuple[float, float] | None
     doubt: float
+    closures: int
 
 
 def fit_revisits(config: RunConfig) -> RevisitFit | None:
-    """Maps the record of a configuration; None if the method has no calibration or doubts its map.
+    """Maps the record of a configuration; None if the map closes no loops, is doubted or has no calibration.
 
     Raises:
         InputError: the record cannot be mapped.
@@ -42,7 +44,8 @@ def fit_revisits(config: RunConfig) -> RevisitFit | None:
         for _ in session.replay(observation_of(sample) for sample in source):
             pass
     write = session.map.files().get("calibration.yaml")
-    if write is None:
+    closures = len(session.map.closures())
+    if write is None or not closures:
         return None
     with TemporaryDirectory() as folder:
         file = Path(folder) / "calibration.yaml"
@@ -50,4 +53,4 @@ def fit_revisits(config: RunConfig) -> RevisitFit | None:
         found = load(file).data["keyframes"]["calibration"]
     turn = (1 + found["turn_error"], found["turn_error_sd"]) if "turn_error" in found else None
     bias = found["heading_bias"], found["heading_bias_sd"]
-    return RevisitFit(bias, turn, float(session.map.final_doubt()))
+    return RevisitFit(bias, turn, float(session.map.final_doubt()), closures)

@@ -9,8 +9,8 @@ from ratslam.config.includes import merge_settings
 from ratslam.config.strict_yaml import dump_data
 
 KEPT_SDS = 2.0
-"""A quantity that is nearer to the assumed one than this many of its standard deviations changes no setting: a
-heading bias of no significance, applied to a long path, does more harm than none."""
+"""A quantity that is nearer to the assumed one than this many of its standard deviations changes no setting:
+a heading bias of no significance, applied to a long path, does more harm than none."""
 HEADING = ("quantity", "assumed", "now", "+-", "unit", "setting")
 
 
@@ -108,4 +108,3 @@ def _row(quantity: Quantity) -> Sequence[str]:
 
 def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
     return "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-

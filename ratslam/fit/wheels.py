@@ -1,7 +1,7 @@
 """Systematic errors and noise of wheel odometry, from a record with true poses.
 
-The record is cut into windows of 10 s: shorter ones measure the jitter of the truth and the offset between the
-clocks, longer ones leave too few. Over a window that the odometry calls L m long and T rad of turning,
+The record is cut into windows of 10 s: shorter ones measure the jitter of the truth and the offset between
+the clocks, longer ones leave too few. Over a window of L m and T rad of turning by the odometry,
     true turn  = turn_scale T + heading_bias L + noise of variance (a L + c |T|),
     true chord = length_scale x chord of the odometry with these headings + noise,
 by robust least squares (soft L1), since a wheel that slips for a moment is no scale error. Uncertainties are

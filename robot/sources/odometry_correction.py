@@ -68,5 +68,6 @@ class _CorrectedSource:
     def __iter__(self) -> Iterator[Sample]:
         for sample in self._source:
             *motion, dt = sample.reading.odometry
-            moved = Odometry(*correct_motions(self._correction, np.array(motion, float)), dt)
+            dx, dy, dtheta = correct_motions(self._correction, np.array(motion, float))
+            moved = Odometry(dx, dy, dtheta, dt)
             yield sample._replace(reading=sample.reading._replace(odometry=moved))

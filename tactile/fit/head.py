@@ -2,9 +2,9 @@
 
 Each contact says that the whisker met a wall at a protraction. A head of another rest angle or radius would
 have met it at another one: the geometry is that whose predicted protractions are the measured ones, by robust
-least squares. A tip on top of a wall tells the rest angle, a shaft against a wall's edge the radius too. Lengths
-and heights of the bases are taken as they are, because they trade against the rest angle; and so does the delay
-of the detection, which is part of the rest angle found.
+least squares. A tip on top of a wall tells the rest angle, a shaft against a wall's edge the radius too.
+Lengths and heights of the bases are taken as they are, because they trade against the rest angle; and so does
+the delay of the detection, which is part of the rest angle found.
 """
 
 from __future__ import annotations
@@ -104,9 +104,7 @@ def head_with(assumed: HeadConfig, values: np.ndarray) -> HeadConfig:
     return assumed.model_copy(update={"rest_deg": float(values[0]), "rings": rings})
 
 
-def _summarise(
-    values: np.ndarray, sd: np.ndarray, contacts: int, error: tuple[float, ...]
-) -> HeadFit:
+def _summarise(values: np.ndarray, sd: np.ndarray, contacts: int, error: tuple[float, ...]) -> HeadFit:
     """The fit; a radius that is not known to its own size is unknown."""
     radii = tuple(
         (float(value), float(one)) if one < value else None

@@ -1,0 +1,143 @@
+"""`fit` measures a rig, and what it writes is a configuration's to include."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from ratslam.config.run_config import RunConfig, load_config
+from ratslam.config.strict_yaml import dump_data
+from ratslam.fit.head import walls_of
+from ratslam.fit.rig import Quantity, Rig, rig_settings
+from robot.recordings.mcap_reader import record_source
+from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.sources.odometry import from_motions
+from tactile.base.se2 import integrate
+from tactile.whiskers.head_geometry import HeadConfig
+
+ROWS = 900
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive whose turns are 10 % short by the odometry, with truth and without, and a session of a head."""
+    folder = tmp_path_factory.mktemp("fit")
+    random = np.random.default_rng(0)
+    time, way, turn = 0.5 * np.arange(ROWS), random.uniform(0, 0.2, ROWS), random.normal(0, 0.2, ROWS)
+    way[0] = turn[0] = 0
+    wander = 0.01 * random.standard_normal(ROWS)  # rad
+    truth = integrate(from_motions(time, way, 0.0, 1.1 * turn + wander)[:, :3])
+    table = np.column_stack([time, way, turn])
+    for name in ("drive_odometry.csv", "alone.csv"):
+        np.savetxt(folder / name, table, delimiter=",", header="t,distance,turn", comments="")
+    table = np.column_stack([table[:, 0], truth])
+    np.savetxt(folder / "drive_truth.csv", table, delimiter=",", header="t,x,y,heading", comments="")
+    head = HeadConfig(rest_deg=62, dead=(4,))
+    settings = {"path": {"explore": 120}, "motion": {"speed": 0.03}}
+    record_source(HeadSimulation(SimulationConfig.model_validate(settings), head), folder / "w.mcap")
+    return folder
+
+
+def test_wheels_are_measured_and_the_file_is_included(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = folder / "rig.yaml"
+    assert main(["fit", str(folder / "drive_odometry.csv"), "-o", str(rig)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["quantity", "assumed", "now", "+-", "unit", "setting"]
+    turn = next(line.split() for line in lines if line.startswith("turn scale"))
+    assert turn[2] == "1"
+    assert float(turn[3]) == pytest.approx(1.1, abs=0.02)
+    assert turn[-1] == "recording.odometry.turn_scale"
+    length = next(line for line in lines if line.startswith("length scale"))
+    assert length.endswith("unchanged, within 2 sd")
+    (folder / "mine.yaml").write_text("include: [rig.yaml]\nrecording: {file: drive_odometry.csv}\n")
+    config = load_config(folder / "mine.yaml")
+    assert config.recording is not None
+    assert config.recording.odometry.turn_scale == pytest.approx(1.1, abs=0.02)
+    assert config.recording.odometry.length_scale == 1
+    assert f"# {lines[0]}" in rig.read_text()
+
+
+def test_a_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = folder / "there.yaml"
+    file.write_text("touch: {}\n")
+    assert main(["fit", str(folder / "drive_odometry.csv"), "-o", str(file)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert file.read_text() == "touch: {}\n"
+
+
+def test_the_head_and_its_dead_whiskers_are_measured(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = folder / "head.yaml"
+    wrong = ["--set", "touch.head.rest_deg=75", "--set", "touch.head.dead=[]"]
+    assert main(["fit", str(folder / "w.mcap"), "-o", str(rig), *wrong]) == 0
+    text = capsys.readouterr().out
+    assert "not determined: noise, drift, baseline" in text  # of whisks without raw samples
+    assert "not determined: radius of ring 0" in text
+    (folder / "head_run.yaml").write_text("include: [head.yaml]\nrecording: {file: w.mcap}\n")
+    head = load_config(folder / "head_run.yaml").touch.head
+    assert head.rest_deg == pytest.approx(62 + np.degrees(0.015), abs=0.5)
+    assert head.rings[2].radius == pytest.approx(0.08, rel=0.02)
+    assert head.dead == (4,)
+
+
+def test_without_truth_and_views_the_wheels_are_unknown(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = folder / "nothing.yaml"
+    record = folder / "bare"
+    record.mkdir()
+    (record / "alone.csv").write_bytes((folder / "alone.csv").read_bytes())
+    assert main(["fit", str(record / "alone.csv"), "-o", str(rig)]) == 2
+    out = capsys.readouterr()
+    assert "not determined: length scale: no true poses" in out.out
+    assert "nothing that tells of the rig" in out.err
+    assert not rig.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [("none.csv", None, "no such file"), ("a.csv", "x1,y1\n1,2\n", "error"), ("b.yaml", "a: [", "bracket")],
+)
+def test_bad_records_are_refused(
+    name: str, content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    assert main(["fit", str(tmp_path / name)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_old_command_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train-templates", "x"]) == 2
+    assert "ratslam reproduce templates" in capsys.readouterr().err
+
+
+def test_settings_are_those_that_differ() -> None:
+    rig = Rig(
+        (
+            Quantity("a", 1.0, 1.1, 0.01, "", "recording.odometry.turn_scale"),
+            Quantity("b", 1.0, 1.1, 0.1, "", "recording.odometry.length_scale"),
+            Quantity("c", None, 3.0, 0.1, ""),
+        ),
+        {"touch": {"head": {"dead": [2]}}},
+    )
+    assert rig_settings(rig) == {
+        "recording": {"odometry": {"turn_scale": 1.1}},
+        "touch": {"head": {"dead": [2]}},
+    }
+    assert "turn_scale: 1.1" in dump_data(rig_settings(rig))
+    assert set(rig_settings(rig)) <= set(RunConfig.model_fields)
+
+
+def test_the_walls_are_those_of_the_simulation() -> None:
+    settings = {"path": {"explore": 5}, "maze": {"heights": [0.03, 0.05]}}
+    source = HeadSimulation(SimulationConfig.model_validate(settings))
+    again, walls = walls_of(source.info), source.scene.surroundings.walls
+    np.testing.assert_array_equal(again.box, walls.box)
+    np.testing.assert_array_equal(again.height, walls.height)
