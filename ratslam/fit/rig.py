@@ -7,10 +7,8 @@ from typing import Any, NamedTuple
 
 from ratslam.config.includes import merge_settings
 from ratslam.config.strict_yaml import dump_data
+from ratslam.fit.wheels import KEPT_SDS
 
-KEPT_SDS = 2.0
-"""A quantity that is nearer to the assumed one than this many of its standard deviations changes no setting:
-a heading bias of no significance, applied to a long path, does more harm than none."""
 HEADING = ("quantity", "assumed", "now", "+-", "unit", "setting")
 
 

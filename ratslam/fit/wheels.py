@@ -29,6 +29,9 @@ BLOCKS, DRAWS = 15, 300
 """Blocks of consecutive windows, and bootstrap copies."""
 SLIP = 5.0
 """A window whose error exceeds this many robust standard deviations is a slip."""
+KEPT_SDS = 2.0
+"""A quantity that is nearer to the assumed one than this many of its standard deviations changes nothing: a
+heading bias of no significance, applied to a long path, does more harm than none."""
 _MAD = 1.4826
 
 
@@ -57,10 +60,11 @@ class WheelFit(NamedTuple):
 
     @property
     def correction(self) -> OdometryCorrection:
-        """The systematic errors, as settings of a recording."""
-        turn = 1.0 if self.turn_scale is None else self.turn_scale[0]
+        """The systematic errors beyond `KEPT_SDS`, as settings of a recording."""
         return OdometryCorrection(
-            length_scale=self.length_scale[0], turn_scale=turn, heading_bias=self.heading_bias[0]
+            length_scale=_if_sure(self.length_scale, 1.0),
+            turn_scale=1.0 if self.turn_scale is None else _if_sure(self.turn_scale, 1.0),
+            heading_bias=_if_sure(self.heading_bias, 0.0),
         )
 
 
@@ -113,6 +117,10 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
         path=path,
         turned=turned,
     )
+
+
+def _if_sure(found: tuple[float, float], assumed: float) -> float:
+    return found[0] if abs(found[0] - assumed) > KEPT_SDS * found[1] else assumed
 
 
 def _window_ends(time: np.ndarray, truth: np.ndarray) -> np.ndarray:
