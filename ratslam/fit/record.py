@@ -11,6 +11,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.fit.head import fit_head_of
 from ratslam.fit.revisits import fit_revisits
 from ratslam.fit.rig import Quantity, Rig, join_rigs
+from ratslam.fit.stage import fit_stage_of, is_stage
 from ratslam.fit.wheels import LEAST_TURNED, WheelFit, fit_wheels
 from ratslam.fit.whiskers import fit_signals_of, has_signals_only
 from ratslam.pipeline.source import open_source
@@ -29,8 +30,10 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
     Raises:
         InputError: the record cannot be read.
     """
+    if is_stage(config):
+        return fit_stage_of(config)
     if has_signals_only(config):
-        return fit_signals_of(config, [], None)
+        return fit_signals_of(config, [])
     plain = without_correction(config)
     with open_source(plain) as source:
         completed = complete(plain, source)
@@ -38,7 +41,7 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
         info = source.info
     parts = [fit_wheels_of(config, completed, samples, seed)]
     if info.raw_whiskers and info.planar_whiskers is None:
-        parts += [fit_signals_of(config, samples, info), fit_head_of(completed, samples, info)]
+        parts += [fit_signals_of(config, samples), fit_head_of(completed, samples, info)]
     return join_rigs(parts)
 
 

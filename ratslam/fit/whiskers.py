@@ -10,7 +10,6 @@ from ratslam.config.run_config import RunConfig
 from ratslam.fit.rig import Quantity, Rig
 from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
 from robot.sources.source import Sample
-from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig, read_settings
 from tactile.base.types import Cycle, Whisk
@@ -49,23 +48,26 @@ def has_signals_only(config: RunConfig) -> bool:
     return config.source is not None and config.source.plugin in SIGNALS
 
 
-def fit_signals_of(config: RunConfig, samples: list[Sample], info: SourceInfo | None) -> Rig:
-    """Noise, drift and faults of the whiskers."""
-    reason = "noise, drift, baseline"
+def fit_signals_of(config: RunConfig, samples: list[Sample]) -> Rig:
+    """Noise, drift and faults of the whiskers.
+
+    Raises:
+        InputError: the file of a registered source cannot be read.
+    """
+    if has_signals_only(config):
+        assert config.source is not None
+        record = SIGNALS[config.source.plugin](config.source)
+        return signal_rig(record, fit_signals(record), registered=True)
     try:
-        if has_signals_only(config):
-            assert config.source is not None
-            record = SIGNALS[config.source.plugin](config.source)
-        else:
-            record = signals_of_cycles(samples, info)
-        return signal_rig(record, fit_signals(record), has_signals_only(config))
+        record = signals_of_cycles(samples)
+        return signal_rig(record, fit_signals(record), registered=False)
     except InputError as error:
         dead = dead_of_whisks(samples)
         settings = {"touch": {"head": {"dead": dead}}} if dead else {}
-        return Rig(settings=settings, unknown=(f"{reason}: {error}",))
+        return Rig(settings=settings, unknown=(f"noise, drift, baseline: {error}",))
 
 
-def signals_of_cycles(samples: list[Sample], info: SourceInfo | None) -> SignalRecord:
+def signals_of_cycles(samples: list[Sample]) -> SignalRecord:
     """The deflections of a whisker head at rest, at the start of each cycle.
 
     Raises:
