@@ -32,8 +32,8 @@ def fit_stage_of(config: RunConfig) -> Rig:
     record = read_stage_calibration(settings.file)
     try:
         errors = held_out_errors(record)
-    except InputError as error:
-        return Rig(unknown=(f"stage-to-signal map: {error}",))
+    except InputError as reason:
+        return Rig(unknown=(f"stage-to-signal map: {reason}",))
     size = float(np.sqrt((record.signal**2).mean()))
     error, control = (float(np.median(part)) for part in errors)
     share = [100 * float(np.median(errors[0][fold])) / size for fold in _folds(len(record.signal))]

@@ -66,12 +66,11 @@ def measure(folder: Path) -> FitResult:
         InputError: a record is missing or damaged.
     """
     require_recordings(folder, REACH, *(file for _, file in RECORDS.values()))
-    records, paths = {}, ()
+    records = dict[str, RecordResult]()
     for name in RECORDS:
-        log = _log(name, folder)
-        records[name] = _measure_wheels(name, log, folder)
-        if name == CREATE:
-            paths = tuple(_paths(half, fit) for half, fit in _pairs(log, records[name]))
+        records[name] = _measure_wheels(name, _log(name, folder), folder)
+    create = _pairs(_log(CREATE, folder), records[CREATE])
+    paths = tuple(_paths(half, fit) for half, fit in create)
     signals = read_signals_of_reach(
         PluginConfig(plugin="whisker_reach", settings={"file": str(folder / REACH)})
     )
