@@ -25,6 +25,7 @@ from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import FULL, Ablation
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.signed_appearance import SignedAppearance
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import fan_width, sector_shifts
@@ -33,9 +34,11 @@ from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
+    signed_likelihood,
     touch_likelihood,
     view_likelihood,
 )
+from ratslam.recall.signed_likelihood import stored_image
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
 from tactile.base.types import Array, Observation
 
@@ -107,6 +110,7 @@ class RecallBackend(Backend):
         self.labels, self.view_shape = labels, view_shape
         self.size = 0 if labels else int(np.prod(view_shape))
         self.pixels = pixel_layout(view_shape) if self.recall.sector_fov == "whiskers" else None
+        self.signed = self.pixels is not None and self.recall.images == "signed"
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
         self.window_levels = window_levels(config.pose_cells, self.dtype)
@@ -212,6 +216,8 @@ class RecallBackend(Backend):
     def _appearance(self) -> Appearance:
         if self.labels:
             return LabelAppearance()
+        if self.signed:
+            return SignedAppearance(self.size)
         if self.pixels is not None:
             half_turns = len(sector_shifts(self.recall)) > 1
             return WhiskerAppearance(self.pixels, self.recall.temper, self._normalise, half_turns)
@@ -225,12 +231,15 @@ class RecallBackend(Backend):
         return np.asarray(view_templates.normalise(config, jnp.asarray(shaped)))
 
     def _features(self, view: Array, observation: Observation) -> Array:
-        """The stored and compared form of a view: its values, or the levels of its whisker pixels."""
+        """The stored and compared form of a view: its values, the levels of its whisker pixels, or
+        their signed roots."""
         flat = view.reshape(-1)[: self.size]
         if self.pixels is None:
             return flat
-        alive = live_pixels(observation).reshape(-1).astype(self.dtype)
-        return pixel_levels(flat, alive).astype(jnp.int32)
+        alive = live_pixels(observation).reshape(-1)
+        if self.signed:
+            return stored_image(flat, alive)
+        return pixel_levels(flat, alive.astype(self.dtype)).astype(jnp.int32)
 
     def _recall(
         self, memory: Memory, view: Array, label: Array
@@ -253,6 +262,8 @@ class RecallBackend(Backend):
     def _likelihood(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, ObservationLikelihood]:
         if self.labels:
             return memory, label_likelihood(self.recall, memory, label)
+        if self.signed:
+            return signed_likelihood(self.recall, memory, view)
         if self.pixels is not None:
             return touch_likelihood(self.recall, memory, view, self.pixels)
         return memory, view_likelihood(self.recall, self.cell, memory, view)

@@ -39,6 +39,8 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"pose_cells": {"cell_size": info.cell_size}})
     if info.labels_only:
         config = _fill(config, {"templates": {"source": "labels"}})
+    if info.signed_views:
+        config = _fill(config, {"recall": {"images": "signed"}})
     if _is_other_touch(config, source):
         # Touch without whiskers around the robot: what it measures has no layout that is known here.
         config = _fill(config, {"recall": {"sector_fov": "none"}})

@@ -22,9 +22,13 @@ class RecallConfig(Settings):
     """Field of view, rad (counter-clockwise positive), of views that are ordered sectors, so that a turned
     robot sees them shifted; `none`: not ordered; `whiskers`: rows of whiskers around the robot; `auto` (also
     0): estimated from the session."""
+    images: Literal["heights", "signed"] = "heights"
+    """Whiskers: `heights`: a pixel is silent or has a height in 0..1, compared by its level; `signed`: pixels
+    are signed departures from rest in any unit, compared by their covariances. Sources of signed views set
+    it."""
     shifts: NonNegativeInt = 3
     """Largest sector shift in either direction. With whiskers, any value but 0 compares views turned by half
-    a turn too, where each whisker is compared with the opposite one."""
+    a turn too, where each whisker is compared with the opposite one; signed images are not."""
     frame_distance: PositiveFloat = 0.3
     """Distance after which a view becomes a keyframe, cells. A robot at rest stores nothing."""
     frame_turn: PositiveFloat = 0.15
@@ -75,7 +79,7 @@ class RecallConfig(Settings):
 def sector_shifts(config: RecallConfig) -> np.ndarray:
     """[S] sector shifts at which views are compared; whiskers: half turns."""
     if config.sector_fov == "whiskers":
-        return np.arange(2 if config.shifts else 1, dtype=np.int32)
+        return np.arange(2 if config.shifts and config.images == "heights" else 1, dtype=np.int32)
     reach = 0 if config.sector_fov == "none" else config.shifts
     return np.arange(-reach, reach + 1, dtype=np.int32)
 

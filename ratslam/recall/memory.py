@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.recall.signed_likelihood import packed_shape
 from ratslam.recall.whisker_likelihood import LEVELS
 from tactile.base.se2 import compose, correct_heading
 from tactile.base.types import Array
@@ -23,8 +24,8 @@ class MapFeedback(NamedTuple):
             rad/rad. since: distance travelled since
             the last closure, m. angle: turn per sector shift, rad, 0 while unknown; whiskers: half a turn.
             scale: view error below which different places seldom come; whiskers: log-odds that stand for an
-            image never seen before; 0 while unknown. likeness: [G, L, L] see `log_odds_table`; empty except
-            for whiskers.
+            image never seen before; 0 while unknown. likeness: [G, L, L] see `log_odds_table`, or of signed
+            images, see `signed_likelihood.pack`; empty except for whiskers.
     """
 
     poses: np.ndarray
@@ -71,7 +72,7 @@ class Memory(NamedTuple):
     """All keyframes, rows in order of time, and the posterior over them.
 
     Attributes:
-        view: [D, C]; whiskers: levels, int32. label: [C] int32. packet: [C, 3] pose-cell packet when the
+        view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32. packet: [C, 3] pose-cell packet when the
             keyframe was taken, cells.
         x, y, cosine, sine: [C] poses in the map. count, distinct: number of keyframes and of known labels,
             int32.
@@ -123,6 +124,8 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         return jnp.zeros(shape, dtype)
 
     touch = config.sector_fov == "whiskers"
+    levels = touch and config.images == "heights"
+    learned = (groups, LEVELS, LEVELS) if levels else packed_shape(size) if touch else (0, 0, 0)
     shape = len(sector_shifts(config)), capacity if touch else 0
 
     def no_modes() -> Modes:
@@ -132,7 +135,7 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         )  # fmt: skip
 
     return Memory(
-        view=jnp.zeros((size, capacity), jnp.int32) if touch else zeros(size, capacity),
+        view=jnp.zeros((size, capacity), jnp.int32) if levels else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
         packet=zeros(capacity, 3),
         x=zeros(capacity),
@@ -150,7 +153,7 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         since=zeros(),
         angle=zeros(),
         scale=zeros(),
-        likeness=zeros(groups, LEVELS, LEVELS) if touch else zeros(0, 0, 0),
+        likeness=zeros(*learned),
         **no_modes()._asdict(),
         control=no_modes(),
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.memory import Memory, allowed_shifts, current_pose, recallable
+from ratslam.recall.signed_likelihood import log_odds, project, unpack
 from ratslam.recall.whisker_likelihood import PixelLayout
 from tactile.base.types import Array
 
@@ -69,18 +70,35 @@ def touch_likelihood(
 ) -> tuple[Memory, ObservationLikelihood]:
     """Likelihood of a whisker image: levels [D].
 
-    Pixels are not independent, so their log-odds are tempered. The likelihood at a new place is that at the
-    successors of keyframes similar to the previous image, because images in corridors change alike.
+    Pixels are not independent, so their log-odds are tempered.
 
     Returns:
         the memory with this image's likelihoods, which the next image needs; the likelihood.
     """
-    frames = recallable(config, memory)
     row = memory.likeness[pixels.group, level]
     then = [memory.view, memory.view[pixels.opposite]][: len(sector_shifts(config))]
     odds = jnp.stack([jnp.sum(jnp.take_along_axis(row, levels, axis=1), axis=0) for levels in then])
+    return _weigh(config, memory, config.temper * odds)
+
+
+def signed_likelihood(
+    config: RecallConfig, memory: Memory, image: Array
+) -> tuple[Memory, ObservationLikelihood]:
+    """Likelihood of a signed image: its stored form [D]; returns as `touch_likelihood`."""
+    model = unpack(memory.likeness)
+    odds = log_odds(model, project(model, image[:, None]), project(model, memory.view))
+    return _weigh(config, memory, odds[None])
+
+
+def _weigh(config: RecallConfig, memory: Memory, odds: Array) -> tuple[Memory, ObservationLikelihood]:
+    """Likelihood of an image with these log-odds [S, C] against the keyframes.
+
+    The likelihood at a new place is that at the successors of keyframes similar to the previous image, because
+    images in corridors change alike.
+    """
+    frames = recallable(config, memory)
     certain = (memory.scale != 0) & jnp.any(frames)
-    likelihood = jnp.where(frames[None] & certain, jnp.exp(config.temper * odds), 0.0)
+    likelihood = jnp.where(frames[None] & certain, jnp.exp(odds), 0.0)
     expected = jnp.where(frames[None], _successors(memory.before), 0.0)
     total = jnp.sum(expected)
     familiar = jnp.sum(expected * likelihood) / jnp.where(total > 0, total, 1.0)

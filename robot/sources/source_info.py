@@ -66,6 +66,8 @@ class SourceInfo(Settings):
     into observations."""
     labels_only: bool = False
     """Whether readings carry given place labels and never a view."""
+    signed_views: bool = False
+    """Whether views are signed departures from rest, in any unit, instead of values in 0..1."""
     cell_size: PositiveFloat | None = None
     """Pose-cell side length that suits the data, m."""
     head: HeadConfig | None = None
