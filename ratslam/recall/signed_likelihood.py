@@ -177,10 +177,10 @@ def _covariances(images: np.ndarray, steps: ImagePairs, pairs: ImagePairs) -> Tw
     projection, correlation = np.zeros((size, DIRECTIONS)), np.zeros(DIRECTIONS)
     if count:
         prior = np.eye(count)
-        total = _shrunk((images[:, used] - mean[used]) / sd[used], prior)
+        total = _shrunk((images[:, used] - mean[used]) / sd[used], prior, len(images))
         within = (1 - PRIOR_CORRELATION) * prior
         for one, other in (steps, pairs):
-            within = _shrunk((one[:, used] - other[:, used]) / (np.sqrt(2) * sd[used]), within)
+            within = _shrunk((one[:, used] - other[:, used]) / (np.sqrt(2) * sd[used]), within, len(images))
         share, directions = eigh(within, total, subset_by_index=[0, min(DIRECTIONS, count) - 1])
         rho = np.clip(1 - share, 0.0, LARGEST_CORRELATION)
         correlation[: len(rho)] = rho
@@ -188,9 +188,12 @@ def _covariances(images: np.ndarray, steps: ImagePairs, pairs: ImagePairs) -> Tw
     return TwoCovariances(mean, projection, correlation, np.array(PRIOR))
 
 
-def _shrunk(values: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """[D, D] second moments of values [n, D] and of a prior that counts as D of them."""
-    return (values.T @ values + len(prior) * prior) / (len(values) + len(prior))
+def _shrunk(values: np.ndarray, prior: np.ndarray, most: int) -> np.ndarray:
+    """[D, D] second moments of values [n, D] and of a prior that counts as D of them. They count as at most
+    `most` values, because the pairs of N images are not more than N independent values."""
+    count = min(len(values), most)
+    share = count / (count + len(prior))
+    return share * (values.T @ values) / max(len(values), 1) + (1 - share) * prior
 
 
 def calibrate(same: np.ndarray, weights: np.ndarray, different: np.ndarray) -> Calibration:
