@@ -72,7 +72,8 @@ class Memory(NamedTuple):
     """All keyframes, rows in order of time, and the posterior over them.
 
     Attributes:
-        view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32. packet: [C, 3] pose-cell packet when the
+        view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32. packet: [C, 3]
+            pose-cell packet when the
             keyframe was taken, cells.
         x, y, cosine, sine: [C] poses in the map. count, distinct: number of keyframes and of known labels,
             int32.

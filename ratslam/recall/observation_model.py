@@ -93,8 +93,8 @@ def signed_likelihood(
 def _weigh(config: RecallConfig, memory: Memory, odds: Array) -> tuple[Memory, ObservationLikelihood]:
     """Likelihood of an image with these log-odds [S, C] against the keyframes.
 
-    The likelihood at a new place is that at the successors of keyframes similar to the previous image, because
-    images in corridors change alike.
+    The likelihood at a new place is that at the successors of keyframes similar to the previous image,
+    because images in corridors change alike.
     """
     frames = recallable(config, memory)
     certain = (memory.scale != 0) & jnp.any(frames)

@@ -52,6 +52,9 @@ PRIOR = Calibration(0.25, 0.0, 0.1, 0.1)
 PRIOR_SD = Calibration(1.0, 3.0, 1.0, 1.0)
 """Standard deviations of the logarithm of the temper, of the offset and of the log-odds of the shares."""
 
+LIMIT = 5.0
+"""Largest departure from the prior calibration, standard deviations."""
+
 
 class TwoCovariances(NamedTuple):
     """The learned model of images of D pixels.
@@ -69,8 +72,8 @@ class TwoCovariances(NamedTuple):
 
 
 def stored_image(view: Array, alive: Array) -> Array:
-    """The stored form [D] of a view [D]: signed square roots, `DEAD` where `alive` [D] is False. For NumPy and
-    JAX."""
+    """The stored form [D] of a view [D]: signed square roots, `DEAD` where `alive` [D] is False. For NumPy
+    and JAX."""
     library: Any = np if isinstance(view, np.ndarray) else jnp
     return library.where(alive, library.sign(view) * library.sqrt(abs(view)), DEAD)
 
@@ -127,8 +130,8 @@ class ImagePairs(NamedTuple):
     one: np.ndarray
     other: np.ndarray
 
-    def part(self, rows: np.ndarray) -> ImagePairs:
-        """Some of them, by number or by mask."""
+    def part(self, rows: slice) -> ImagePairs:
+        """Some of them."""
         return ImagePairs(self.one[rows], self.other[rows])
 
 
@@ -143,21 +146,23 @@ def learn(images: np.ndarray, pairs: ImagePairs, apart: np.ndarray) -> TwoCovari
     """
     steps = ImagePairs(images[1:], images[:-1])
     covariances = _covariances(images, steps, pairs)
-    scores = np.zeros(len(steps.one) + len(pairs.one))
+    kinds, scores = (steps, pairs), [np.zeros(len(kind.one)) for kind in (steps, pairs)]
     for odd in (0, 1):
-        held, rest = [np.arange(len(kind.one)) % 2 == odd for kind in (steps, pairs)], 1 - odd
-        others = [np.arange(len(kind.one)) % 2 == rest for kind in (steps, pairs)]
-        trial = _covariances(images, steps.part(others[0]), pairs.part(others[1]))
-        found = [_raw_scores(trial, *kind.part(mask)) for kind, mask in zip((steps, pairs), held, strict=True)]
-        scores[np.concatenate(held)] = np.concatenate(found)
-    weights = np.ones(len(scores))
-    weights[: len(steps.one)] = min(images.shape[1] / max(len(steps.one), 1), 1.0)
+        rest = [kind.part(np.s_[1 - odd :: 2]) for kind in kinds]
+        trial = _covariances(images, *rest)
+        for score, kind in zip(scores, kinds, strict=True):
+            score[odd::2] = _raw_scores(trial, *kind.part(np.s_[odd::2]))
+    same = np.concatenate(scores)
+    weights = np.ones(len(same))
+    compared = int(covariances.projection.any(axis=1).sum())
+    weights[: len(steps.one)] = min(compared / max(len(steps.one), 1), 1.0)
     different = _raw_scores(covariances, images[apart[:, 0]], images[apart[:, 1]])
-    calibration = calibrate(scores, weights, different)
+    calibration = calibrate(same, weights, different)
     return covariances._replace(calibration=np.array(calibration))
 
 
 def _raw_scores(model: TwoCovariances, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[n] log-odds before calibration of pairs of stored images [n, D]."""
     return _raw_log_odds(model.correlation[:, None], project(model, one.T), project(model, other.T))
 
 
@@ -209,7 +214,8 @@ def calibrate(same: np.ndarray, weights: np.ndarray, different: np.ndarray) -> C
         lost += weight * np.logaddexp(0, calibrated(found, different)).sum()
         return float(lost + (((free - prior) / sd) ** 2).sum() / 2)
 
-    return _bound(minimize(cost, prior, method="L-BFGS-B").x)
+    limits = np.column_stack([prior - LIMIT * sd, prior + LIMIT * sd])
+    return _bound(minimize(cost, prior, method="L-BFGS-B", bounds=limits).x)
 
 
 def _free(calibration: Calibration) -> np.ndarray:

@@ -106,7 +106,9 @@ def plan_visits(truth: np.ndarray, things: int, seed: int) -> Visits:
 
 def most_needed(visits: Visits) -> int:
     """The largest number of rows that an object needs, of first visits or of later ones."""
-    return int(max(np.bincount(visits.thing[visits.later == later]).max(initial=0) for later in (False, True)))
+    return int(
+        max(np.bincount(visits.thing[visits.later == later]).max(initial=0) for later in (False, True))
+    )
 
 
 def draw_by_place(records: list[ObjectRecord], visits: Visits, seed: int) -> np.ndarray:
@@ -123,7 +125,9 @@ def draw_by_place(records: list[ObjectRecord], visits: Visits, seed: int) -> np.
         for later, rows in ((False, np.arange(half)), (True, np.arange(half, 2 * half))):
             whisks = np.flatnonzero((visits.thing == number) & (visits.later == later))
             if len(whisks) > half:
-                found = f"object {number} is felt {len(whisks)} times in {'later' if later else 'first'} visits"
+                found = (
+                    f"object {number} is felt {len(whisks)} times in {'later' if later else 'first'} visits"
+                )
                 raise InputError("seed", found, f"at most {half} times", "choose another seed")
             images[whisks] = record.images[random.permutation(rows)[: len(whisks)]]
     return images

@@ -1,8 +1,10 @@
 """Objects felt by eight actuated whiskers.
 
-From the recordings of "Vibrissae-inspired vision-based magnetic-actuated whisker" (doi 10.1038/s41467-025-67672-x).
-A CSV file holds one object, without a header: a row per touch of 8 whiskers x 16 displacements of their roots,
-integers in camera pixels, 0 at rest. Rows have no time and no pose; neighbours were felt one after the other.
+From the recordings of "Vibrissae-inspired vision-based magnetic-actuated whisker"
+(doi 10.1038/s41467-025-67672-x). A CSV file holds one object, without a header: a row per touch of
+8 whiskers x 16 displacements of their roots, integers in camera pixels, 0 at rest. Rows have no time and no
+pose. The files do not say that rows are in the order of the touches, nor which of their values belong to one
+whisker; 16 successive ones are taken to.
 """
 
 from __future__ import annotations

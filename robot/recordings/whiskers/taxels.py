@@ -53,8 +53,8 @@ def read_contacts(path: Path) -> list[TaxelContact]:
     """All contacts of a file.
 
     Raises:
-        InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is empty,
-            has other columns or values that are not finite.
+        InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is
+            empty, has other columns or values that are not finite.
     """
     return _contacts(path, read_bytes(path))
 

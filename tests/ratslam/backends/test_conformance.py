@@ -27,6 +27,7 @@ TOUCH = {
     "recall": {"sector_fov": "whiskers"},
     "keyframes": {"select_every": 15, "may_be_carried": True, "sequence_agreement": 0.2},
 }
+SIGNED = TOUCH | {"recall": {"sector_fov": "whiskers", "images": "signed"}}
 # With large odometry noise, so that it resamples throughout the session.
 DOUBTFUL = {
     "particles": 20,
@@ -39,13 +40,14 @@ METHODS = {
     "recall": pose_cells("recall", "views"),
     "recall-labels": pose_cells("recall", "labels"),
     "touch": pose_cells("recall", "views", **TOUCH),
+    "signed-touch": pose_cells("recall", "views", **SIGNED),
     "classic": pose_cells("classic", "views"),
     "classic-labels": pose_cells("classic", "labels"),
     "grid": ("grid", {"grid": DOUBTFUL}),
 }
 EXAMPLE = "dead-reckoning"
-OFTEN = {"recall-labels"}
-"""Backends that differ from another one only by the source of views: for `make soak`."""
+OFTEN = {"recall-labels", "signed-touch"}
+"""Backends that differ from another one only by the kind of views: for `make soak`."""
 
 
 def some(names):
