@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import eigh
-from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from tactile.base.types import Array
@@ -206,6 +205,8 @@ def calibrate(same: np.ndarray, weights: np.ndarray, different: np.ndarray) -> C
     of different places [Q], which count as much in all."""
     if not len(same):
         return PRIOR
+    from scipy.optimize import minimize  # slow to import, and only signed images need it
+
     prior, sd, weight = _free(PRIOR), np.array(PRIOR_SD), weights.sum() / len(different)
 
     def cost(free: np.ndarray) -> float:

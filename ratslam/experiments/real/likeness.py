@@ -204,9 +204,9 @@ def chance_of(parts: list[HeldOut]) -> float:
 NOTES = [
     "AUC: probability that two images of one object have larger log-odds than two of different objects; "
     "chance is 0.5. Pairs are of a held-out image and one that was learned from. Touches of a run follow "
-    "each other, so that pairs within a run would be too easy. The first run differs most from the others. An "
-    "image of the taxels is the mean of a contact. These contacts showed that many pairs of few images must not "
-    "count as independent: they tell that the model holds for another sensor, but are no longer unseen.",
+    "each other, so that pairs within a run would be too easy. The first run differs most from the others. "
+    "An image of the taxels is the mean of a contact. These contacts showed that many pairs of few images "
+    "must not count as independent: the model holds for another sensor, but they are no longer unseen.",
 ]
 
 

@@ -138,17 +138,17 @@ def table(walks: list[WalkResult]) -> list[str]:
     return [
         *lines,
         "",
-        f"EM (m^2 + rad^2) is at most {GOAL} in {reached} of {len(walks)} walks, over the first three circuits "
-        f"in {three}. {NOTE}",
+        f"EM (m^2 + rad^2) is at most {GOAL} in {reached} of {len(walks)} walks, over the first three "
+        f"circuits in {three}. {NOTE}",
     ]
 
 
 NOTE = (
     "Poses and odometry are simulated; the images are recorded, but the robot that moves did not feel them "
-    "where it is, and images within a cell do not vary with the position. The fourth circuit is driven in the "
-    "opposite direction, and each facing of a cell has an object of its own, so that nothing in it can be "
-    "recognised; the column of the true path shows what odometry alone loses there. The simulated whiskers "
-    "compare both directions."
+    "where it is, and images within a cell do not vary with the position. The fourth circuit is driven in "
+    "the opposite direction, and each facing of a cell has an object of its own, so that nothing in it can "
+    "be recognised; the column of the true path shows what odometry alone loses there. The simulated "
+    "whiskers compare both directions."
 )
 
 
