@@ -11,7 +11,7 @@ from robot.recordings.sanity_checks import RowName
 from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
-from robot.sources.source_info import SourceInfo
+from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
 from tactile.base.errors import InputError
 
 RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
@@ -36,7 +36,8 @@ class RecordingRows:
     Attributes:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
         shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
-        errors: found so far. views, seen, label, truth: as in `InMemorySource`.
+        errors: found so far. views, seen, label, truth, contact, point: as in `InMemorySource`.
+        sensors: the whiskers that make contacts, if any.
     """
 
     time: np.ndarray
@@ -45,6 +46,9 @@ class RecordingRows:
     whiskers: int = 0
     errors: list[InputError] = field(default_factory=list)
     truth: np.ndarray | None = None
+    contact: np.ndarray | None = None
+    point: np.ndarray | None = None
+    sensors: PlanarWhiskersInfo | None = None
     views: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
     label: np.ndarray = field(init=False)
@@ -53,6 +57,15 @@ class RecordingRows:
         rows = len(self.time)
         self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
         self.label = np.full(rows, -1, np.int32)
+
+    def set_contacts(self, rows: np.ndarray, touching: np.ndarray, sensors: PlanarWhiskersInfo) -> None:
+        """Contacts [M, W] bool of the tips of whiskers at M rows, and none at the others."""
+        self.sensors, self.whiskers = sensors, len(sensors.mounts)
+        self.contact = np.zeros((len(self.time), self.whiskers), bool)
+        self.contact[rows] = touching
+        base, angle = np.array(sensors.mounts)[:, :2], np.radians(np.array(sensors.mounts)[:, 2])
+        tips = base + sensors.length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        self.point = tips * self.contact[:, :, None]
 
     def source(self, name: str, digest: str, where: str, limits: UnitLimits) -> InMemorySource:
         """The recording as a `Source`, after the unit check.
@@ -73,8 +86,13 @@ class RecordingRows:
             seen=self.seen,
             label=self.label,
             truth=self.truth,
-            info=SourceInfo(labels_only=bool((self.label >= 0).any()) and not self.seen.any()),
+            info=SourceInfo(
+                labels_only=bool((self.label >= 0).any()) and not self.seen.any(),
+                planar_whiskers=self.sensors,
+            ),
             alive=np.ones(self.whiskers, bool),
+            contact=self.contact,
+            point=self.point,
         )
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from robot.recordings.alignment import interpolated_poses, nearest_rows, range_errors, range_pixels
-from robot.recordings.csv_config import LabelColumns, PairColumns, TruthColumns, ViewColumns
+from robot.recordings.csv_config import ContactColumns, LabelColumns, PairColumns, TruthColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
 from robot.recordings.unit_check import UnitLimits, heading_errors
+from robot.sources.source_info import PlanarWhiskersInfo
 from tactile.base.errors import InputError
 
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
@@ -48,6 +49,28 @@ def align_views(
         values = range_pixels(values, pixels, part.max_range)
     rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
     return rows, values.reshape(-1, *shape), errors + faults
+
+
+def align_contacts(
+    base: CsvFile, files: Mapping[Path, CsvFile], part: ContactColumns, time: np.ndarray
+) -> AlignedRows:
+    """Contacts [M, W] bool, in the order of the sensors in the settings."""
+    file, names = files[part.file or base.path], tuple(part.directions)
+    values = np.column_stack([file.column(name) for name in names])
+    errors = file.faults(*names)
+    bad = ~np.isin(values, (0, 1)) & np.isfinite(values)
+    if bad.any():
+        row, sensor = np.argwhere(bad)[0].tolist()
+        found = f"{names[sensor]} is {values[row, sensor]:g}"
+        errors.append(InputError(file.place(row), found, "1 in contact, 0 without"))
+    rows, faults = _match_rows(file, base, np.arange(len(values)), part.time, part.tolerance, time)
+    return rows, values == 1, errors + faults
+
+
+def sensors_of(part: ContactColumns) -> PlanarWhiskersInfo:
+    """The touch sensors as whiskers from the origin of base_link to what they touch."""
+    mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
+    return PlanarWhiskersInfo(mounts=mounts, length=part.distance)
 
 
 def align_labels(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from tactile.base.config import Settings
+from tactile.whiskers.head_geometry import Degrees
 
 
 class PoseColumns(Settings):
@@ -57,6 +59,22 @@ class ViewColumns(Settings):
     of consecutive beams, so their number must be a multiple of the pixels. Null: pixel values in 0..1."""
     tolerance: float | None = Field(default=None, ge=0)
     """Largest time between a view and its nearest odometry row, s; null: the median step."""
+
+
+class ContactColumns(Settings):
+    """Contacts of touch sensors around the robot, such as bumpers: one column a sensor, 1 in contact, else 0."""
+
+    file: Path | None = None
+    """File of the contacts; a `*` in its name stands for the beginning of the recording's file name. Null: the
+    odometry file."""
+    time: str = "t"
+    """Column of the time, s, in that file."""
+    directions: Annotated[dict[str, Degrees], Field(min_length=1)] = {"left": 45.0, "front": 0.0, "right": -45.0}
+    """For each column the direction of what its sensor touches, degrees counter-clockwise from ahead."""
+    distance: PositiveFloat = 0.17
+    """Distance of what is touched from the origin of base_link, m: the radius of a round robot."""
+    tolerance: float | None = Field(default=None, ge=0)
+    """As for views."""
 
 
 class LabelColumns(Settings):
@@ -122,6 +140,8 @@ class CsvConfig(Settings):
     """C, columns of a view."""
     views: ViewColumns | None = None
     """Views, if any."""
+    contacts: ContactColumns | None = None
+    """Contacts, if any."""
     labels: LabelColumns | None = None
     """Place labels, if any."""
     pairs: PairColumns | None = None

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from robot.recordings.alignment import RecordingRows
-from robot.recordings.csv_alignment import align_labels, align_truth, align_views
-from robot.recordings.csv_config import CsvConfig, PoseColumns, VelocityColumns, ViewColumns
+from robot.recordings.csv_alignment import align_contacts, align_labels, align_truth, align_views, sensors_of
+from robot.recordings.csv_config import ContactColumns, CsvConfig, PoseColumns, VelocityColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
 from robot.recordings.sanity_checks import clock_errors
 from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits, heading_errors
@@ -28,7 +28,7 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
     Raises:
         InputError: files or columns are missing, cells are not numbers, or values are impossible.
     """
-    parts = (config.views, config.labels, config.pairs, config.truth)
+    parts = (config.views, config.contacts, config.labels, config.pairs, config.truth)
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
     files = {name: read_csv(name) for name in dict.fromkeys(paths)}
     base = files[path]
@@ -43,6 +43,11 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
         recording.errors += faults
         if not faults:
             recording.views[rows], recording.seen[rows] = values, True
+    if config.contacts is not None:
+        rows, values, faults = align_contacts(base, files, config.contacts, time)
+        recording.errors += faults
+        if not faults:
+            recording.set_contacts(rows, values, sensors_of(config.contacts))
     if config.labels is not None or config.pairs is not None:
         rows, values, faults = align_labels(base, files, config.labels, config.pairs, time)
         recording.errors += faults
@@ -66,16 +71,19 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
     if config.labels is not None and config.pairs is not None:
         found = "both table.labels and table.pairs are given"
         errors.append(InputError(str(base.path), found, "one of them"))
-    for key in (*ODOMETRY, "labels", "pairs", "truth", "views"):
+    for key in (*ODOMETRY, "contacts", "labels", "pairs", "truth", "views"):
         part = getattr(config, key)
         if part is None:
             continue
         file = files[getattr(part, "file", None) or base.path]
-        numbers = {"file", "tolerance", "threshold", "prefix", "max_range"}
+        numbers = {"file", "tolerance", "threshold", "prefix", "max_range", "directions", "distance"}
         named = part.model_dump(exclude=numbers, exclude_none=True)
         if file is base:
             named.pop("time", None)  # the time of the odometry is used there
         errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
+        if isinstance(part, ContactColumns):
+            key = "contacts.directions"
+            errors += file.absences([(column, f"table.{key}") for column in part.directions])
         if isinstance(part, ViewColumns):
             errors += _gap_errors(file, part.prefix)
     return errors

@@ -51,7 +51,7 @@ class RecordingConfig(Settings):
         recording = folder / self.file
         parts = {
             key: part.model_copy(update={"file": _companion(recording, folder, part.file)})
-            for key in ("views", "labels", "pairs", "truth")
+            for key in ("views", "contacts", "labels", "pairs", "truth")
             if (part := getattr(self.table, key)) is not None and part.file is not None
         }
         beside = {

@@ -16,7 +16,7 @@ from tactile.base.types import Observation, Odometry, observation
 
 @dataclass(frozen=True, eq=False)
 class InMemorySource(ClosedSource):
-    """A `Source` over N rows of observations without contacts.
+    """A `Source` over N rows of observations without walls.
 
     Attributes:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
@@ -26,6 +26,8 @@ class InMemorySource(ClosedSource):
         truth: [N, 3] (x m, y m, heading rad), rows of NaN where unknown; None if never known.
         info: devices, world and origin.
         alive: [W] whether each whisker works; empty for cameras, lasers and given labels.
+        contact: [N, W] bool, whiskers in contact, and point: [N, W, 2] contact points in base_link, m, zero
+            without contact; None for a source without contacts.
     """
 
     name: str
@@ -39,6 +41,8 @@ class InMemorySource(ClosedSource):
     truth: np.ndarray | None = None
     info: SourceInfo = field(default_factory=SourceInfo)
     alive: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    contact: np.ndarray | None = None
+    point: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.views.flags.writeable = False  # samples share slices of it
@@ -62,14 +66,22 @@ class InMemorySource(ClosedSource):
 
     def __iter__(self) -> Iterator[Sample]:
         shape = self.view_shape
-        for time, motion, view, seen, label, truth in zip(
-            self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(), strict=True
-        ):
+        for time, motion, view, seen, label, truth, touch in zip(
+            self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(),
+            self._contacts(), strict=True,
+        ):  # fmt: skip
             picture = view if seen else None
             reading = observation(
                 Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
             )
-            yield Sample(time, reading._replace(alive=self.alive.copy()), truth)
+            yield Sample(time, reading._replace(alive=self.alive.copy(), **touch), truth)
+
+    def _contacts(self) -> Iterator[dict[str, np.ndarray]]:
+        if self.contact is None or self.point is None:
+            yield from repeat({}, self.length)
+        else:
+            rows = zip(self.contact, self.point, strict=True)
+            yield from ({"contact": contact.copy(), "point": point.copy()} for contact, point in rows)
 
     def _truths(self) -> Iterator[np.ndarray | None]:
         if self.truth is None:
@@ -112,6 +124,6 @@ def load_into_memory(source: Source) -> InMemorySource:
 
 def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
     """The first steps of a source in memory; its digest is the original one followed by their number."""
-    columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
+    columns = ("time", "motion", "moved", "views", "seen", "label", "truth", "contact", "point")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
     return replace(log, digest=f"{log.digest}[:{steps}]", **cut)
