@@ -12,7 +12,8 @@ Share = Annotated[float, Field(gt=0, lt=1)]
 
 
 class DriftConfig(Settings):
-    """The filter's model of odometry errors: a turn or a distance d becomes d (1 + session + move + step).
+    """The filter's model of odometry errors: a turn or a distance d becomes d (1 + session + move + step),
+    and a turn in t seconds heading_rate t more.
 
     Scale errors persist, and a filter that models them as independent noise of each step cannot track them.
     """
@@ -25,6 +26,12 @@ class DriftConfig(Settings):
     """Standard deviation of the relative scale error of one step."""
     heading: NonNegativeFloat = 5e-4
     """Standard deviation of the heading error of one step, rad."""
+    heading_rate: NonNegativeFloat = 0.0
+    """Standard deviation of a heading drift that is constant over the session, rad/s: wheels that are not quite
+    equal."""
+    slip: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the forward motion that is lost in a step that begins in contact, and the largest share lost of
+    its turn: 1 for bumpers, because a wall stops the robot but not its wheels; 0 for whiskers, which bend."""
 
 
 class ResamplingConfig(Settings):
@@ -43,6 +50,8 @@ class ResamplingConfig(Settings):
     """Standard deviation of the rotation of copies, rad."""
     scale: NonNegativeFloat = 3e-3
     """Standard deviation of the change of the session's scale error in copies."""
+    heading_rate: NonNegativeFloat = 1e-4
+    """Standard deviation of the change of the heading drift in copies, rad/s, where there is one."""
 
 
 class LikelihoodConfig(Settings):

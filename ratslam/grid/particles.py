@@ -1,7 +1,7 @@
 """Particles: motion, weights and resampling.
 
-Each particle carries estimates of the odometry's scale errors: one constant over the session, one constant
-over a movement.
+Each particle carries estimates of the odometry's errors: scale errors constant over the session, scale errors
+constant over a movement, and a heading drift constant over the session.
 """
 
 from __future__ import annotations
@@ -16,18 +16,24 @@ from ratslam.grid.config import DriftConfig, ResamplingConfig
 from tactile.base.types import Array, Odometry
 
 
+RATE_STREAM, SLIP_STREAM = 1, 2
+"""Random streams beside those of the scale errors, which stay the same where there is no drift or slip."""
+
+
 class Particles(NamedTuple):
     """N particles.
 
     Attributes:
         pose: [N, 3] m, m, rad. session, move: [N, 2] relative scale errors of distances and turns, over the
-            session and over the present movement. weight: [N] logarithms.
+            session and over the present movement. weight: [N] logarithms. heading_rate: [N] heading drift,
+            rad/s; None if there is none.
     """
 
     pose: Array
     session: Array
     move: Array
     weight: Array
+    heading_rate: Array | None = None
 
 
 class Resampling(NamedTuple):
@@ -45,26 +51,41 @@ class Resampling(NamedTuple):
 
 
 def start(config: DriftConfig, key: Array, count: int, dtype: jnp.dtype) -> Particles:
-    """N particles at the origin, with random scale errors."""
+    """N particles at the origin, with random scale errors and heading drifts."""
     # Without the barrier XLA merges two factors: other bits compiled than not.
     session = config.session * lax.optimization_barrier(jax.random.normal(key, (count, 2), dtype))
-    return Particles(jnp.zeros((count, 3), dtype), session, jnp.zeros_like(session), jnp.zeros(count, dtype))
+    rate = None
+    if config.heading_rate:
+        draws = jax.random.normal(jax.random.fold_in(key, RATE_STREAM), (count,), dtype)
+        rate = config.heading_rate * lax.optimization_barrier(draws)
+    at, weight = jnp.zeros((count, 3), dtype), jnp.zeros(count, dtype)
+    return Particles(at, session, jnp.zeros_like(session), weight, rate)
 
 
 def move(
-    config: DriftConfig, particles: Particles, odometry: Odometry, changed: Array, key: Array
+    config: DriftConfig,
+    particles: Particles,
+    odometry: Odometry,
+    changed: Array,
+    key: Array,
+    pressed: Array | bool = False,
 ) -> Particles:
     """The particles after an odometry reading.
 
     Args:
-        changed: bool, a new movement has begun, whose scale errors are drawn at random.
+        changed: bool, a new movement has begun, whose scale errors are drawn at random. pressed: bool, the step
+            begins in contact.
     """
     dtype = particles.pose.dtype
     draws = jax.random.normal(key, (5, *particles.weight.shape), dtype)
     move = jnp.where(changed, config.move * draws[:2].T, particles.move)
     scale = 1 + particles.session + move + config.step * draws[2:4].T
+    if config.slip:
+        scale *= _kept_shares(config.slip, odometry, pressed, len(draws[0]), key, dtype)
     x, y, heading = particles.pose.T
     error = odometry.dtheta * (scale[:, 1] - 1) + config.heading * draws[4]
+    if particles.heading_rate is not None:
+        error += particles.heading_rate * odometry.dt
     on = heading + error / 2  # odometry is in the old frame; its heading error grows along the step
     c, s = jnp.cos(on), jnp.sin(on)
     dx, dy = odometry.dx * scale[:, 0], odometry.dy * scale[:, 0]
@@ -72,6 +93,16 @@ def move(
     turned -= 2 * jnp.pi * jnp.round(turned / (2 * jnp.pi))  # large angles lose precision in float32
     pose = jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, turned], axis=1)
     return particles._replace(pose=pose, move=move)
+
+
+def _kept_shares(
+    slip: float, odometry: Odometry, pressed: Array | bool, count: int, key: Array, dtype: jnp.dtype
+) -> Array:
+    """[N, 2] shares of distance and turn that remain of a step's odometry: a robot that begins it in contact
+    and drives forward stands still while its wheels turn; how far it turns is unknown."""
+    lost = slip * jax.random.uniform(jax.random.fold_in(key, SLIP_STREAM), (count,), dtype)
+    kept = jnp.stack([jnp.full(count, 1 - slip, dtype), 1 - lost], axis=1)
+    return jnp.where(pressed & (odometry.dx > 0), kept, 1.0)
 
 
 def weigh(particles: Particles, likelihood: Array) -> tuple[Particles, Array]:
@@ -134,12 +165,17 @@ def copy_particles(
     dtype = particles.pose.dtype
     new = (drawn.ancestor != jnp.arange(len(drawn.ancestor), dtype=jnp.int32)).astype(dtype)[:, None]
     draws = jax.random.normal(key, (len(drawn.ancestor), 5), dtype) * new
+    rate = particles.heading_rate
+    if rate is not None:
+        changes = jax.random.normal(jax.random.fold_in(key, RATE_STREAM), new.shape[:1], dtype)
+        rate = rate[drawn.ancestor] + config.heading_rate * new[:, 0] * changes
     spread = jnp.array([config.length, config.length, config.heading], dtype)
     return Particles(
         particles.pose[drawn.ancestor] + spread[None] * draws[:, :3],
         particles.session[drawn.ancestor] + config.scale * draws[:, 3:],
         particles.move[drawn.ancestor],
         jnp.zeros_like(particles.weight),
+        rate,
     )
 
 

@@ -69,7 +69,11 @@ class ContactColumns(Settings):
     odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
-    directions: Annotated[dict[str, Degrees], Field(min_length=1)] = {"left": 45.0, "front": 0.0, "right": -45.0}
+    directions: Annotated[dict[str, Degrees], Field(min_length=1)] = {
+        "left": 45.0,
+        "front": 0.0,
+        "right": -45.0,
+    }
     """For each column the direction of what its sensor touches, degrees counter-clockwise from ahead."""
     distance: PositiveFloat = 0.17
     """Distance of what is touched from the origin of base_link, m: the radius of a round robot."""

@@ -20,7 +20,7 @@ class CreateWorldConfig(Settings):
     whiskers: WhiskersConfig = WhiskersConfig()
     """The whiskers, as in the simulator."""
     wheels: WheelsConfig = WheelsConfig()
-    """Errors of the odometry that the robot reports."""
+    """Errors of the odometry that the robot reports; of `measured` the scale errors, each for ten moves."""
     body: PositiveFloat = 0.17
     """Radius of the robot, m; at this distance from a wall the bumper is pressed."""
     bridge: BridgeEmulatorConfig = BridgeEmulatorConfig()

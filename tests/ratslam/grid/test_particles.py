@@ -328,3 +328,44 @@ def test_turning_on_the_spot_for_ever_keeps_the_heading_in_float32():
     )
     heading = np.asarray(group.pose, float)[:, 2]
     assert wrap(heading - count * float(np.float32(turn))) == pytest.approx(0, abs=0.02)
+
+
+def test_a_heading_drift_persists_and_copies_vary_it():
+    """Size: standard deviations of 20 000 drifts within 4.5 standard errors: 1e-4."""
+    count = 20_000
+    config = DriftConfig(**STEADY).model_copy(update={"heading_rate": 0.002})
+    group = particles.start(config, jax.random.key(0), count, np.dtype(float))
+    assert np.std(group.heading_rate) == pytest.approx(0.002, rel=4.5 / np.sqrt(2 * count))
+    for _ in range(3):
+        group = moved(config, group, odometry(0, 0, 0.1), jnp.bool_(True), jax.random.key(1))
+    assert np.allclose(group.pose[:, 2], 3 * (0.1 + 0.5 * group.heading_rate), atol=1e-12)
+    drawn_all = placed(np.where(np.arange(count) == 7, count, 0))
+    after = particles.copy_particles(ResamplingConfig(heading_rate=1e-4), group, drawn_all, jax.random.key(2))
+    change = np.delete(np.asarray(after.heading_rate - group.heading_rate[7]), 7)
+    assert after.heading_rate[7] == group.heading_rate[7]
+    assert np.std(change) == pytest.approx(1e-4, rel=4.5 / np.sqrt(2 * count))
+    without = particles.start(DriftConfig(**STEADY), jax.random.key(0), 3, np.dtype(float))
+    assert without.heading_rate is None
+
+
+def test_a_robot_pressed_against_a_wall_does_not_advance_and_turns_by_part_of_its_odometry():
+    """Size: mean and deviation of 10 000 uniform shares within 4.5 standard errors: 1e-4."""
+    count, key = 10_000, jax.random.key(3)
+    config = DriftConfig(**STEADY).model_copy(update={"slip": 1.0})
+    group, still = swarm(np.zeros((count, 3))), jnp.bool_(False)
+
+    def after(config, forward, pressed):
+        ahead = odometry(forward, 0, 0.4)
+        return np.asarray(moved(config, group, ahead, still, key, jnp.bool_(pressed)).pose)
+
+    pressed = after(config, 0.1, True)
+    assert np.abs(pressed[:, :2]).max() < 1e-15
+    assert (0 <= pressed[:, 2]).all()
+    assert (pressed[:, 2] <= 0.4).all()
+    assert pressed[:, 2].mean() == pytest.approx(0.2, abs=4.5 * 0.4 / np.sqrt(12 * count))
+    whole = after(DriftConfig(**STEADY), 0.1, True)
+    assert whole[0] == pytest.approx([0.1, 0.0, 0.4])
+    assert (after(config, 0.1, False) == after(DriftConfig(**STEADY), 0.1, False)).all()
+    assert (after(config, -0.1, True) == after(DriftConfig(**STEADY), -0.1, True)).all()  # it backs off
+    half = after(config.model_copy(update={"slip": 0.5}), 0.1, True)
+    assert np.hypot(*half[:, :2].T) == pytest.approx(0.05)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from robot.recordings.csv_alignment import labels_from_pairs
 from robot.recordings.csv_config import (
+    ContactColumns,
     CsvConfig,
     LabelColumns,
     MotionColumns,
@@ -25,6 +26,7 @@ from robot.recordings.csv_config import (
 from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.npz_trace import read_trace
+from robot.sources.in_memory import truncate_log
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
@@ -82,6 +84,23 @@ def test_views_of_another_file_are_assigned_to_the_nearest_row(write: Write) -> 
     samples = list(read_csv_recording(write(ODOMETRY), config))
     assert [bool(sample.reading.view_seen) for sample in samples] == [True, False, True, False]
     assert samples[2].reading.view.ravel().tolist() == [0.4, 0.5, 0.6]
+
+
+def test_contacts_lie_at_the_radius_in_the_direction_of_their_sensors(write: Write) -> None:
+    file = write("t,right,left\n0.45,0,1\n1.1,1,1\n", "bumps.csv")
+    part = ContactColumns(file=file, directions={"left": 90.0, "right": -90.0}, distance=0.2)
+    source = read_csv_recording(write(ODOMETRY), with_parts(contacts=part))
+    assert source.whiskers == 2
+    readings = [sample.reading for sample in source]
+    assert [reading.contact.tolist() for reading in readings] == [[0, 0], [1, 0], [1, 1], [0, 0]]
+    assert readings[2].point == pytest.approx(np.array([[0.0, 0.2], [0.0, -0.2]]))
+    assert not readings[1].point[1].any()
+    sensors = source.info.planar_whiskers
+    assert sensors is not None
+    assert (sensors.mounts, sensors.length) == (((0, 0, 90), (0, 0, -90)), 0.2)
+    assert not source.info.raw_whiskers
+    again = truncate_log(source, 2)
+    assert [sample.reading.contact.any() for sample in again] == [False, True]
 
 
 def test_labels_in_the_odometry_file(write: Write) -> None:
@@ -190,6 +209,7 @@ def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) ->
 
 
 RANGES = ViewColumns(max_range=8)
+LEFT = ContactColumns(directions={"left": 45.0})
 FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "column": ("t,vxs,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vxs', 'w'", "mean 'vxs'?"]),
     "key": ("stamp,vx,w\n0,1,0\n", {}, [":1: no column 't'", "name the column with table.time"]),
@@ -216,6 +236,9 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r* is nan"]),
     "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": RANGES}, [":2: r* is -1.0", "0 m or more"]),
     "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": RANGES}, ["over 800 m", "by 1000"]),
+    "bumper": ("t,vx,w,left\n0,1,0,2\n", {"contacts": LEFT}, [":2: left is 2", "1 in contact, 0 without"]),
+    "no bumper": ("t,vx,w,l\n0,1,0,0\n", {"contacts": LEFT}, ["no column 'left'", "table.contacts.directions"]),
+    "bumper nan": ("t,vx,w,left\n0,1,0,nan\n", {"contacts": LEFT}, [":2: left is nan"]),
     "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "an integer"]),
     "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n", {"truth": TruthColumns()}, [":2: y is empty"]),
 }  # fmt: skip
@@ -245,6 +268,8 @@ OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
                     [":1: no column 'score'", "did you mean 'scores'?"]),
     "both": ("t1,t2,score\n1,0.5,1\n", lambda p: {"pairs": PairColumns(file=p), "labels": LabelColumns()},
              ["both table.labels and table.pairs"]),
+    "far bumper": ("t,left,front,right\n9,0,0,0\n", lambda p: {"contacts": ContactColumns(file=p)},
+                   [":2: the nearest odometry row is 7.5 s away"]),
     "truth clock": ("t,x,y,heading\n0,0,0,0\n0,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
                     [":3: t repeats 0.0 s"]),
     "truth elsewhen": ("t,x,y,heading\n50,0,0,0\n60,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
