@@ -27,11 +27,10 @@ class DriftConfig(Settings):
     heading: NonNegativeFloat = 5e-4
     """Standard deviation of the heading error of one step, rad."""
     heading_rate: NonNegativeFloat = 0.0
-    """Standard deviation of a heading drift that is constant over the session, rad/s: wheels that are not quite
-    equal."""
+    """Standard deviation of a heading drift that is constant over the session, rad/s."""
     slip: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the forward motion that is lost in a step that begins in contact, and the largest share lost of
-    its turn: 1 for bumpers, because a wall stops the robot but not its wheels; 0 for whiskers, which bend."""
+    """Share of the forward motion that is lost in a step that begins in contact, and the largest lost share
+    of its turn. 1 for bumpers: a wall stops the robot but not its wheels; 0 for whiskers, which bend."""
 
 
 class ResamplingConfig(Settings):

@@ -15,7 +15,6 @@ from jax import lax
 from ratslam.grid.config import DriftConfig, ResamplingConfig
 from tactile.base.types import Array, Odometry
 
-
 RATE_STREAM, SLIP_STREAM = 1, 2
 """Random streams beside those of the scale errors, which stay the same where there is no drift or slip."""
 
@@ -73,8 +72,8 @@ def move(
     """The particles after an odometry reading.
 
     Args:
-        changed: bool, a new movement has begun, whose scale errors are drawn at random. pressed: bool, the step
-            begins in contact.
+        changed: bool, a new movement has begun, whose scale errors are drawn at random. pressed: bool, the
+            step begins in contact.
     """
     dtype = particles.pose.dtype
     draws = jax.random.normal(key, (5, *particles.weight.shape), dtype)

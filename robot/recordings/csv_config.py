@@ -62,18 +62,16 @@ class ViewColumns(Settings):
 
 
 class ContactColumns(Settings):
-    """Contacts of touch sensors around the robot, such as bumpers: one column a sensor, 1 in contact, else 0."""
+    """Contacts of touch sensors around the robot, such as bumpers: a column each, 1 in contact, else 0."""
 
     file: Path | None = None
-    """File of the contacts; a `*` in its name stands for the beginning of the recording's file name. Null: the
-    odometry file."""
+    """File of the contacts; a `*` in its name stands for the beginning of the recording's file name. Null:
+    the odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
-    directions: Annotated[dict[str, Degrees], Field(min_length=1)] = {
-        "left": 45.0,
-        "front": 0.0,
-        "right": -45.0,
-    }
+    directions: Annotated[dict[str, Degrees], Field(min_length=1)] = Field(
+        default={"left": 45.0, "front": 0.0, "right": -45.0}
+    )
     """For each column the direction of what its sensor touches, degrees counter-clockwise from ahead."""
     distance: PositiveFloat = 0.17
     """Distance of what is touched from the origin of base_link, m: the radius of a round robot."""

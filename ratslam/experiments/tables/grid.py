@@ -56,6 +56,8 @@ ODOMETRY_ERRORS = {
     "measured, calibrated": "as of real Creates, mean scales corrected",
 }
 _NO_WALLS, _GEOMETRIC = ({"touch": {"reports": {"walls": walls}}} for walls in ("none", "geometric"))
+_WIDE_DRIFT = {"grid": {"drift": {"heading_rate": 2e-3, "move": 0.08}}}
+"""A heading drift of 0.12 rad/min, the RMS of real Creates, and larger errors of single moves."""
 ROWS: dict[str, dict[str, Any]] = {
     "bias": {},
     "move": {},
@@ -63,7 +65,10 @@ ROWS: dict[str, dict[str, Any]] = {
     "measured": {},
     "measured, calibrated": {},
     "measured, blobs only": _NO_WALLS,
-    "measured without drift": {"grid": {"drift": {"heading_rate": 0.0}}},
+    "measured, wide drift": _WIDE_DRIFT,
+    "measured, calibrated, wide drift": _WIDE_DRIFT,
+    "bias, wide drift": _WIDE_DRIFT,
+    "move, wide drift": _WIDE_DRIFT,
     "bias, blobs only": _NO_WALLS,
     "move, blobs only": _NO_WALLS,
     "bias, geometric": _GEOMETRIC,
@@ -83,6 +88,8 @@ DEFAULT_ROWS = (
     *((world, row) for world in "AB" for row in ODOMETRY_ERRORS),
     ("A", "bias, blobs only"),
     ("A", "bias, geometric"),
+    ("A", "measured, wide drift"),
+    ("B", "measured, wide drift"),
 )
 COLUMNS = (
     "arenas, odometry errors", "dead reckoning", "ratslam", "ratio", "below half, below",

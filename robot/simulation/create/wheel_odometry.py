@@ -1,4 +1,4 @@
-"""Wheel odometry of the Create: scale errors of 5 % (Fox et al. 2012, II-B), or the errors of real Creates."""
+"""Wheel odometry of the Create: scale errors of 5 % (Fox et al. 2012, II-B), or those of real Creates."""
 
 from __future__ import annotations
 

@@ -360,7 +360,7 @@ def test_a_robot_pressed_against_a_wall_does_not_advance_and_turns_by_part_of_it
 
     pressed = after(config, 0.1, True)
     assert np.abs(pressed[:, :2]).max() < 1e-15
-    assert (0 <= pressed[:, 2]).all()
+    assert (pressed[:, 2] >= 0).all()
     assert (pressed[:, 2] <= 0.4).all()
     assert pressed[:, 2].mean() == pytest.approx(0.2, abs=4.5 * 0.4 / np.sqrt(12 * count))
     whole = after(DriftConfig(**STEADY), 0.1, True)

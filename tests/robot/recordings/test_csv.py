@@ -237,7 +237,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": RANGES}, [":2: r* is -1.0", "0 m or more"]),
     "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": RANGES}, ["over 800 m", "by 1000"]),
     "bumper": ("t,vx,w,left\n0,1,0,2\n", {"contacts": LEFT}, [":2: left is 2", "1 in contact, 0 without"]),
-    "no bumper": ("t,vx,w,l\n0,1,0,0\n", {"contacts": LEFT}, ["no column 'left'", "table.contacts.directions"]),
+    "no bumper": ("t,vx,w\n0,1,0\n", {"contacts": LEFT}, ["no column 'left'", "table.contacts.directions"]),
     "bumper nan": ("t,vx,w,left\n0,1,0,nan\n", {"contacts": LEFT}, [":2: left is nan"]),
     "label": ("t,vx,w,label\n0,1,0,1.5\n", {"labels": LabelColumns()}, [":2: label is 1.5", "an integer"]),
     "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n", {"truth": TruthColumns()}, [":2: y is empty"]),

@@ -89,7 +89,7 @@ def test_a_bias_lasts_the_session() -> None:
 
 
 def drive_as_mrclam(runs: int, first: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
-    """True motions and odometry [N, 4] of runs of 75 windows of 10 s: 0.055 m/s ahead, turning by up to 1 rad."""
+    """True motions and odometry [N, 4] of runs of 75 windows of 10 s: 0.055 m/s ahead, turns of 0.925 rad."""
     found = []
     for seed in range(first, first + runs):
         turn = np.repeat(stream(seed, "drive").choice([-0.0925, 0.0925], 75), 20)
@@ -105,8 +105,8 @@ def windows(rows: np.ndarray) -> np.ndarray:
 
 
 def analyse(motion: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """As the recordings were analysed: truth over odometry of length and turn, heading drift (rad/s), spread of
-    a window's distance as a share of it, turn residual of a window (rad)."""
+    """As the recordings were analysed: truth over odometry of length and turn, heading drift (rad/s), spread
+    of a window's distance as a share of it, turn residual of a window (rad)."""
     true, odometry = windows(motion), windows(measured)
     length = true[:, 0].sum() / odometry[:, 0].sum()
     known = odometry[:, [2, 3]]
@@ -116,7 +116,7 @@ def analyse(motion: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def test_measured_errors_are_those_of_real_creates_when_analysed_alike() -> None:
-    """Size: means and deviations of 200 runs within 4.5 standard errors; 0.002 for rounding of the published."""
+    """Size: means and deviations of 200 runs within 4.5 standard errors; 0.002 for rounding."""
     found = np.array([analyse(*run) for run in drive_as_mrclam(200)])
     length, turn, drift, spread, residual = found.T
     # Least squares underrates a scale whose regressor errs: turns by 1 + 0.143 squared.
@@ -130,7 +130,7 @@ def test_measured_errors_are_those_of_real_creates_when_analysed_alike() -> None
 
 
 def test_a_measured_heading_drifts_within_the_published_bounds() -> None:
-    """A robot that drives straight ahead reports turns: the truth drifts the other way, by -0.22 to 0.01 rad/min."""
+    """A robot that drives straight ahead reports turns; its true heading drifts the other way."""
     motion = np.tile([0.025, 0.0, 0.0, 0.5], (200, 1))
     config, kind = WheelsConfig(noise="measured"), np.ones(200, int)
     drifts = []
