@@ -40,6 +40,7 @@ def test_a_missing_recording_is_named(tmp_path: Path) -> None:
         bumps.measure(tmp_path)
 
 
+@pytest.mark.soak
 def test_the_filter_is_better_than_odometry_because_wheels_slip_at_walls(
     reference_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
