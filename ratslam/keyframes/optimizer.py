@@ -22,6 +22,11 @@ from ratslam.keyframes.linearisation import (
 from ratslam.pose_graph.block_cholesky import BlockPattern
 from tactile.base.se2 import bend_motion, correct_heading, wrap
 
+HALVINGS = 10
+"""Largest number of lengths tried of a step."""
+ROUNDING = 1e-9
+"""Rise of the cost, as a share of it, that rounding may cause."""
+
 
 class OdometryChain(NamedTuple):
     """Odometry between consecutive keyframes.
@@ -224,13 +229,26 @@ class System:
             step = equations.step()
             if step is None:
                 break
-            moved = fit.poses + step[0]
-            moved[:, 2] = wrap(moved[:, 2])
-            bias, turn_error = fit.bias + step[1][0], fit.turn_error + sum(step[1][1:])
-            fit = fit._replace(poses=moved, bias=float(bias), turn_error=float(turn_error))
-            if np.abs(step[0]).max(initial=0.0) < tolerance:
+            fit, share = self._descend(fit, *step)
+            if share * np.abs(step[0]).max(initial=0.0) < tolerance:
                 break
         return fit
+
+    def _descend(self, fit: MapFit, poses: np.ndarray, calibration: np.ndarray) -> tuple[MapFit, float]:
+        """The fit after a Gauss-Newton step [N, 3] and [K], halved until it does not raise the robust cost,
+        and the share of the step; 0 for a step that no halving mends. Far from the solution a whole step can
+        raise the cost by orders of magnitude: turning a long chain moves its end along an arc and not along
+        the tangent (Nocedal & Wright 2006, section 3.1)."""
+        cost, share = self.robust_cost(fit), 1.0
+        for _ in range(HALVINGS):
+            moved = fit.poses + share * poses
+            moved[:, 2] = wrap(moved[:, 2])
+            bias, turn_error = share * calibration[0], share * sum(calibration[1:])
+            after = MapFit(moved, float(fit.bias + bias), fit.weights, float(fit.turn_error + turn_error))
+            if self.robust_cost(after) <= cost * (1 + ROUNDING) + ROUNDING:
+                return after, share
+            share /= 2
+        return fit, 0.0
 
     def robust_cost(self, fit: MapFit) -> float:
         """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of
