@@ -7,6 +7,7 @@ kernel); Kuemmerle et al. 2011 (the error); the calibration and the weights by s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from typing import NamedTuple
 
@@ -23,9 +24,9 @@ from ratslam.pose_graph.block_cholesky import BlockPattern
 from tactile.base.se2 import bend_motion, correct_heading, wrap
 
 HALVINGS = 10
-"""Largest number of lengths tried of a step."""
+"""Number of lengths tried of a step."""
 ROUNDING = 1e-9
-"""Rise of the cost, as a share of it, that rounding may cause."""
+"""Share by which rounding may raise the cost of a solved map."""
 
 
 class OdometryChain(NamedTuple):
@@ -132,9 +133,22 @@ def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float 
 
     Returns:
         the fit after the first step that changes every pose by less than the tolerance (m, rad), or after
-        `iterations` steps; the last fit before the equations become singular.
+        `iterations` steps; the last fit before the equations become singular. Steps that together raise the
+        cost are taken anew, each halved until it does not: a closure that turns a long chain by radians moves
+        its end along an arc, and the tangent can lead far away (Nocedal & Wright 2006, section 3.1).
     """
     return System(problem).solve(start, iterations, tolerance)
+
+
+Advance = Callable[[MapFit, np.ndarray, np.ndarray], tuple[MapFit, float]]
+"""The fit after a share of a step of the poses [N, 3] and of the calibration [K], and that share."""
+
+
+def _whole_step(fit: MapFit, poses: np.ndarray, calibration: np.ndarray) -> tuple[MapFit, float]:
+    moved = fit.poses + poses
+    moved[:, 2] = wrap(moved[:, 2])
+    bias, turn_error = fit.bias + calibration[0], fit.turn_error + sum(calibration[1:])
+    return fit._replace(poses=moved, bias=float(bias), turn_error=float(turn_error)), 1.0
 
 
 def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.ndarray]:
@@ -222,32 +236,33 @@ class System:
     def solve(self, start: MapFit, iterations: int, tolerance: float = 1e-4) -> MapFit:
         """See `solve`."""
         weights = np.ones(len(self._problem.closures.scale))
-        fit = MapFit(np.array(start.poses, float), start.bias, weights, start.turn_error)
+        first = MapFit(np.array(start.poses, float), start.bias, weights, start.turn_error)
+        fit = self._iterate(first, iterations, tolerance, _whole_step)
+        if self.robust_cost(fit) <= self.robust_cost(first) * (1 + ROUNDING):
+            return fit
+        return self._iterate(first, iterations, tolerance, self._descend)
+
+    def _iterate(self, fit: MapFit, iterations: int, tolerance: float, advance: Advance) -> MapFit:
         for _ in range(iterations):
             equations = self.linearise(fit)
             fit = fit._replace(weights=equations.weights)
             step = equations.step()
             if step is None:
                 break
-            fit, share = self._descend(fit, *step)
+            fit, share = advance(fit, *step)
             if share * np.abs(step[0]).max(initial=0.0) < tolerance:
                 break
         return fit
 
     def _descend(self, fit: MapFit, poses: np.ndarray, calibration: np.ndarray) -> tuple[MapFit, float]:
-        """The fit after a Gauss-Newton step [N, 3] and [K], halved until it does not raise the robust cost,
-        and the share of the step; 0 for a step that no halving mends. Far from the solution a whole step can
-        raise the cost by orders of magnitude: turning a long chain moves its end along an arc and not along
-        the tangent (Nocedal & Wright 2006, section 3.1)."""
-        cost, share = self.robust_cost(fit), 1.0
-        for _ in range(HALVINGS):
-            moved = fit.poses + share * poses
-            moved[:, 2] = wrap(moved[:, 2])
-            bias, turn_error = share * calibration[0], share * sum(calibration[1:])
-            after = MapFit(moved, float(fit.bias + bias), fit.weights, float(fit.turn_error + turn_error))
-            if self.robust_cost(after) <= cost * (1 + ROUNDING) + ROUNDING:
+        """The fit after a Gauss-Newton step, halved until it does not raise the robust cost, and the share of
+        the step; the same fit and 0 where no halving helps."""
+        cost = self.robust_cost(fit)
+        for halvings in range(HALVINGS):
+            share = 0.5**halvings
+            after, _ = _whole_step(fit, share * poses, share * calibration)
+            if self.robust_cost(after) <= cost:
                 return after, share
-            share /= 2
         return fit, 0.0
 
     def robust_cost(self, fit: MapFit) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from ratslam.experiments.real.figure import RealFigure
 from tactile.base.atomic_write import write_text_atomically
 
-NAMES: tuple[str, ...] = ("contact", "drift", "fit", "tangent", "likeness", "walk", "bumps")
+NAMES: tuple[str, ...] = ("contact", "drift", "fit", "tangent", "likeness", "walk", "create", "bumps")
 """The figures: names of modules of this room."""
 
 

@@ -232,3 +232,20 @@ def test_a_single_frame_is_a_map():
     )
     assert np.allclose(fit.poses, START[None], rtol=0, atol=1e-14)
     assert np.isfinite(fit.bias)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_step_raises_the_cost(seed):
+    """A closure that turns a long chain by radians, where a whole Gauss-Newton step would."""
+    stream = np.random.default_rng(seed)
+    motion = np.zeros((300, 3))
+    motion[:, 0], motion[:, 2] = 0.1, stream.normal(0, 0.3, 300)
+    chain = chained(motion)
+    closures = closed([(3 + k, 296 + k) for k in range(4)], [2.0] * 4, [0] * 4, [20.0])
+    system = System(MapProblem(chain, closures, PRIORS[1]))
+    fit = from_odometry(chain)
+    costs = [system.robust_cost(fit)]
+    for _ in range(8):
+        fit = system.solve(fit, 1)
+        costs.append(system.robust_cost(fit))
+    assert np.diff(costs).max() <= 1e-6 * costs[0]
