@@ -75,11 +75,12 @@ def measure_create(folder: Path) -> CreateResult:
         variants[name] = measure_variant(run)
         if name == DEFAULT:
             default = run
-    error = np.unwrap(default.odometry[:, 2] - default.truth[:, 2])
+    known = np.isfinite(default.truth).all(axis=1)
+    error = np.unwrap((default.odometry - default.truth)[known, 2])
     return CreateResult(
         variants=variants,
         true_turns=true_turns_ate(default),
-        drift=float(np.nanmax(error) - np.nanmin(error)),
+        drift=float(np.ptp(error)),
         latency=float(np.median(depth["latency"])),
         paths=_aligned_paths(default),
         walls=segments,
@@ -108,8 +109,7 @@ def create_table(result: CreateResult) -> list[str]:
 
 
 CAVEATS = (
-    "Not shown: that nine rays can place this robot to 0.5 m. Most candidates are wrong, because many pieces "
-    "of wall look alike to nine rays. The robot does not come back to where it began, so even all true "
+    "Not shown: that nine rays can place this robot to 0.5 m. The robot does not come back to where it began, so even all true "
     "revisits bound the error only as the last column says. Odometry turns away by {drift:.1f} rad "
     "over the session. A depth reading is {latency:.2f} s older than its time (median of the file's column)."
 )
@@ -171,9 +171,14 @@ def draw_create(result: CreateResult, png: Path) -> None:
     room = add_axes(figure, 0.62, 3.0, 7.0, 4.1)
     for wall in result.walls:
         room.plot(wall[::2], wall[1::2], color=INK, lw=1.6)
-    for name, colour in (("odometry", GREY), ("map", VERMILLION), ("truth", BLUE)):
+    doubt = result.variants[DEFAULT].doubt
+    for name, colour, label in (
+        ("odometry", GREY, "odometry"),
+        ("map", VERMILLION, f"map (doubt {doubt:.2f})"),
+        ("truth", BLUE, "truth"),
+    ):
         path = result.paths[name]
-        room.plot(path[:, 0], path[:, 1], color=colour, lw=0.9, label=name)
+        room.plot(path[:, 0], path[:, 1], color=colour, lw=0.9, label=label)
     room.set_aspect("equal")
     room.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     name_axes(room, "x (m)", "y (m)")

@@ -117,8 +117,10 @@ def true_revisits(graph: KeyframeGraph, truth: np.ndarray) -> Iterator[Candidate
 
 def true_turns_ate(run: RecordingRun) -> float:
     """ATE of odometry whose turns are replaced by the true ones, m: what is left if headings were known."""
-    motion = between(run.odometry[:-1], run.odometry[1:])
+    known = np.isfinite(run.truth).all(axis=1)
+    odometry, truth = run.odometry[known], run.truth[known]
+    motion = between(odometry[:-1], odometry[1:])
     forward = motion[:, 0] * np.cos(motion[:, 2] / 2) + motion[:, 1] * np.sin(motion[:, 2] / 2)
-    turn = wrap(np.diff(run.truth[:, 2]))
+    turn = wrap(np.diff(truth[:, 2]))
     driven = np.stack([forward * np.cos(turn / 2), forward * np.sin(turn / 2), turn], axis=1)
-    return ate(np.concatenate([np.zeros((1, 3)), integrate(driven)]), run.truth)
+    return ate(np.concatenate([np.zeros((1, 3)), integrate(driven)]), truth)
