@@ -109,9 +109,10 @@ def create_table(result: CreateResult) -> list[str]:
 
 
 CAVEATS = (
-    "Not shown: that nine rays can place this robot to 0.5 m. The robot does not come back to where it began, so even all true "
-    "revisits bound the error only as the last column says. Odometry turns away by {drift:.1f} rad "
-    "over the session. A depth reading is {latency:.2f} s older than its time (median of the file's column)."
+    "Not shown: that nine rays can place this robot to 0.5 m. The robot does not come back to where it began, "
+    "so even all true revisits bound the error only as the last column says. Odometry turns away by "
+    "{drift:.1f} rad over the session. A depth reading is {latency:.2f} s older than its time (median of the "
+    "file's column)."
 )
 
 
