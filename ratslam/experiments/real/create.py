@@ -109,7 +109,7 @@ def create_table(result: CreateResult) -> list[str]:
 
 
 CAVEATS = (
-    "Not shown: that nine rays can place this robot to 0.5 m. The robot does not come back to where it began, "
+    "Not shown: that nine rays can place this robot to 0.5 m. The robot does not return to where it began, "
     "so even all true revisits bound the error only as the last column says. Odometry turns away by "
     "{drift:.1f} rad over the session. A depth reading is {latency:.2f} s older than its time (median of the "
     "file's column)."
@@ -190,7 +190,7 @@ def draw_create(result: CreateResult, png: Path) -> None:
         (result.distances.contact, VERMILLION, "first reading of a contact"),
     ):
         weights = np.full(len(values), 1 / len(values))
-        below.hist(values, bins, weights=weights, color=colour, alpha=0.8, label=label)
+        below.hist(values, bins.tolist(), weights=weights, color=colour, alpha=0.8, label=label)
     below.legend(frameon=False, fontsize=9)
     name_axes(below, "true distance from the robot to the nearest wall (m)", "share")
     figure.savefig(png)
