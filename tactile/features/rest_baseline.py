@@ -21,14 +21,16 @@ class RestBaselineConfig(Settings):
 
     rest_time: PositiveFloat = 0.02
     """Time from the beginning of a cycle in which a whisker is at rest, s."""
-    gain: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Share of the way to its level at rest that the baseline goes in a cycle."""
+    gain: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the way to its level at rest that the baseline goes in a cycle. Below 1 the noise of the rest is
+    averaged over cycles, but the baseline lags behind a drift."""
     free_sds: PositiveFloat = 6.0
     """A whisker further than this from its baseline at rest touches something, or is bent, and its baseline
-    stands still; in standard deviations of the free deflection."""
+    stands still; in standard deviations of the free deflection. The distance grows with the root of the
+    cycles since the whisker was last free, as a random walk does."""
     bent_cycles: PositiveInt = 40
     """A whisker that is away from its baseline at rest for this many cycles on end counts as bent: it has no
-    signal until it returns."""
+    signal until it returns, and the distance grows no more."""
 
 
 class RestBaseline(NamedTuple):
@@ -59,7 +61,8 @@ def follow_baseline(
         return baseline
     rest = cycle.deflection[:count].mean(axis=0) - calibration.mean - baseline.offset
     known = calibration.alive & np.isfinite(rest).all(axis=-1)
-    free = known & (np.abs(rest) <= config.free_sds * calibration.sd).all(axis=-1)
+    wandering = np.sqrt(1.0 + np.minimum(baseline.away, config.bent_cycles))
+    free = known & (np.abs(rest) <= config.free_sds * wandering[:, None] * calibration.sd).all(axis=-1)
     return RestBaseline(
         offset=baseline.offset + np.where(free[:, None], config.gain * rest, 0.0),
         away=np.where(known, np.where(free, 0, baseline.away + 1), baseline.away),

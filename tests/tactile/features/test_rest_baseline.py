@@ -65,6 +65,19 @@ def test_a_bent_whisker_has_no_signal_until_it_returns() -> None:
     assert np.delete(alive, 5, axis=1).all()
 
 
+def test_a_whisker_that_drifted_unseen_is_free_again() -> None:
+    """A whisker in contact at rest for 20 cycles, whose baseline drifts meanwhile by more than the allowance
+    of one cycle, is not lost: a random walk explains where it is found."""
+    frontend = Frontend(TouchConfig(), FREE)
+    pressed, drifted = np.zeros((COUNT, 2)), np.zeros((COUNT, 2))
+    pressed[5, 0], drifted[5, 0] = 200 * SD, 9 * SD
+    offsets = [*[pressed] * 20, *[drifted] * 10]
+    whisks = [frontend.features(cycle(k, offset)) for k, offset in enumerate(offsets)]
+    assert all(whisk.contact[5] for whisk in whisks[:20])
+    assert not any(whisk.contact[5] for whisk in whisks[20:])
+    np.testing.assert_allclose(frontend.baseline.offset[5, 0], 9 * SD, atol=SD)
+
+
 def test_it_continues_from_its_arrays_bit_for_bit() -> None:
     cycles = [cycle(k, 0.3 * SD * k) for k in range(20)]
     one, other = (Frontend(TouchConfig(), FREE) for _ in range(2))
