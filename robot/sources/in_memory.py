@@ -25,7 +25,7 @@ class InMemorySource(ClosedSource):
         label: [N] given place label, -1 for none.
         truth: [N, 3] (x m, y m, heading rad), rows of NaN where unknown; None if never known.
         info: devices, world and origin.
-        alive: [W] whether each whisker works; empty for cameras, lasers and given labels.
+        alive: [W] or [N, W] whether each whisker works; empty for cameras, lasers and given labels.
         contact: [N, W] bool, whiskers in contact, and point: [N, W, 2] contact points in base_link, m, zero
             without contact; None for a source without contacts.
     """
@@ -58,23 +58,22 @@ class InMemorySource(ClosedSource):
 
     @property
     def whiskers(self) -> int:
-        return len(self.alive)
+        return self.alive.shape[-1]
 
     @property
     def length(self) -> int:
         return len(self.time)
 
     def __iter__(self) -> Iterator[Sample]:
-        shape = self.view_shape
-        for time, motion, view, seen, label, truth, touch in zip(
-            self.time.tolist(), self.motion, self.views, self.seen, self.label, self._truths(),
-            self._contacts(), strict=True,
-        ):  # fmt: skip
+        shape, alive = self.view_shape, np.broadcast_to(self.alive, (self.length, self.whiskers))
+        columns = (self.time.tolist(), self.motion, self.views, self.seen, self.label)
+        rows = zip(*columns, alive, self._truths(), self._contacts(), strict=True)
+        for time, motion, view, seen, label, works, truth, touch in rows:
             picture = view if seen else None
             reading = observation(
                 Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
             )
-            yield Sample(time, reading._replace(alive=self.alive.copy(), **touch), truth)
+            yield Sample(time, reading._replace(alive=works.copy(), **touch), truth)
 
     def _contacts(self) -> Iterator[dict[str, np.ndarray]]:
         if self.contact is None or self.point is None:
@@ -94,17 +93,12 @@ def load_into_memory(source: Source) -> InMemorySource:
     """A source of observations, read into memory; contact points are not kept.
 
     Raises:
-        InputError: some readings are whisker data, there are no samples, or a whisker changes its `alive`
-            flag.
+        InputError: some readings are whisker data, or there are no samples.
     """
     samples = list(source)
     readings = [sample.reading for sample in samples if isinstance(sample.reading, Observation)]
     if len(readings) < len(samples) or not samples:
         raise InputError(source.name, "whisker readings" if samples else "no samples", "observations")
-    alive = readings[0].alive
-    if any((reading.alive != alive).any() for reading in readings):
-        found = "whiskers whose `alive` flag changes"
-        raise InputError(source.name, found, "a constant flag for each whisker")
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     return InMemorySource(
@@ -118,7 +112,7 @@ def load_into_memory(source: Source) -> InMemorySource:
         label=np.array([reading.label for reading in readings], np.int32),
         truth=None if np.isnan(truth).all() else truth,
         info=source.info.model_copy(update={"raw_whiskers": False}),
-        alive=alive,
+        alive=np.array([reading.alive for reading in readings], bool),
     )
 
 
@@ -126,4 +120,6 @@ def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
     """The first steps of a source in memory; its digest is the original one followed by their number."""
     columns = ("time", "motion", "moved", "views", "seen", "label", "truth", "contact", "point")
     cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
+    if log.alive.ndim == 2:
+        cut["alive"] = log.alive[:steps]
     return replace(log, digest=f"{log.digest}[:{steps}]", **cut)

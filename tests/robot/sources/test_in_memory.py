@@ -1,0 +1,38 @@
+"""Sources in memory: whiskers that stop working and work again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robot.sources.in_memory import InMemorySource, load_into_memory, truncate_log
+
+ROWS, WHISKERS = 6, 4
+
+
+def source(alive: np.ndarray) -> InMemorySource:
+    return InMemorySource(
+        name="test",
+        digest="0",
+        time=np.arange(ROWS, dtype=float),
+        motion=np.zeros((ROWS, 4)),
+        moved=np.ones(ROWS, bool),
+        views=np.zeros((ROWS, 1, WHISKERS, 1)),
+        seen=np.ones(ROWS, bool),
+        label=np.full(ROWS, -1, np.int32),
+        alive=alive,
+    )
+
+
+def test_a_whisker_may_be_bent_for_a_part_of_the_session() -> None:
+    alive = np.ones((ROWS, WHISKERS), bool)
+    alive[2:4, 1] = False
+    log = load_into_memory(source(alive))
+    assert log.whiskers == WHISKERS
+    np.testing.assert_array_equal([sample.reading.alive for sample in log], alive)
+    np.testing.assert_array_equal([sample.reading.alive for sample in truncate_log(log, 3)], alive[:3])
+
+
+def test_one_row_of_flags_holds_for_all() -> None:
+    flags = np.array([True, False, True, True])
+    for sample in source(flags):
+        np.testing.assert_array_equal(sample.reading.alive, flags)
