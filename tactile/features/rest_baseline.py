@@ -22,8 +22,8 @@ class RestBaselineConfig(Settings):
     rest_time: PositiveFloat = 0.02
     """Time from the beginning of a cycle in which a whisker is at rest, s."""
     gain: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Share of the way to its level at rest that the baseline goes in a cycle. Below 1 the noise of the rest is
-    averaged over cycles, but the baseline lags behind a drift."""
+    """Share of the way to its level at rest that the baseline goes in a cycle. Below 1 the noise of the rest
+    is averaged over cycles, but the baseline lags behind a drift."""
     free_sds: PositiveFloat = 6.0
     """A whisker further than this from its baseline at rest touches something, or is bent, and its baseline
     stands still; in standard deviations of the free deflection. The distance grows with the root of the
