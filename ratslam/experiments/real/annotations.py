@@ -1,4 +1,4 @@
-"""Stretches of a record that people marked as contact, free or unclear, and scores against them."""
+"""Stretches of a record marked as contact, free or unclear by annotators, and scores against them."""
 
 from __future__ import annotations
 

@@ -11,6 +11,17 @@ from tactile.base.atomic_write import write_text_atomically
 
 NAMES: tuple[str, ...] = ("contact", "drift", "fit", "tangent", "likeness", "walk", "create", "bumps")
 """The figures: names of modules of this room."""
+UNPROVEN = """\
+## What these recordings do not show
+- No public recording has whiskers, revisits and true positions together. So no map here is made by real
+  whiskers: the images of the walk were recorded, its poses and odometry are simulated.
+- No real head was whisking. Contact was measured on passive magnetic whiskers of one arm, in a reach of 12 s;
+  the rest angle and the radii of a head were fitted on simulated heads only.
+- No whisker of these recordings is known to be bent for good, and no touch recording is longer than a minute:
+  hours of drift are made of the drift of that one reach.
+- The Create is one drive of nine minutes in one room.
+- No session was driven live: arm, head and Create ran as emulators.
+"""
 
 
 def find_figure(name: str) -> RealFigure:
@@ -38,4 +49,5 @@ def reproduce_real(names: Sequence[str], data: Path, output: Path) -> Iterator[s
         lines = [f"## {figure.title}", "", *figure.table(result), "", shown, ""]
         yield from lines
         page += lines
-        write_text_atomically(output / "real.md", "\n".join(page))
+        write_text_atomically(output / "real.md", "\n".join([*page, UNPROVEN]))
+    yield UNPROVEN
