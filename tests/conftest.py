@@ -15,10 +15,11 @@ import pytest
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 
-if "RATSLAM_TEST_CACHE" not in os.environ:
-    # Workers share compiled kernels; every run of the suite starts with an empty cache.
-    os.environ["RATSLAM_TEST_CACHE"] = tempfile.mkdtemp(prefix="ratslam-tests-")
-    atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_CACHE"], ignore_errors=True)
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # Workers share compiled kernels and runs; every run of the suite starts without any.
+    os.environ["RATSLAM_TEST_FOLDER"] = tempfile.mkdtemp(prefix="ratslam-tests-")
+    atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_FOLDER"], ignore_errors=True)
+os.environ.setdefault("RATSLAM_TEST_CACHE", os.environ["RATSLAM_TEST_FOLDER"])
 # Programs that tests start cache their kernels there too, apart from the user's.
 os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 
@@ -31,6 +32,26 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", f"{os.environ['XDG_CACHE_HOME']}/ratslam/jax")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+FEWER_PASSES = "--xla_cpu_use_fusion_emitters=false"
+"""Compiles a session's kernel in about 60 % of the time; its steps take a third longer. Most tests compile
+more than they compute. Soak and benchmarks compile as users do, and so do the programs that tests start with
+the environment of `tests.helpers.environment`."""
+LONGEST = (
+    "tests/ratslam/live/test_complete_session.py",
+    "tests/ratslam/live/test_create_session.py",
+    "tests/ratslam/live/test_head_faults.py",
+    "tests/ratslam/backends/test_conformance.py",
+    "tests/ratslam/live/test_installed_backend.py",
+    "tests/ratslam/examples/test_examples.py",
+    "tests/ratslam/experiments/studies/test_growth.py",
+    "tests/ratslam/experiments/studies/test_study_runner.py",
+    "tests/ratslam/pipeline/test_report_page.py",
+    "tests/test_docs.py",
+    "tests/ratslam/live/test_kills.py",
+    "tests/ratslam/live/test_arm_faults.py",
+)
+"""Modules that begin first, so that no worker is left alone with one at the end."""
 
 settings.register_profile(
     "ratslam", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -45,6 +66,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--part", default="", metavar="K/N", help="run part K of N of the soak")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    # JAX reads the flags when it first computes; workers and programs that tests start inherit them.
+    flags = os.environ["XLA_FLAGS"]
+    as_users_do = config.getoption("--soak") or config.getoption("--benchmark-only")
+    if not as_users_do and FEWER_PASSES not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {FEWER_PASSES}"
+
+
 @pytest.hookimpl(trylast=True)  # after benchmarks/conftest.py has marked its tests
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     soak = config.getoption("--soak")
@@ -54,7 +83,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         chosen = [item for item in chosen if _module(item) in modules]
     left = set(items) - set(chosen)
     config.hook.pytest_deselected(items=[item for item in items if item in left])
-    items[:] = chosen
+    order = {module: k for k, module in enumerate(LONGEST)}
+    items[:] = sorted(chosen, key=lambda item: order.get(_module(item), len(order)))
 
 
 def modules_of_part(part: str, modules: set[str]) -> set[str]:

@@ -70,7 +70,7 @@ def test_trials_of_other_seeds_and_noise_equal_single_sessions():
         backend.kernel,
         jax.tree.map(lambda *rows: jnp.stack(rows), *states),
         jax.tree.map(lambda *rows: np.stack(rows), *(stack(rows) for rows in courses)),
-        block=2,
+        block=3,
     )
     for seed, rows in enumerate(courses):
         _, estimate, _ = drive(backend, initial(backend, seed), rows)

@@ -20,6 +20,7 @@ from ratslam.config.run_config import load_config
 from ratslam.pipeline.run import process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.source import open_observations
+from tests.helpers.square_run import copy_square_run
 
 ROOT = Path(__file__).parents[3]
 FILES = {
@@ -33,9 +34,7 @@ SQUARE = str(ROOT / "configs" / "square.yaml")
 @pytest.fixture(scope="module")
 def square(tmp_path_factory):
     """A finished run."""
-    path = tmp_path_factory.mktemp("square") / "run"
-    assert main(["run", SQUARE, "-o", str(path)]) == 0
-    return path
+    return copy_square_run(tmp_path_factory.mktemp("square") / "run")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +43,9 @@ def corridor(tmp_path_factory):
     folder = tmp_path_factory.mktemp("corridor")
     config = folder / "long.yaml"
     golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
-    config.write_text(f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 25, cell_size: 0.02}}\n")
+    config.write_text(
+        f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 25, cell_size: 0.02, engine: dense}}\n"
+    )
     assert main(["run", str(config), "-o", str(folder / "whole")]) == 0
     return config, folder / "whole"
 

@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 
 from ratslam.cli import main
+from tests.helpers.square_run import copy_square_run
 
 ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("runs") / "square"
-    assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(directory)]) == 0
-    return directory
+    return copy_square_run(tmp_path_factory.mktemp("runs") / "square")
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from ratslam.export.formats import export_run
 from ratslam.pose_graph.io import read_g2o
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, wrap
+from tests.helpers.square_run import copy_square_run
 
 ROOT = Path(__file__).parents[3]
 GRID = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
@@ -34,8 +35,7 @@ GRID = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.
 @pytest.fixture(scope="module")
 def square(tmp_path_factory):
     """A finished run with closures, views, and a truth that is known at two of three steps."""
-    path = tmp_path_factory.mktemp("square") / "run"
-    assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(path)]) == 0
+    path = copy_square_run(tmp_path_factory.mktemp("square") / "run")
     lines = (path / "truth.tum").read_text().splitlines(keepends=True)
     (path / "truth.tum").write_text("".join(line for k, line in enumerate(lines) if k % 3))
     return path

@@ -10,6 +10,11 @@ import nbformat
 import pytest
 
 ROOT = Path(__file__).parents[3]
+MAZE = """
+simulation: {path: {explore: 5}}
+backend: classic
+pose_cells: {cells_xy: 11, cells_heading: 12}
+"""
 CELL = """
 import ratslam
 config = ratslam.load_config("maze.yaml")
@@ -21,7 +26,7 @@ def test_a_cell_shows_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
-    (tmp_path / "maze.yaml").write_text("simulation: {path: {explore: 5}}\nbackend: classic\n")
+    (tmp_path / "maze.yaml").write_text(MAZE)
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
     folder = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, kernel_name="python3", resources=folder).execute()

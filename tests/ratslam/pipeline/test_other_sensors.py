@@ -24,6 +24,7 @@ SESSION = """
 SHORT = """
     maze: {columns: 3, rows: 3, loop: 8}
     path: {circuits: CCC}
+pose_cells: {cells_xy: 11, engine: dense}
 """
 HEAD = """
 touch:

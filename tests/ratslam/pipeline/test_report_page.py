@@ -17,6 +17,7 @@ from evaluation.artifacts.closure_views import read_closure_views
 from evaluation.report.palette import PALETTE
 from ratslam.cli import main
 from ratslam.pipeline.report import write_report
+from tests.helpers.square_run import copy_square_run
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="of the extra [dev]")
 playwright = pytest.importorskip("playwright.sync_api", reason="of the extra [dev]")
@@ -34,8 +35,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH")
 @pytest.fixture(scope="module")
 def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with closures and truth, all but some of its closures removed."""
-    path = tmp_path_factory.mktemp("square") / "square"
-    assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(path)]) == 0
+    path = copy_square_run(tmp_path_factory.mktemp("square") / "square")
     lines = (path / "closures.csv").read_text().splitlines(keepends=True)
     verdicts = [line.replace("accepted", "open") if k % 3 == 0 else line for k, line in enumerate(lines)]
     (path / "closures.csv").write_text("".join(verdicts[: CLOSURES + 1]))

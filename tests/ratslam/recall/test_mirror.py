@@ -160,7 +160,8 @@ def backend_of(kind):
 @cache
 def engine(kind):
     backend = backend_of(kind)
-    return backend, jax.jit(backend.kernel)
+    # Low optimisation, because compilation dominates.
+    return backend, jax.jit(backend.kernel, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def reflected(kind, view):

@@ -23,6 +23,7 @@ from ratslam.viewer import target as targets
 from ratslam.viewer.observer import Viewer
 from ratslam.viewer.target import prepare_target
 from tactile.base.errors import InputError
+from tests.helpers.square_run import copy_square_run
 
 ROOT = Path(__file__).parents[3]
 SQUARE = str(ROOT / "configs" / "square.yaml")
@@ -31,9 +32,7 @@ SQUARE = str(ROOT / "configs" / "square.yaml")
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     """A run without a view."""
-    path = tmp_path_factory.mktemp("plain") / "run"
-    assert main(["run", SQUARE, "-o", str(path)]) == 0
-    return path
+    return copy_square_run(tmp_path_factory.mktemp("plain") / "run")
 
 
 @pytest.fixture(scope="module")

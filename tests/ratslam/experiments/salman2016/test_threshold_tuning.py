@@ -37,6 +37,7 @@ simulation:
   maze: {columns: 3, rows: 2, loop: 6}
   path: {circuits: CCC}
   odometry: {noise: none}
+pose_cells: {cells_xy: 11, cells_heading: 12}
 """
 
 

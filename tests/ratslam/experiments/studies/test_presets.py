@@ -29,7 +29,8 @@ simulation: {maze: {columns: 3, rows: 2, loop: 6}, path: {circuits: C}, whisking
 pose_cells: {cells_xy: 11, cells_heading: 12}
 backend: classic
 """
-TINY = "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: CC}, raw: true}\n"
+CELLS = "pose_cells: {cells_xy: 11, cells_heading: 12}\n"
+TINY = "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: CC}, raw: true}\n" + CELLS
 
 
 def preset(name, path=SQUARE, *overrides, **options):
@@ -91,9 +92,10 @@ def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
 
 
 def test_both_backends_see_the_same_session(tmp_path, capsys):
-    (tmp_path / "c.yaml").write_text("create_simulation: {reports: 40, seed: 3}\nbackend: classic\n")
-    quick = ["grid.particles=8", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]
-    command = ["study", "--preset", "backends", str(tmp_path / "c.yaml"), *(f"--set={one}" for one in quick)]
+    quick = ["create_simulation.reports=40", "backend=classic", "pose_cells.cells_xy=11"]
+    quick += ["pose_cells.cells_heading=12"]
+    config = str(ROOT / "configs" / "create_arena.yaml")
+    command = ["study", "--preset", "backends", config, *(f"--set={one}" for one in quick)]
     assert main([*command, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
     content = json.loads((tmp_path / "out" / "table.json").read_text())
     rat, grid, reckoned = content["rows"]

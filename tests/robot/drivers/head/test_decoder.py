@@ -34,9 +34,7 @@ def stream(count: int, first: int = 0, shape: tuple[int, int] = (18, 3)) -> tupl
     return pack_frames(number, 500 * number, np.zeros(count), values), values
 
 
-@settings(max_examples=600)
-@given(streams())
-def test_every_prefix_agrees_with_the_reference_decoder(drawn):
+def check_prefixes(drawn):
     data, cuts, shape = drawn
     decoder, got = Decoder(*shape), []
     for start, end in itertools.pairwise([0, *cuts, len(data)]):
@@ -48,6 +46,19 @@ def test_every_prefix_agrees_with_the_reference_decoder(drawn):
         size = 20 + 2 * shape[0] * shape[1]
         whole = decoder.counts.good + decoder.counts.duplicates
         assert end == size * whole + decoder.counts.skipped_bytes + decoder.pending
+
+
+@settings(max_examples=150)
+@given(streams())
+def test_every_prefix_agrees_with_the_reference_decoder(drawn):
+    check_prefixes(drawn)
+
+
+@pytest.mark.soak
+@settings(max_examples=3000)
+@given(streams())
+def test_every_prefix_of_many_streams_agrees_with_the_reference_decoder(drawn):
+    check_prefixes(drawn)
 
 
 @given(st.binary(max_size=400), st.integers(1, 7))

@@ -24,11 +24,17 @@ def few():
         yield
 
 
-@settings(max_examples=1000)
-@given(
-    st.sampled_from([0, 3, 2**32 - 5]), st.lists(STEPS, max_size=60), st.lists(st.integers(0, 60), max_size=6)
-)
-def test_all_orders_of_arrival(few, first, steps, cuts):
+def arrivals(examples):
+    """Decorates a law of sequence numbers in any order, cut into blocks anywhere."""
+    drawn = given(
+        st.sampled_from([0, 3, 2**32 - 5]),
+        st.lists(STEPS, max_size=60),
+        st.lists(st.integers(0, 60), max_size=6),
+    )
+    return lambda law: settings(max_examples=examples)(drawn(law))
+
+
+def check_arrivals(first, steps, cuts):
     raw = [(first + step) % 2**32 for step in itertools.accumulate(steps)]
     mine, streams = SequenceUnwrapper(), []
     for block in np.split(np.array(raw, np.uint32), sorted(cut for cut in cuts if cut <= len(raw))):
@@ -37,3 +43,14 @@ def test_all_orders_of_arrival(few, first, steps, cuts):
         assert [n if taken else None for n, taken in zip(number.tolist(), new.tolist(), strict=True)] == full
         assert mine.missing == sum(stream.missing for stream in streams)
         assert mine.streams == len(streams)
+
+
+@arrivals(250)
+def test_all_orders_of_arrival(few, first, steps, cuts):
+    check_arrivals(first, steps, cuts)
+
+
+@pytest.mark.soak
+@arrivals(5000)
+def test_many_orders_of_arrival(few, first, steps, cuts):
+    check_arrivals(first, steps, cuts)
