@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def copy_square_run(directory: Path) -> Path:
-    """A copy of the finished run, which a test may spoil; returns its directory."""
+    """A copy of the finished run `run`, which a test may spoil; returns its directory."""
     folder = Path(os.environ["RATSLAM_TEST_FOLDER"])
     made = folder / "square"
     with (folder / "square.lock").open("w") as lock:
@@ -21,6 +21,7 @@ def copy_square_run(directory: Path) -> Path:
         if not made.exists():
             partial = folder / "square.partial"
             shutil.rmtree(partial, ignore_errors=True)
-            assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(partial)]) == 0
+            # The name of the directory is the title of its pictures.
+            assert main(["run", str(ROOT / "configs" / "square.yaml"), "-o", str(partial / "run")]) == 0
             partial.rename(made)
-    return Path(shutil.copytree(made, directory))
+    return Path(shutil.copytree(made / "run", directory))
