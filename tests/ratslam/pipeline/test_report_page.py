@@ -14,6 +14,7 @@ import pytest
 
 from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.closure_views import read_closure_views
+from evaluation.report.closure_records import display_gain
 from evaluation.report.palette import PALETTE
 from ratslam.cli import main
 from ratslam.pipeline.report import write_report
@@ -206,7 +207,8 @@ def check_shown(shown: dict[str, Any], number: int, directory: Path) -> None:
     assert shown["chosen"] == f"Steps {earlier} and {later}: {words}."
     assert shown["pressed"] == [number]
     rows = np.searchsorted(views.step, [earlier, later])
-    assert shown["views"] == [views.view[row].ravel().tolist() for row in rows]
+    bright = np.minimum(np.ceil(views.view[rows] * display_gain(views.view)), 255)
+    assert shown["views"] == bright.reshape(2, -1).tolist()
     assert [label.split(",")[0] for label in shown["labels"]] == [
         f"View at step {k}" for k in (earlier, later)
     ]
