@@ -139,11 +139,6 @@ def draw_any(records: list[ObjectRecord], visits: Visits, seed: int) -> np.ndarr
     return rows[stream(seed, "rows of objects").permutation(len(rows))[: len(visits.thing)]]
 
 
-def walk_config(maze: int, folder: Path, seed: int, *, shuffled: bool = False) -> WalkConfig:
-    """The walk of the first four circuits of a session of the touch table."""
-    return WalkConfig(folder=folder, simulation=walk_simulation(maze), seed=seed, shuffled=shuffled)
-
-
 def walk_simulation(maze: int) -> SimulationConfig:
     """The session of a maze of the touch table, its first four circuits."""
     config = task_config(TouchTask("main", maze))

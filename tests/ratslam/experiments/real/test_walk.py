@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.experiments.real.walk import reckon_from
+from ratslam.config.completion import complete
+from ratslam.experiments.real.walk import compare_one_way, whisker_config
+from ratslam.experiments.real.walk_odometry import continue_path, draw_energies, last_before_reversal
 from ratslam.experiments.real.walk_source import (
     AWAY,
     ENTRY,
@@ -20,10 +22,13 @@ from ratslam.experiments.real.walk_source import (
     plan_visits,
     walk_simulation,
 )
+from ratslam.recall.config import sector_shifts
 from robot.recordings.whiskers.objects import ObjectRecord
+from robot.simulation.head.session import HeadSimulation
+from robot.sources.odometry import OdometryConfig
 from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
-from tactile.base.se2 import between, integrate
+from tactile.base.se2 import between, compose, integrate, wrap
 
 SLICE = Path(__file__).parents[3] / "data" / "real_touch" / "purdue"
 
@@ -81,9 +86,52 @@ def test_object_that_is_needed_too_often():
 def test_reckoned_path_is_true_up_to_its_start():
     motion = np.random.default_rng(0).normal(size=(10, 3))
     truth = integrate(np.random.default_rng(1).normal(size=(10, 3)))
-    path = reckon_from(truth, motion, 4)
+    path = continue_path(truth, motion, 3)
     np.testing.assert_array_equal(path[:4], truth[:4])
     np.testing.assert_allclose(between(path[3:-1], path[4:])[:, :2], motion[4:, :2], atol=1e-9)
+
+
+def test_reversal_is_the_largest_turn_whatever_its_side_and_the_wrap():
+    turns = np.zeros(40)
+    turns[5:9], turns[20:27], turns[30:34] = 0.4, -0.45, 0.4
+    heading = 3.0 + np.cumsum(turns)
+    truth = np.column_stack([np.zeros((40, 2)), wrap(heading)])
+    assert last_before_reversal(truth) == 19
+    with pytest.raises(ValueError, match="empty"):
+        last_before_reversal(np.zeros((5, 3)))
+
+
+def there_and_back():
+    """[N, 3] poses along a line and, after a turn, back; and times, s."""
+    x = np.concatenate([np.arange(20), np.full(7, 19), np.arange(19, -1, -1)]) * 0.05
+    heading = wrap(np.concatenate([np.zeros(20), np.arange(1, 8) * np.pi / 7, np.full(20, np.pi)]))
+    return np.column_stack([x, np.zeros(len(x)), heading]), np.arange(len(x), dtype=float)
+
+
+def energies_of(paths, noise, seed=3):
+    truth, time = there_and_back()
+    config = OdometryConfig(noise=noise)
+    last = last_before_reversal(truth)
+    return draw_energies(paths, truth, time, last, config, seed=seed, draws=5)
+
+
+def test_drawn_energies_are_those_of_the_noise_and_of_the_path():
+    truth, _ = there_and_back()
+    moved = compose(np.array([2.0, -1.0, 0.7]), truth)
+    bent = truth + np.linspace(0, 0.4, len(truth))[:, None] * [0, 0, 1.0]
+    np.testing.assert_allclose(energies_of((truth, moved), "none"), 0, atol=1e-12)
+    drawn = energies_of((truth, moved, bent), "gated")
+    np.testing.assert_allclose(drawn[0], drawn[1], rtol=1e-6)
+    assert (drawn[0] > 0).all()
+    assert len(np.unique(drawn[0])) == 5
+    assert (drawn[2] != drawn[0]).all()
+    np.testing.assert_array_equal(drawn[0], energies_of((truth,), "gated")[0])
+
+
+def test_one_direction_has_no_half_turns():
+    config = complete(whisker_config(31201), HeadSimulation(walk_simulation(31201)))
+    assert sector_shifts(config.recall).tolist() == [0, 1]
+    assert sector_shifts(compare_one_way(config).recall).tolist() == [0]
 
 
 def test_folder_without_recordings(tmp_path):
