@@ -12,7 +12,7 @@ from robot.recordings.whiskers.reach import COLUMNS, ENTRY, WHISKERS, ReachConfi
 from robot.sources.registry import SOURCES
 from tactile.base.errors import InputError
 
-FILE = Path(__file__).parents[3] / "data" / "real_touch" / "stanford_reach" / "free_rows.csv"
+FILE = Path(__file__).parents[3] / "data" / "real_touch" / "stanford" / "reach_free_rows.csv"
 
 
 @pytest.fixture
