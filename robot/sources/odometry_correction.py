@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from robot.sources.input_files import digest_of
 from robot.sources.source import Sample, Source
 from tactile.base.config import Settings
 from tactile.base.se2 import correct_heading
-from tactile.base.types import Odometry
+from tactile.base.types import Observation, Odometry
 
 
 class OdometryCorrection(Settings):
@@ -36,6 +36,17 @@ def correct_motions(correction: OdometryCorrection, motion: np.ndarray) -> np.nd
     length = np.hypot(motion[..., 0], motion[..., 1])
     scaled = motion * np.array([correction.length_scale, correction.length_scale, 1.0])
     return correct_heading(scaled, length, correction.heading_bias, correction.turn_scale - 1)
+
+
+def correct_observations(
+    correction: OdometryCorrection, observations: Sequence[Observation]
+) -> list[Observation]:
+    """Observations with the odometry corrected."""
+    motions = np.array([observation.odometry[:3] for observation in observations]).reshape(-1, 3)
+    return [
+        observation._replace(odometry=Odometry(*motion, observation.odometry.dt))
+        for observation, motion in zip(observations, correct_motions(correction, motions), strict=True)
+    ]
 
 
 def correct_odometry(source: Source, correction: OdometryCorrection) -> Source:

@@ -20,7 +20,8 @@ from ratslam.experiments.real.figure import RealFigure, require_recordings
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.runner import build_session
 from ratslam.pipeline.source import open_observations
-from robot.simulation.create.wheel_odometry import HEADING_DRIFT, TRUE_LENGTH, TRUE_TURN
+from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
+from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import observation_of
 from robot.world.polygons import segment_distance
 from tactile.base.random_streams import stream
@@ -33,6 +34,8 @@ SEEDS = range(10)
 OTHER_SPEED = 0.055
 """Mean speed of the Creates whose errors are assumed, m/s. Published is their drift by the minute; that it is
 one by the metre is an assumption, and a drift by the minute corrects this faster drive by less."""
+OTHER_CREATES = MEAN_ERRORS.model_copy(update={"heading_bias": float(np.mean(HEADING_DRIFT)) / OTHER_SPEED})
+"""The mean errors of the Creates of `wheel_odometry.py`, which are others."""
 OTHERS = "errors of other Creates taken out"
 VARIANTS: dict[str, tuple[str, ...]] = {
     "grid filter": (),
@@ -164,7 +167,7 @@ def _read_drive(walls: Path) -> Recorded:
 def _treat(name: str, observations: list[Observation], seed: int) -> list[Observation]:
     """The observations of a row."""
     if name == OTHERS:
-        return [_correct(each) for each in observations]
+        return correct_observations(OTHER_CREATES, observations)
     if name != "bumps shuffled in time":
         return observations
     order = stream(seed, "shuffle").permutation(len(observations))
@@ -173,14 +176,6 @@ def _treat(name: str, observations: list[Observation], seed: int) -> list[Observ
         each._replace(contact=bump.contact, point=bump.point)
         for each, bump in zip(observations, bumps, strict=True)
     ]
-
-
-def _correct(observation: Observation) -> Observation:
-    """The observation without the mean errors of the Creates of `wheel_odometry.py`, which are others."""
-    moved = observation.odometry
-    drift = np.mean(HEADING_DRIFT) / OTHER_SPEED * np.hypot(moved.dx, moved.dy)
-    dx, dy, dtheta = TRUE_LENGTH * moved.dx, TRUE_LENGTH * moved.dy, TRUE_TURN * moved.dtheta + drift
-    return observation._replace(odometry=moved._replace(dx=dx, dy=dy, dtheta=dtheta))
 
 
 def _run(
@@ -204,7 +199,7 @@ def _odometry_errors(drive: Recorded) -> dict[str, float]:
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
         return _ate(integrate(motion), drive.truth)
 
-    corrected = [_correct(each) for each in drive.observations]
+    corrected = correct_observations(OTHER_CREATES, drive.observations)
     return {
         "odometry": error(),
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),

@@ -22,7 +22,8 @@ from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.arena_trial import session_at_start
 from ratslam.pipeline.artifacts import true_grid
 from ratslam.pipeline.source import open_source, read_observations
-from robot.simulation.create.wheel_odometry import TRUE_LENGTH, TRUE_TURN
+from robot.simulation.create.wheel_odometry import MEAN_ERRORS
+from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import open_touch_source, report_config_of
 from robot.world.arena import Arena, wall_segments
 from robot.world.polygons import segment_distance
@@ -160,15 +161,14 @@ def measure_session(task: GridTask) -> GridFigures:
     truth = np.array([sample.truth for sample, _ in rows])
     observations = [observation for _, observation in rows]
     start = source.arena.start
+    if "calibrated" in task.row:
+        observations = correct_observations(MEAN_ERRORS, observations)
     moves = np.array([observation.odometry[:3] for observation in observations])
     if "BACK skipped" in task.row:
         still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=BACK_DURATION)
         observations = [
             o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
         ]
-    if "calibrated" in task.row:
-        observations = [_calibrate(observation) for observation in observations]
-        moves = np.array([observation.odometry[:3] for observation in observations])
     touch = report_config_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])
@@ -181,14 +181,6 @@ def measure_session(task: GridTask) -> GridFigures:
         contacts=sum(each.moment >= 2 and each.motion == MotionKind.FORWARD for each in readings),
         map=_map_scores(session.map, source.arena),
     )
-
-
-def _calibrate(observation: Observation) -> Observation:
-    """The observation with odometry corrected by the mean scales of real Creates; the rest of a run's own
-    errors remains."""
-    moved = observation.odometry
-    dx, dy, dtheta = TRUE_LENGTH * moved.dx, TRUE_LENGTH * moved.dy, TRUE_TURN * moved.dtheta
-    return observation._replace(odometry=moved._replace(dx=dx, dy=dy, dtheta=dtheta))
 
 
 def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> float:

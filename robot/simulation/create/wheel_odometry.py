@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat
 
+from robot.sources.odometry_correction import OdometryCorrection
 from tactile.base.config import Settings
 
 BIAS_WHITE_SHARE = 0.2
@@ -23,6 +24,10 @@ WINDOW, RUN_WINDOWS = 10.0, 75
 WINDOW_LENGTH, WINDOW_TURN = (0.10, 0.14), (0.125, 0.16)
 """Ranges over runs of the standard deviation of a window's error, as a share of its distance and of its turn
 (0.10 to 0.17 rad in windows that turned by 0.8 to 1.05 rad)."""
+
+
+MEAN_ERRORS = OdometryCorrection(length_scale=TRUE_LENGTH, turn_scale=TRUE_TURN)
+"""What takes the mean scale errors of real Creates out of an odometry; the rest of a run's own remains."""
 
 
 class WheelsConfig(Settings):

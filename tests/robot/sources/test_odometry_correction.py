@@ -12,8 +12,14 @@ from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
 from robot.sources.odometry import from_motions
-from robot.sources.odometry_correction import OdometryCorrection, correct_motions, correct_odometry
+from robot.sources.odometry_correction import (
+    OdometryCorrection,
+    correct_motions,
+    correct_observations,
+    correct_odometry,
+)
 from tactile.base.se2 import integrate
+from tactile.base.types import Odometry, observation
 
 ERRORS = OdometryCorrection(length_scale=0.9, turn_scale=1.2, heading_bias=-0.05)
 
@@ -70,3 +76,13 @@ def test_without_errors_the_source_is_the_same_object() -> None:
 def test_a_scale_is_positive(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         OdometryCorrection.model_validate({name: 0.0})
+
+
+def test_observations_are_corrected_in_their_odometry_only() -> None:
+    motion = np.array([[0.1, 0.0, 0.2], [0.0, 0.0, -0.3]])
+    before = [observation(Odometry(*row, 0.5), np.ones((1, 2, 1))) for row in motion]
+    after = correct_observations(ERRORS, before)
+    np.testing.assert_array_equal([one.odometry[:3] for one in after], correct_motions(ERRORS, motion))
+    assert [one.odometry.dt for one in after] == [0.5, 0.5]
+    assert all(one.view is was.view for one, was in zip(after, before, strict=True))
+    assert correct_observations(ERRORS, []) == []
