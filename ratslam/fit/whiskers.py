@@ -8,13 +8,12 @@ import numpy as np
 
 from ratslam.config.run_config import RunConfig
 from ratslam.fit.rig import Quantity, Rig
-from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
+from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, find_touches, read_reach
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig, read_settings
 from tactile.base.types import Cycle, Whisk
-from tactile.features.contact_stream import Touch, find_contacts, start_stream
-from tactile.features.free_record import calibrate_free
+from tactile.features.contact_stream import Touch
 from tactile.fit.signals import SignalFit, SignalRecord, fit_signals
 
 REST_SHARE = 0.05
@@ -29,14 +28,11 @@ def read_signals_of_reach(source: PluginConfig) -> SignalRecord:
     """The signals of an arm that reaches through clutter."""
     config = read_settings(ReachConfig, source.settings, "source.settings")
     signal = read_reach(config.file).signal
-    free = signal[: config.free_rows]
-    plan, state = start_stream(
-        config.contact, calibrate_free(config.free, free, str(config.file)), config.rate
-    )
-    _, touch = find_contacts(plan, state, signal)
     block = max(round(DRIFT_BLOCK * config.rate), 1)
-    contact = (touch == Touch.CONTACT).mean(axis=0)
-    return SignalRecord(free, signal, block, block / config.rate, contact, WHISKERS, "counts")
+    contact = (find_touches(config, signal) == Touch.CONTACT).mean(axis=0)
+    return SignalRecord(
+        signal[: config.free_rows], signal, block, block / config.rate, contact, WHISKERS, "counts"
+    )
 
 
 SIGNALS: dict[str, Callable[[PluginConfig], SignalRecord]] = {"whisker_reach": read_signals_of_reach}

@@ -19,7 +19,7 @@ from ratslam.experiments.real.contact_page import (
     list_contacts,
     stretches,
 )
-from ratslam.experiments.real.figure import RealFigure, require_recordings
+from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
 from ratslam.experiments.real.spliced_hours import (
     Decide,
     Snippet,
@@ -40,7 +40,6 @@ from tactile.features.contact_stream import (
 )
 from tactile.features.free_record import FreeBaseline, calibrate_free
 
-RECORD = "real_touch/whiskersensing_stanford/derived/reaching_take20_in_clutter.csv"
 CONTACT_SDS = 20.0
 """Departure that makes a contact of the record one to find in the spliced hours: the paper's."""
 SHORTEST = 20
@@ -59,7 +58,7 @@ def measure_contacts(data: Path) -> ContactResult:
     Raises:
         InputError: the record or an annotation is missing or damaged.
     """
-    config = ReachConfig(file=require_recordings(data, RECORD)[0])
+    config = ReachConfig(file=require_recordings(data, REACH)[0])
     record = read_reach(config.file)
     signal, first = record.signal, record.signal[: config.free_rows]
     free = calibrate_free(config.free, first)

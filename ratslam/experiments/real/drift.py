@@ -14,11 +14,12 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
-from ratslam.experiments.real.figure import RealFigure, require_recordings
+from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from robot.recordings.whiskers.number_table import read_columns
+from robot.recordings.whiskers.reach import read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
 
-REACH = "real_touch/whiskersensing_stanford/derived/reaching_take20_in_clutter.csv"
 CAMERA = "real_touch/actuated_whisker_purdue/data/airflow/airflowDemoData.csv"
 RATE = 200.0
 """Readings per second; the file has no time, the authors assume this rate."""
@@ -101,10 +102,10 @@ def measure_drift(folder: Path) -> DriftResult:
     """The figures of real and simulated whiskers.
 
     Raises:
-        InputError: a recording is missing.
+        InputError: a recording is missing or damaged.
     """
     reach, camera = require_recordings(folder, REACH, CAMERA)
-    signal = np.loadtxt(reach, delimiter=",", skiprows=1)[:, 8:].reshape(-1, 14, 3)
+    signal = read_reach(reach).signal
     free: dict[str, FreeFigures] = {}
     creep: dict[str, CreepFigures] = {}
     for name, part in (("fitted", FIT), ("checked", CHECK)):
@@ -115,7 +116,7 @@ def measure_drift(folder: Path) -> DriftResult:
         free[name] = free_figures(noise.reshape(len(signal), -1), RATE)
         bent = np.repeat(signal[:, FIT.bent + CHECK.bent], COPIES, axis=1)
         creep[name] = creep_figures(simulate_bent(config, bent), creep["fitted"].time)
-    held = np.loadtxt(camera, delimiter=",", skiprows=1)
+    held, _ = read_columns(camera, ("Time", "dx", "dy"))
     held = held[(held[:, 0] > 19) & (held[:, 0] < 23.5)]  # pressed without moving
     free["camera"] = free_figures(held[:, 1:], len(held) / np.ptp(held[:, 0]))
     return DriftResult(free, creep)

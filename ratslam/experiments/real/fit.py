@@ -11,7 +11,7 @@ import numpy as np
 from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
 from ratslam.config.run_config import load_config
-from ratslam.experiments.real.figure import RealFigure, require_recordings
+from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
 from ratslam.fit.revisits import RevisitFit, fit_revisits
 from ratslam.fit.wheels import WheelFit, fit_wheels
 from ratslam.fit.whiskers import read_signals_of_reach
@@ -22,7 +22,6 @@ from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
 from tactile.fit.signals import SignalFit, SignalRecord, fit_signals
 
-REACH = "real_touch/whiskersensing_stanford/derived/reaching_take20_in_clutter.csv"
 RECORDS = {
     "real Create": ("create_lab", "data/create_lab_odometry.csv"),
     "Intel lab": ("intel_laser", "data/intel_odom_gt.csv"),

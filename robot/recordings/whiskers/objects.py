@@ -9,14 +9,13 @@ whisker; 16 successive ones are taken to.
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from robot.recordings.whiskers.number_table import read_rows
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of, read_bytes
 from robot.sources.registry import SourceEntry
 from robot.sources.source_info import SourceInfo
 from tactile.base.config import Settings
@@ -47,27 +46,14 @@ def read_object(path: Path) -> ObjectRecord:
     """The record in a file.
 
     Raises:
-        InputError: the file is missing, empty or cut, or a row is not 128 whole numbers.
+        InputError: as `number_table.read_rows`, or a row is not of 128 whole numbers.
     """
-    content, size = read_bytes(path), WHISKERS * VALUES
-    expected = f"{size} whole numbers in each row, {WHISKERS} whiskers x {VALUES} displacements"
-    if not content.endswith(b"\n"):
-        raise InputError(str(path), "the last line is cut", cure="copy the file again")
-    if not content.strip():
-        raise InputError(str(path), "no rows", expected, "was it copied completely?")
-    try:
-        table = np.loadtxt(BytesIO(content), delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise InputError(str(path), str(error), expected) from None
-    if table.shape[1] != size:
-        raise InputError(str(path), f"{table.shape[1]} columns", expected)
-    rows, columns = np.nonzero(table != np.round(table))  # NaN differs from itself; infinity is found below
-    if not len(rows):
-        rows, columns = np.nonzero(np.isinf(table))
-    if len(rows):
-        found = f"{table[rows[0], columns[0]]:g} in column {columns[0] + 1}"
-        raise InputError(f"{path}:{rows[0] + 1}", found, expected)
-    return ObjectRecord(table.reshape(-1, WHISKERS, VALUES), digest_of([content]))
+    table, digest = read_rows(path, WHISKERS * VALUES)
+    if (broken := np.argwhere(table != np.round(table))).size:
+        row, column = broken[0].tolist()
+        found = f"{table[row, column]:g} in column {column + 1}"
+        raise InputError(f"{path}:{row + 1}", found, "whole numbers of pixels")
+    return ObjectRecord(table.reshape(-1, WHISKERS, VALUES), digest)
 
 
 def open_object(config: ObjectConfig) -> InMemorySource:

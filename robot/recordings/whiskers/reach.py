@@ -8,16 +8,14 @@ right. It has no time: the authors' tracker assumes 200 readings per second.
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
-from robot.recordings.sanity_checks import nonfinite_errors
+from robot.recordings.whiskers.number_table import read_columns
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.registry import SourceEntry
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
@@ -63,34 +61,28 @@ def read_reach(path: Path) -> ReachRecord:
     """The record in a file.
 
     Raises:
-        InputError: the file is missing, empty or cut, or has other columns or values that are not numbers.
+        InputError: as `number_table.read_columns`, or rows are missing.
     """
-    content = read_bytes(path)
-    header = content.split(b"\n", 1)[0].decode("utf-8", "replace").strip().split(",")
-    if lacking := [name for name in COLUMNS if name not in header]:
-        raise missing_error(str(path), "column", lacking[0], header)
-    if tuple(header) != COLUMNS:
-        raise InputError(str(path), f"{len(header)} columns", f"these {len(COLUMNS)}: {', '.join(COLUMNS)}")
-    if not content.endswith(b"\n"):
-        raise InputError(str(path), "the last line is cut", cure="copy the file again")
-    if content.count(b"\n") == 1:
-        raise InputError(str(path), "no rows", "a recording", "was it copied completely?")
-    try:
-        table = np.loadtxt(BytesIO(content), delimiter=",", skiprows=1, ndmin=2)
-    except ValueError as error:
-        raise InputError(str(path), str(error), f"{len(COLUMNS)} numbers in each line") from None
-    errors = [
-        error
-        for name, column in zip(COLUMNS, table.T, strict=True)
-        for error in nonfinite_errors(column, name, lambda row: f"{path}, row {row}")
-    ]
-    raise_errors(errors)
+    table, digest = read_columns(path, COLUMNS)
     if (jump := np.flatnonzero(table[:, 0] != np.arange(len(table)))).size:
         first = int(jump[0])
         where = f"{path}, row {first}"
         raise InputError(where, f"row number {table[first, 0]:g}", f"{first}, without gaps")
     signal = table[:, 8:].reshape(len(table), len(WHISKERS), 3)
-    return ReachRecord(table[:, 1:4], table[:, 4:8], signal, digest_of([content]))
+    return ReachRecord(table[:, 1:4], table[:, 4:8], signal, digest)
+
+
+def find_touches(config: ReachConfig, signal: np.ndarray) -> np.ndarray:
+    """[T, 14] a `Touch` for each reading of each whisker, as live.
+
+    Args:
+        signal: [T, 14, 3] counts, of the whole record.
+
+    Raises:
+        InputError: a whisker cannot be calibrated on the free rows.
+    """
+    free = calibrate_free(config.free, signal[: config.free_rows], f"{config.file}, free rows")
+    return find_contacts(*start_stream(config.contact, free, config.rate), signal)[1]
 
 
 def open_reach(config: ReachConfig) -> InMemorySource:
@@ -103,9 +95,7 @@ def open_reach(config: ReachConfig) -> InMemorySource:
         InputError: see `read_reach`; a whisker cannot be calibrated.
     """
     record = read_reach(config.file)
-    where, count = f"{config.file}, free rows", len(record.signal)
-    free = calibrate_free(config.free, record.signal[: config.free_rows], where)
-    _, touch = find_contacts(*start_stream(config.contact, free, config.rate), record.signal)
+    touch, count = find_touches(config, record.signal), len(record.signal)
     motion = np.zeros((count, 4))
     motion[1:, :2] = np.diff(record.position[:, :2], axis=0)
     motion[1:, 3] = 1 / config.rate

@@ -7,13 +7,13 @@ sweep an object stands on the stage: its place changes with the stage's position
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import PositiveFloat
 
+from robot.recordings.whiskers.number_table import read_columns
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_motions
 from robot.sources.registry import SourceEntry
@@ -21,8 +21,8 @@ from robot.sources.source import Source
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
-COLUMNS = ["px", "py", "pz", "sx", "sy", "sz"]
-"""Columns after the index."""
+COLUMNS = ("", "px", "py", "pz", "sx", "sy", "sz")
+"""The index has no name."""
 MILLIMETRE = 1e-3
 """m."""
 UNEVEN = 3.0
@@ -32,10 +32,11 @@ SAME_PLACE = 1e-6
 
 
 class StageRecording(NamedTuple):
-    """N rows of a file: position [N, 3] of the stage, m; signal [N, 3], counts."""
+    """N rows of a file: position [N, 3] of the stage, m; signal [N, 3], counts; sha256 (hex) of the file."""
 
     position: np.ndarray
     signal: np.ndarray
+    digest: str
 
 
 class StageCalibration(NamedTuple):
@@ -55,36 +56,15 @@ class StageConfig(Settings):
     rate_hz: PositiveFloat = 1.0
     """Rows per second; the files have no time."""
 
-    def resolved(self, folder: Path) -> StageConfig:
-        """A copy with relative paths resolved against a folder."""
-        return self.model_copy(update={"file": folder / self.file})
-
 
 def read_stage(path: Path) -> StageRecording:
     """Reads a file.
 
     Raises:
-        InputError: it cannot be read, has other columns, a row that is cut or not a finite number, or no
-            rows.
+        InputError: as `number_table.read_columns`.
     """
-    expected = f"a CSV file with the columns index, {', '.join(COLUMNS)}"
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read ({type(error).__name__})", expected) from error
-    if not lines or lines[0].strip().split(",")[1:] != COLUMNS:
-        found = f"the columns {lines[0][:60]!r}" if lines else "an empty file"
-        raise InputError(str(path), found, expected)
-    rows = []
-    for number, line in enumerate(lines[1:], start=2):
-        row = _numbers(line)
-        if len(row) != len(COLUMNS) + 1 or not np.isfinite(row).all():
-            raise InputError(f"{path}:{number}", f"{line[:60]!r}", f"{len(COLUMNS) + 1} finite numbers")
-        rows.append(row[1:])
-    if not rows:
-        raise InputError(str(path), "no rows", expected)
-    table = np.array(rows)
-    return StageRecording(table[:, :3] * MILLIMETRE, table[:, 3:])
+    table, digest = read_columns(path, COLUMNS)
+    return StageRecording(table[:, 1:4] * MILLIMETRE, table[:, 4:], digest)
 
 
 def cut_sweep(recording: StageRecording) -> StageRecording:
@@ -96,7 +76,8 @@ def cut_sweep(recording: StageRecording) -> StageRecording:
     if not len(runs):
         return recording
     first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    return StageRecording(recording.position[first : last + 1], recording.signal[first : last + 1])
+    rows = slice(first, last + 1)
+    return recording._replace(position=recording.position[rows], signal=recording.signal[rows])
 
 
 def read_stage_calibration(path: Path) -> StageCalibration:
@@ -133,7 +114,7 @@ def open_stage(config: StageConfig) -> Source:
     steps = np.diff(recording.position, axis=0, prepend=recording.position[:1])
     return InMemorySource(
         name=config.file.stem,
-        digest=hashlib.sha256(config.file.read_bytes()).hexdigest(),
+        digest=recording.digest,
         time=time,
         motion=from_motions(time, steps[:, 0], steps[:, 1], np.zeros(count)),
         moved=np.ones(count, bool),
@@ -143,13 +124,6 @@ def open_stage(config: StageConfig) -> Source:
         truth=np.stack([x, y, np.zeros(count)], axis=1),
         alive=np.ones(1, bool),
     )
-
-
-def _numbers(line: str) -> list[float]:
-    try:
-        return [float(cell) for cell in line.split(",")]
-    except ValueError:
-        return []
 
 
 ENTRY = SourceEntry(StageConfig, lambda config, warn: open_stage(config))

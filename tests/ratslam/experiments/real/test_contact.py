@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.experiments.real.contact import RECORD, baseline_of
+from ratslam.experiments.real.contact import baseline_of
 from ratslam.experiments.real.contact_page import stretches
+from ratslam.experiments.real.figure import REACH
 from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
 from tactile.features.contact_stream import Touch, find_contacts, find_fixed_contacts, start_stream
 from tactile.features.free_record import calibrate_free
@@ -16,7 +17,7 @@ from tactile.features.free_record import calibrate_free
 
 @pytest.fixture(scope="module")
 def signal(reference_data: Path) -> np.ndarray:
-    return read_reach(reference_data / RECORD).signal
+    return read_reach(reference_data / REACH).signal
 
 
 def contacts(signal: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def change(lines: list[str], row: int, column: int, value: str) -> list[str]:
         (lambda lines: lines[:-1] + [lines[-1].rstrip("\n")], "last line is cut"),
         (lambda lines: lines[:-1] + [lines[-1][:40] + "\n"], "expected 50 numbers in each line"),
         (lambda lines: lines[:5] + lines[6:], "row 4: row number 5; expected 4"),
-        (lambda lines: change(lines, 7, 9, "nan"), f"row 7: {COLUMNS[9]} is nan"),
+        (lambda lines: change(lines, 7, 9, "nan"), rf"reach\.csv:9: {COLUMNS[9]} is nan"),
         (lambda lines: change(lines, 7, 9, "abc"), "abc"),
         (lambda lines: [lines[0].replace("left0_x", "left_x"), *lines[1:]], "no column 'left0_x'"),
         (lambda lines: [lines[0].replace("row", "row,time", 1), *lines[1:]], "51 columns"),
