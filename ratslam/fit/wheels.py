@@ -17,6 +17,7 @@ import numpy as np
 from robot.sources.odometry_correction import OdometryCorrection, correct_motions
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.samples import robust_sd
 from tactile.base.se2 import integrate, wrap
 
 WINDOW = 10.0
@@ -32,7 +33,6 @@ SLIP = 5.0
 KEPT_SDS = 2.0
 """A quantity that is nearer to the assumed one than this many of its standard deviations changes nothing: a
 heading bias of no significance, applied to a long path, does more harm than none."""
-_MAD = 1.4826
 
 
 class WheelFit(NamedTuple):
@@ -180,7 +180,7 @@ def _solve_robustly(columns: np.ndarray, value: np.ndarray) -> np.ndarray:
     from scipy.optimize import least_squares
 
     start = np.linalg.lstsq(columns, value, rcond=None)[0]
-    scale = _robust_sd(value - columns @ start)
+    scale = float(robust_sd(value - columns @ start))
     if scale == 0:
         return start
     fit = least_squares(
@@ -204,13 +204,9 @@ def _slips(windows: _Windows, values: np.ndarray) -> np.ndarray:
     """[M] bool, the windows whose turn or distance no noise explains."""
     heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
     chord = windows.true_chord - values[0] * windows.chord
-    return np.any([np.abs(error) > SLIP * _robust_sd(error) for error in (heading, chord)], axis=0)
+    return np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
 
 
 def _clip_slips(error: np.ndarray) -> np.ndarray:
-    most = SLIP * _robust_sd(error)
+    most = SLIP * robust_sd(error)
     return np.clip(error, -most, most)
-
-
-def _robust_sd(error: np.ndarray) -> float:
-    return float(_MAD * np.median(np.abs(error)))

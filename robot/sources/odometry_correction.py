@@ -44,8 +44,10 @@ def correct_observations(
     """Observations with the odometry corrected."""
     motions = np.array([observation.odometry[:3] for observation in observations]).reshape(-1, 3)
     return [
-        observation._replace(odometry=Odometry(*motion, observation.odometry.dt))
-        for observation, motion in zip(observations, correct_motions(correction, motions), strict=True)
+        observation._replace(odometry=Odometry(dx, dy, dtheta, observation.odometry.dt))
+        for observation, (dx, dy, dtheta) in zip(
+            observations, correct_motions(correction, motions), strict=True
+        )
     ]
 
 

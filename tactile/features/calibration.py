@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from tactile.base.errors import InputError
+from tactile.base.samples import robust_sd
 from tactile.base.types import Cycle
 from tactile.features.free_record import (
     DirtyRecordConfig,
@@ -126,8 +127,7 @@ def _find_touched(config: CalibrationConfig, deflection: np.ndarray, alive: np.n
 def _outliers(config: CalibrationConfig, part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Bool of the shape of `part`, whether its samples are outliers of the record `whole` [T, ...]."""
     middle = np.median(whole, axis=0)
-    robust = 1.4826 * np.median(np.abs(whole - middle), axis=0)
-    return np.abs(part - middle) > config.outlier_sds * robust
+    return np.abs(part - middle) > config.outlier_sds * robust_sd(whole - middle)
 
 
 def _repair(

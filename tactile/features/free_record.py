@@ -13,6 +13,7 @@ from pydantic import PositiveFloat
 
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.samples import longest_run
 from tactile.features.signal_noise import LAG, WINDOW, estimate_noise, quiet_windows, window_variances
 
 
@@ -115,12 +116,11 @@ def clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
         The rows, or None if no window is quiet.
     """
     variances = window_variances(record)
-    quiet = (quiet_windows(variances) & (variances <= limit**2)).all(axis=-1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(int)))
-    if not len(edges):
+    quiet = np.all(quiet_windows(variances) & (variances <= limit**2), axis=-1)
+    if not quiet.any():
         return None
-    first, last = max(edges.reshape(-1, 2), key=lambda run: run[1] - run[0])
-    return slice(int(first) * (WINDOW // 2), (int(last) - 1) * (WINDOW // 2) + WINDOW + LAG)
+    run = longest_run(quiet)
+    return slice(run.start * (WINDOW // 2), (run.stop - 1) * (WINDOW // 2) + WINDOW + LAG)
 
 
 def dirty_error(where: str, dirty: list[DirtyWhisker], cure: str) -> InputError:

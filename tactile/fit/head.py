@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile.base.errors import InputError
+from tactile.base.samples import robust_sd
 from tactile.whiskers.head_geometry import HeadConfig
 
 LEAST_CONTACTS = 50
@@ -84,14 +85,14 @@ def fit_head(assumed: HeadConfig, contact: np.ndarray, angle: np.ndarray, predic
     values = min(starts, key=lambda start: float(np.median(np.abs(errors(start)))))
     bounds = np.array([[1.0, STEEPEST_DEG], *np.outer(before[1:], RADII)]).T
     for _ in range(3):
-        scale = max(_robust_sd(errors(values)), LEAST_SCALE)
+        scale = max(float(robust_sd(errors(values))), LEAST_SCALE)
         found = least_squares(
             errors, np.clip(values, *bounds), bounds=bounds, loss="cauchy", f_scale=scale,
             x_scale=np.array([10.0, *0.1 * before[1:]]), diff_step=STEP,
         )  # fmt: skip
         values = found.x
     plain = least_squares(errors, values, diff_step=STEP, max_nfev=1)  # the derivatives without the loss
-    spread = tuple(_robust_sd(errors(at)) for at in (values, before))
+    spread = tuple(float(robust_sd(errors(at))) for at in (values, before))
     return _summarise(values, _uncertainties(plain.jac, errors(values), scale), len(row), spread)
 
 
@@ -127,7 +128,3 @@ def _uncertainties(slope: np.ndarray, error: np.ndarray, scale: float) -> np.nda
     sd = np.full(len(tells), np.inf)
     sd[tells] = np.sqrt(np.diag(inverse @ (sums.T @ sums) @ inverse))
     return sd
-
-
-def _robust_sd(error: np.ndarray) -> float:
-    return 1.4826 * float(np.median(np.abs(error)))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile.base.errors import InputError
+from tactile.base.samples import longest_run
 from tactile.wall_estimation.signal_map import SignalMap, predict_signal, signal_slope, signal_variance
 
 FREE_ROWS = 8
@@ -94,9 +95,8 @@ def find_contact(signal: np.ndarray) -> SlidingContact:
         end = start
     above = signal - np.linspace(start, end, len(signal))
     touching = (np.abs(above) > MIN_SIGNAL_SDS * noise).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]])))
-    runs = edges.reshape(-1, 2)
-    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])] if len(runs) else (0, 0)
+    run = longest_run(touching)
+    first, last = run.start, run.stop
     size = np.append(np.linalg.norm(above[first:last], axis=1), 0.0 if last < len(signal) else np.inf)
     fall = -np.diff(size)[-SLIP_ROWS:]
     slips_off = bool(len(fall) and fall.max() > SHARE_OF_PEAK * peak)
@@ -104,7 +104,7 @@ def find_contact(signal: np.ndarray) -> SlidingContact:
         last -= len(fall) - 1 - int(np.argmax(fall))
     if last - first < MIN_ROWS:
         raise InputError("sweep", f"a contact of {last - first} samples", f"at least {MIN_ROWS}")
-    return SlidingContact(int(first), above[first:last], noise, slips_off)
+    return SlidingContact(first, above[first:last], noise, slips_off)
 
 
 def track_contact(known: SignalMap, place: np.ndarray, touch: SlidingContact) -> ContactTrack:

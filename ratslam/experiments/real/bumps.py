@@ -17,13 +17,13 @@ from ratslam.config.run_config import load_config
 from ratslam.core.session import Session
 from ratslam.core.types import GridDrawing
 from ratslam.experiments.real.figure import RealFigure, require_recordings
+from ratslam.experiments.real.wall_distance import wall_distances
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.runner import build_session
 from ratslam.pipeline.source import open_observations
 from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
 from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import observation_of
-from robot.world.polygons import segment_distance
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation
@@ -230,10 +230,9 @@ def _advances(drive: Recorded) -> tuple[float, float]:
 
 
 def _wall_distances(drive: Recorded) -> np.ndarray:
-    """[n] m, from the true position at each contact to the nearest wall."""
-    touching = np.array([each.contact.any() for each in drive.observations])
-    place = drive.truth[touching & _known(drive.truth), :2]
-    return np.asarray(segment_distance(drive.walls, place)).min(axis=1)
+    """[n] m, from the true position at the first reading of each contact to the nearest wall."""
+    touching, known = np.array([each.contact.any() for each in drive.observations]), _known(drive.truth)
+    return wall_distances(drive.truth[known, :2], touching[known], drive.walls).contact
 
 
 def _dead_reckoning(observations: list[Observation]) -> np.ndarray:

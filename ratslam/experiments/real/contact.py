@@ -17,7 +17,6 @@ from ratslam.experiments.real.contact_page import (
     MarkResult,
     draw_contacts,
     list_contacts,
-    stretches,
 )
 from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
 from ratslam.experiments.real.spliced_hours import (
@@ -30,6 +29,7 @@ from ratslam.experiments.real.spliced_hours import (
     simulate_stream,
 )
 from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
+from tactile.base.samples import true_runs
 from tactile.features.contact_stream import (
     StreamState,
     Touch,
@@ -120,11 +120,11 @@ def _score_tripled(
     contacts = missed = false = wrong = 0
     for whisker in range(signal.shape[1]):
         real, seen = contact[:, whisker], found[:, whisker]
-        long = [run for run in stretches(real) if run[1] - run[0] >= SHORTEST]
+        long = [run for run in true_runs(real) if run[1] - run[0] >= SHORTEST]
         contacts += len(long)
         missed += sum(bool(seen[first:last].mean() < 0.5) for first, last in long)
         near = np.convolve(real, np.ones(2 * SHORTEST + 1), "same") > 0
-        false += sum(not near[first:last].any() for first, last in stretches(seen))
+        false += sum(not near[first:last].any() for first, last in true_runs(seen))
         wrong += int((seen & ~near).sum())
     return StreamScore(contacts, missed, false, wrong, int((~contact).sum()))
 
@@ -165,7 +165,7 @@ def _score_hours(
 def _cut(signal: np.ndarray, mean: np.ndarray, noise: np.ndarray) -> list[Snippet]:
     """The contacts of one whisker after which it is let go, as departures from the baseline before each."""
     smooth = uniform_filter1d(signal - mean, 4, axis=0)
-    runs = stretches((np.abs(smooth) > CONTACT_SDS * noise).any(axis=1))
+    runs = true_runs((np.abs(smooth) > CONTACT_SDS * noise).any(axis=1))
     found = []
     for k, (first, last) in enumerate(runs):
         after = runs[k + 1][0] - SHORTEST if k + 1 < len(runs) else len(signal)

@@ -12,6 +12,7 @@ from evaluation.plots import style
 from ratslam.experiments.real.annotations import Score
 from ratslam.experiments.real.spliced_hours import StreamScore
 from robot.recordings.whiskers.reach import ReachConfig, ReachRecord
+from tactile.base.samples import true_runs
 from tactile.features.free_record import FreeBaseline
 
 
@@ -56,12 +57,6 @@ class ContactResult(NamedTuple):
     marks: MarkResult | None
 
 
-def stretches(which: np.ndarray) -> list[tuple[int, int]]:
-    """First row and end (exclusive) of each run of true values of [T] bool."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
-
-
 def list_contacts(result: ContactResult) -> list[str]:
     """The tables of the page."""
     return [
@@ -83,7 +78,7 @@ def _whisker_table(result: ContactResult) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     for w, name in enumerate(result.whiskers):
-        tracked, fixed = (len(stretches(found[:, w])) for found in (result.contact, result.fixed))
+        tracked, fixed = (len(true_runs(found[:, w])) for found in (result.contact, result.fixed))
         early, late = (f"{part[w]:.1%}" for part in halves)
         share = f"{result.fixed[:, w].mean():.1%}"
         lines.append(f"| {name} | {early} | {late} | {tracked} | {share} | {fixed} | {_remark(result, w)} |")
@@ -98,7 +93,7 @@ def _remark(result: ContactResult, whisker: int) -> str:
     if result.never[whisker]:
         parts.append(f"never touches (within {result.away[whisker]:.0f} sd)")
     if result.contact[-1, whisker]:
-        row = stretches(result.contact[:, whisker])[-1][0]
+        row = true_runs(result.contact[:, whisker])[-1][0]
         travel = np.linalg.norm(np.diff(result.record.position[row:], axis=0), axis=1).sum()
         parts.append(f"away from row {row} to the end, {travel:.2f} m: touching or bent")
     return "; ".join(parts)
@@ -181,7 +176,7 @@ def _draw_rows(axes: Axes, result: ContactResult) -> None:
     colours = (style.BLUE, style.VERMILLION)
     for found, height, colour in zip((result.contact, result.fixed), (-0.2, 0.2), colours, strict=True):
         for w in range(len(result.whiskers)):
-            bars = [(first / rate, (last - first) / rate) for first, last in stretches(found[:, w])]
+            bars = [(first / rate, (last - first) / rate) for first, last in true_runs(found[:, w])]
             axes.broken_barh(bars, (w + height - 0.17, 0.34), color=colour, lw=0)
     dirty = [one.whisker for one in result.free.dirty]
     names = [f"{name}*" if w in dirty else name for w, name in enumerate(result.whiskers)]
@@ -195,7 +190,7 @@ def _draw_rows(axes: Axes, result: ContactResult) -> None:
 def _draw_release(axes: Axes, result: ContactResult) -> None:
     """The channel of the strongest signal of the first whisker that is let go, around that time."""
     whisker = int(np.argmax(~result.never & ~result.contact[-1]))
-    end = stretches(result.contact[:, whisker])[0][1]
+    end = true_runs(result.contact[:, whisker])[0][1]
     rows = np.arange(end - 25, end + 55)
     channel = int(
         np.argmax(np.abs(result.record.signal[:end, whisker] - result.free.mean[whisker]).max(axis=0))

@@ -19,13 +19,13 @@ from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from robot.recordings.whiskers.number_table import read_columns
 from robot.recordings.whiskers.reach import read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
+from tactile.features.contact_stream import find_fixed_contacts
 
 CAMERA = "real_touch/actuated_whisker_purdue/data/airflow/airflowDemoData.csv"
 RATE = 200.0
 """Readings per second; the file has no time, the authors assume this rate."""
-FREE_SDS = 20.0
-"""A reading further from the first `START` than this many of their standard deviations is a contact's."""
 START = 100
+"""First readings, which are free: later ones beyond 20 of their standard deviations are contacts'."""
 SETTLING = 0.3
 """Time after a contact in which a whisker swings, s."""
 
@@ -155,8 +155,9 @@ def creep_figures(signal: np.ndarray, time: float | None) -> CreepFigures:
     Args:
         signal: [T, W, 3]. time: of the creep, s; None: the one that fits best.
     """
+    touches = find_fixed_contacts(signal[:START], signal)
     times = np.geomspace(0.1, 3, 60) if time is None else np.array([time])
-    fits = [[_creep_fit(signal[:, w], time) for w in range(signal.shape[1])] for time in times]
+    fits = [[_creep_fit(signal[:, w], touches[:, w], time) for w in range(signal.shape[1])] for time in times]
     misfit = [sum(fit[1] for fit in row) for row in fits]
     best = int(np.argmin(misfit))
     shares = np.array([fit[0] for fit in fits[best]])
@@ -167,11 +168,10 @@ def creep_figures(signal: np.ndarray, time: float | None) -> CreepFigures:
     )
 
 
-def _creep_fit(signal: np.ndarray, time: float) -> tuple[float, float, np.ndarray]:
-    """Share, rms misfit in noise sds, and the offset after release of one whisker [T, 3]."""
+def _creep_fit(signal: np.ndarray, touches: np.ndarray, time: float) -> tuple[float, float, np.ndarray]:
+    """Share, rms misfit in noise sds, and the offset after release of one whisker [T, 3] that touches [T]."""
     noise = signal[:START].std(axis=0)
     deviation = (signal - signal[:START].mean(axis=0)) / noise
-    touches = (np.abs(deviation) > FREE_SDS).any(axis=1)
     bend = np.where(touches, deviation[:, AXIS], 0.0)
     keep = np.exp(-1 / (RATE * time))
     crept = lfilter([1 - keep], [1, -keep], bend)
@@ -196,7 +196,7 @@ def simulate_bent(config: BaselineConfig, signal: np.ndarray) -> np.ndarray:
     """[T, W, 3] simulated whiskers, bent as real ones [T, W, 3] are while they touch, in noise sds."""
     noise = signal[:START].std(axis=0)
     deviation = (signal - signal[:START].mean(axis=0)) / noise
-    bend = np.where((np.abs(deviation) > FREE_SDS).any(axis=-1), deviation[..., AXIS], 0.0)
+    bend = np.where(find_fixed_contacts(signal[:START], signal), deviation[..., AXIS], 0.0)
     seen = np.zeros(signal.shape)
     seen[..., :2] = np.stack([np.zeros_like(bend), bend], axis=-1)
     sensor = Baseline(config, 1.0, RATE, signal.shape[1], seed=0)

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from scipy.special import expit
-from scipy.stats import rankdata
+from scipy.special import expit, logit
 
+from evaluation.metrics.statistics import auc, expected_calibration_error
 from ratslam.experiments.real.figure import RealFigure, require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
 from robot.recordings.whiskers.objects import read_object
@@ -140,26 +140,22 @@ def distance_of(found: np.ndarray, known: np.ndarray, order: int, roots: bool) -
     return np.stack([(np.abs(known - view) ** order).sum(axis=1) for view in found])
 
 
-def area_under_roc(score: np.ndarray, same: np.ndarray) -> float:
-    """Probability that a pair of one object has a larger score than a pair of two; ties count half."""
-    positive = int(same.sum())
-    rank = rankdata(score.ravel())[same.ravel()].sum()
-    return float((rank - positive * (positive + 1) / 2) / (positive * (same.size - positive)))
+def probabilities(odds: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Probabilities [P] that pairs are of one object, from their log-odds and the share of such pairs."""
+    return np.asarray(expit(odds + logit(same.mean())))
 
 
-def reliability(odds: np.ndarray, same: np.ndarray) -> np.ndarray:
+def reliability(chance: np.ndarray, same: np.ndarray) -> np.ndarray:
     """[10, 2] mean probability of one object, and share of pairs that are of one, in bins of equally many
-    pairs in order of their probability."""
-    before = np.log(same.mean() / (1 - same.mean()))
-    order = np.argsort(odds.ravel(), kind="stable")
-    chance, truth = expit(odds.ravel()[order] + before), same.ravel()[order]
-    parts = zip(np.array_split(chance, BINS), np.array_split(truth, BINS), strict=True)
-    return np.array([[part.mean(), true.mean()] for part, true in parts])
+    pairs [P] in order of their probability."""
+    order = np.argsort(chance, kind="stable")
+    parts = [(chance[part].mean(), same[part].mean()) for part in np.array_split(order, BINS)]
+    return np.array(parts)
 
 
-def calibration_error(odds: np.ndarray, same: np.ndarray) -> float:
-    """Expected calibration error: mean distance of the two over the bins."""
-    return float(np.abs(np.diff(reliability(odds, same), axis=1)).mean())
+def _auc(score: np.ndarray, same: np.ndarray) -> float:
+    """Probability that a pair of one object has a larger score than a pair of two."""
+    return auc(score[~same], score[same])
 
 
 def pooled(parts: list[HeldOut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -188,9 +184,9 @@ def table(result: LikenessResult) -> list[str]:
     ]
     for label, parts, by_block in rows:
         odds, same, distance = pooled(parts)
-        least = f" ({min(area_under_roc(part.odds, part.same) for part in parts):.3f})" if by_block else ""
-        cells = [f"{area_under_roc(odds, same):.3f}{least}", f"{area_under_roc(-distance, same):.3f}"]
-        cells += [f"{calibration_error(odds, same):.3f}"]
+        least = f" ({min(_auc(*pooled([part])[:2]) for part in parts):.3f})" if by_block else ""
+        cells = [f"{_auc(odds, same):.3f}{least}", f"{_auc(-distance, same):.3f}"]
+        cells += [f"{expected_calibration_error(probabilities(odds, same), same, BINS):.3f}"]
         cells += [f"{np.mean([part.recognised[name] for part in parts]):.3f}" for name in names]
         lines.append(f"| {label} | {' | '.join(cells)} | {chance_of(parts):.2f} |")
     return [*lines, "", *NOTES]
@@ -222,7 +218,7 @@ def draw(result: LikenessResult, png: Path) -> None:
         odds, same, distance = pooled(parts)
         for score, style, of in ((odds, "-", "log-odds"), (-distance, ":", "absolute differences")):
             axes[0].plot(*roc(score, same), style, color=color, label=f"{label}: {of}")
-        points = reliability(odds, same)
+        points = reliability(probabilities(odds, same), same)
         axes[1].plot(points[:, 0], points[:, 1], "o-", color=color, label=label)
     axes[0].plot([0, 1], [0, 1], color="0.7", lw=1, label="chance")
     axes[1].plot([0, 1], [0, 1], color="0.7", lw=1)

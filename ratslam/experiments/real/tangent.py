@@ -51,14 +51,13 @@ TIP_SHARE = 0.97
 
 class SweepResult(NamedTuple):
     """One sweep: points [N, 2] of the outline, m; tangents; direction of the stage's motion, rad; radius of
-    the fitted circle and its standard deviation, m; the outline and tangents if all contacts were at the
+    the fitted circle, m; the outline and tangents if all contacts were at the
     tip."""
 
     points: np.ndarray
     tangents: Tangents
     motion: float
     radius: float
-    radius_sd: float
     tip_points: np.ndarray
     tip_tangents: Tangents
 
@@ -163,13 +162,11 @@ def _track(known: SignalMap, place: np.ndarray, touch: SlidingContact) -> SweepR
     covariance, points = plane_covariance(track.covariance), track.outline[:, :2]
     tip_points = (_contacts_at_tip(known, touch.signal) - place)[:, :2]
     along = place[-1] - place[0]
-    circle = fit_circle(points, covariance)
     return SweepResult(
         points,
         local_tangents(points, covariance),
         float(np.arctan2(along[1], along[0])),
-        circle.radius,
-        circle.sd,
+        fit_circle(points, covariance).radius,
         tip_points,
         local_tangents(tip_points, covariance),
     )

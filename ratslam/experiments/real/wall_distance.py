@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robot.world.polygons import segment_distance
+
 
 class WallDistances(NamedTuple):
     """Distances from the robot's true position to the nearest wall, m: [E] at the first reading of each
@@ -21,13 +23,6 @@ def wall_distances(position: np.ndarray, pressed: np.ndarray, walls: np.ndarray)
     Args:
         position: [T, 2], m. pressed: [T] bool, a bumper is pressed. walls: [W, 4] ends x1, y1, x2, y2, m.
     """
-    distance = np.min([_segment_distance(position, wall) for wall in walls], axis=0)
+    distance = segment_distance(walls, position).min(axis=1)
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])
     return WallDistances(distance[begins], distance)
-
-
-def _segment_distance(position: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    """[T] distance of positions [T, 2] from a segment [4]."""
-    start, along = wall[:2], wall[2:] - wall[:2]
-    share = np.clip((position - start) @ along / max(float(along @ along), 1e-12), 0, 1)
-    return np.linalg.norm(position - start - share[:, None] * along, axis=1)

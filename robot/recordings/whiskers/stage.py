@@ -20,6 +20,7 @@ from robot.sources.registry import SourceEntry
 from robot.sources.source import Source
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.samples import longest_run
 
 COLUMNS = ("", "px", "py", "pz", "sx", "sy", "sz")
 """The index has no name."""
@@ -72,11 +73,8 @@ def cut_sweep(recording: StageRecording) -> StageRecording:
     step = np.linalg.norm(np.diff(recording.position, axis=0), axis=1)
     usual = np.median(step)
     even = (step <= UNEVEN * usual) & (step >= usual / UNEVEN)
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], even, [False]]))).reshape(-1, 2)
-    if not len(runs):
-        return recording
-    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    rows = slice(first, last + 1)
+    run = longest_run(even)
+    rows = slice(run.start, run.stop + 1) if even.any() else slice(None)
     return recording._replace(position=recording.position[rows], signal=recording.signal[rows])
 
 

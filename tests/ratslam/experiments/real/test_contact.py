@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ratslam.experiments.real.contact import baseline_of
-from ratslam.experiments.real.contact_page import stretches
 from ratslam.experiments.real.figure import REACH
 from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
+from tactile.base.samples import true_runs
 from tactile.features.contact_stream import Touch, find_contacts, find_fixed_contacts, start_stream
 from tactile.features.free_record import calibrate_free
 
@@ -29,18 +29,12 @@ def contacts(signal: np.ndarray) -> np.ndarray:
 
 def test_four_whiskers_never_touch_and_the_others_touch_a_few_times(signal: np.ndarray) -> None:
     found = contacts(signal)
-    counts = [len(stretches(whisker)) for whisker in found.T]
+    counts = [len(true_runs(whisker)) for whisker in found.T]
     assert counts[4:8] == [0, 0, 0, 0]
     assert all(1 <= count <= 6 for count in counts[:4] + counts[8:])
     fixed = find_fixed_contacts(signal[:100], signal)
-    assert len(stretches(fixed[:, 0])) > 5 * counts[0]  # a whisker that rings crosses again and again
+    assert len(true_runs(fixed[:, 0])) > 5 * counts[0]  # a whisker that rings crosses again and again
     assert not fixed[:, 13].any()  # the dirty one is silenced
-
-
-def test_stretches_are_the_runs_of_true() -> None:
-    which = np.array([True, False, True, True, False])
-    assert stretches(which) == [(0, 1), (2, 4)]
-    assert stretches(np.zeros(3, bool)) == []
 
 
 def test_the_baseline_goes_straight_across_a_contact() -> None:

@@ -32,7 +32,7 @@ def sweep_along_circle(start_deg: float, wrong_deg: float) -> SweepResult:
     points = CENTRE + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     none = np.zeros(len(angle))
     tangents = Tangents((angle + np.pi / 2 + np.radians(wrong_deg)) % np.pi, none + 0.1, none)
-    return SweepResult(points, tangents, np.pi, RADIUS, 1e-3, points, tangents)
+    return SweepResult(points, tangents, np.pi, RADIUS, points, tangents)
 
 
 def test_the_truth_is_the_circle_about_the_other_days_centre() -> None:
