@@ -32,7 +32,7 @@ def reach_config(folder: Path, file: Path) -> Path:
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     """A simulated head of rest angle 60 degrees with a dead whisker, fitted as one of 75 degrees."""
     file = tmp_path_factory.mktemp("raw") / "raw.mcap"
-    settings = {"raw": True, "path": {"explore": 25}, "mechanics": {"noise": NOISE}, "seed": 1}
+    settings = {"raw": True, "path": {"explore": 60}, "mechanics": {"noise": NOISE}, "seed": 1}
     head = HeadConfig(rest_deg=60, dead=(DEAD,))
     record_source(HeadSimulation(SimulationConfig.model_validate(settings), head), file)
     config = file.with_suffix(".yaml")
