@@ -13,6 +13,7 @@ from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
 from ratslam.pipeline.source import open_source
 from robot.recordings.unit_check import MotionTrack, TypicalMotion, typical_motion
+from robot.sources.registry import SOURCES
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
@@ -51,8 +52,15 @@ def diagnose_recording(path: Path) -> Diagnosis:
     Raises:
         InputError: it is missing, or of no known format.
     """
-    found = describe_file(path)
+    try:
+        found = describe_file(path)
+    except InputError:
+        if path.is_file() and (diagnosis := diagnose_registered(path)):
+            return diagnosis
+        raise
     if found.recording is None:
+        if diagnosis := diagnose_registered(path):
+            return diagnosis
         return Diagnosis(found.what, found.table, found.notes, found.faults or (UNREADABLE,))
     sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
     if "visual_odometry" in found.recording:
@@ -69,6 +77,25 @@ def diagnose_recording(path: Path) -> Diagnosis:
             sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
     notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
     return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
+
+
+def diagnose_registered(path: Path) -> Diagnosis | None:
+    """A recording that a registered source reads, whose only setting without default is `file`; None if no
+    source does."""
+    for name in SOURCES.names():
+        settings = {"plugin": name, "settings": {"file": str(path.resolve())}}
+        try:
+            fields = SOURCES.get(name, "source").config_class.model_fields
+            if [key for key, field in fields.items() if field.is_required()] != ["file"]:
+                continue
+            sections = {"source": settings}
+            with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
+                contents = summarise(source)
+        except Exception:  # whatever a package does with a file that is not its own
+            continue
+        what = f"{path}: a recording that the source {name} reads"
+        return Diagnosis(what, notes=facts(contents), advice=shortcomings(contents), config=sections)
+    return None
 
 
 def summarise(source: Source) -> Contents:

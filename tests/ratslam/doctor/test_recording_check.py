@@ -18,6 +18,7 @@ from tests.helpers.ros_bags import odometry, scan, write_bag
 
 START, STEP = 1_700_000_000_000_000_000, 100_000_000  # ns
 STEPS = 40
+REAL = Path(__file__).parents[2] / "data" / "real_touch"
 
 
 def write_table(path: Path, **columns: np.ndarray) -> None:
@@ -81,6 +82,29 @@ def test_the_configuration_reads_the_recording(
         assert samples is None or len(list(source)) == samples
         assert shape is None or source.view_shape == shape
         assert len(list(islice(source, 5))) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "plugin"),
+    [
+        ("stanford/stage_cylinder_2.csv", "whisker_stage"),  # a table without times
+        ("purdue/cherry.csv", "whisker_objects"),  # no header
+        ("sheffield/TXZY_dataI.mat", "taxel_contacts"),  # no reader of ours
+    ],
+)
+def test_a_recording_of_a_registered_source_is_named(name: str, plugin: str, tmp_path: Path) -> None:
+    assert main(["doctor", str(REAL / name), "-o", str(tmp_path / "mine.yaml")]) == 0
+    config = load_config(tmp_path / "mine.yaml")
+    assert config.source is not None
+    assert config.source.plugin == plugin
+    with open_source(config) as source:
+        assert len(list(islice(source, 5))) == 5
+
+
+def test_a_file_of_no_source_is_still_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "notes.mat").write_text("no matrices")
+    assert main(["doctor", str(tmp_path / "notes.mat")]) == 2
+    assert "no reader for '.mat' files" in capsys.readouterr().err
 
 
 def test_a_table_is_put_together_from_the_files_beside_it(
