@@ -136,7 +136,7 @@ def _views(trial: SourceTrial) -> str:
 
 def _masks(trial: SourceTrial) -> str:
     for k, observation in enumerate(trial.observations):
-        require_masks(observation, f"observation {k}")
+        require_masks(observation, f"observation {k}", trial.observing.info.signed_views)
     return ""
 
 

@@ -13,6 +13,7 @@ from ratslam.checks.common import run_checks
 from ratslam.checks.source import CHECKS, GROUPS
 from ratslam.checks.source_trial import SourceTrial
 from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.whiskers import objects
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
@@ -43,6 +44,10 @@ OURS = {
         SourceEntry(CreateSimulationConfig, lambda config, _: CreateSimulation(config)),
         CreateSimulationConfig(),
         most=50,
+    ),
+    "signed views": lambda: SourceTrial(
+        objects.ENTRY,
+        objects.ObjectConfig(file=ROOT / "tests" / "data" / "real_touch" / "purdue" / "cherry.csv"),
     ),
 }
 
