@@ -29,6 +29,9 @@ def merge_includes(document: Document, folder: Path) -> Document:
         return document  # nothing, or an error that validation reports
     merged = Document({**document.data, KEY: []}, document.places)
     for name in reversed(names):
+        if not (folder / name).is_file():
+            where, cure = document.at_key((KEY,)), "paths start at the folder of this configuration"
+            raise InputError(where, f"no file {folder / name}", "an existing file", cure)
         below = load(folder / name)
         if KEY in below.data:
             raise InputError(below.at_key((KEY,)), "files that an included file includes", "settings only")
