@@ -38,11 +38,11 @@ def reproduce_real(names: Sequence[str], data: Path, output: Path) -> Iterator[s
     Raises:
         InputError: a recording is missing or damaged.
     """
-    output.mkdir(parents=True, exist_ok=True)
     page = []
     for name in names:
         figure = find_figure(name)
         result = figure.measure(data)
+        output.mkdir(parents=True, exist_ok=True)
         picture = output / f"{name}.png"
         figure.draw(result, picture)
         shown = f"![{figure.title}]({picture.name})"

@@ -45,3 +45,9 @@ def test_the_page_holds_what_was_measured_before_an_error(
     assert "![Whiskers](good.png)" in lines
     assert sorted(path.name for path in output.iterdir()) == ["good.png", "real.md"]
     assert page.endswith(UNPROVEN)
+
+
+def test_nothing_is_left_where_a_recording_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        list(reproduce_real(["drift"], tmp_path, tmp_path / "page"))
+    assert not (tmp_path / "page").exists()
