@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, prepare_jax
+from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
 from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
 
@@ -63,8 +63,7 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     output = arguments.output
     if output is None or not diagnosis.config:
         return diagnosis
-    if output.exists():
-        raise InputError(str(output), "exists already", "a new file", "choose another with -o")
+    require_new_file(output)
     first = f"# Reads {arguments.path}; written by `python -m ratslam doctor`.\n"
     write_text_atomically(output, first + dump_data(diagnosis.config))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, prepare_jax
+from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
 from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
 
@@ -33,8 +33,10 @@ def add_commands(commands: Commands) -> None:
 
 def _fit(arguments: argparse.Namespace) -> int:
     output: Path | None = arguments.output
-    if output is not None and output.exists():
-        raise InputError(str(output), "exists already", "a new file", "choose another with -o")
+    if output is not None:
+        require_new_file(output)
+    if arguments.seed < 0:
+        raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
     from ratslam.fit.record import fit_record
     from ratslam.fit.rig import render_rig, rig_file
@@ -54,7 +56,8 @@ def _config_of(arguments: argparse.Namespace) -> RunConfig:
     from ratslam.config.packaged import packaged_configs
     from ratslam.config.run_config import RunConfig, load_config
     from ratslam.config.strict_yaml import dump_data, override, parse, validate
-    from ratslam.doctor.recording_check import diagnose_recording
+    from ratslam.doctor.recording_check import UNREADABLE, diagnose_recording
+    from robot.sources.input_files import raise_errors
 
     record: Path = arguments.record
     named = not record.exists() and str(record) in packaged_configs()
@@ -62,8 +65,9 @@ def _config_of(arguments: argparse.Namespace) -> RunConfig:
         return load_config(record, arguments.set)
     diagnosis = diagnose_recording(record)
     if not diagnosis.config:
-        cure = "give a configuration that reads it instead"
-        raise InputError(str(record), "; ".join(diagnosis.faults), "a recording that can be read", cure)
+        raise_errors([InputError("", fault) for fault in diagnosis.faults if fault != UNREADABLE])
+        cure = f"`python -m ratslam doctor {record}` says what is missing"
+        raise InputError(str(record), "no configuration reads it", "a recording", cure)
     text = dump_data(diagnosis.config)
     config = validate(override(parse(text, record.name), arguments.set), RunConfig)
     return config.with_absolute_paths(Path.cwd())

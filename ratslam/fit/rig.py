@@ -91,8 +91,11 @@ def rig_file(rig: Rig, record: str) -> str:
     """The file that a configuration includes: the settings, below the table as comments."""
     text = f"The rig from {record}, written by `python -m ratslam fit`.\n{render_rig(rig)}"
     comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+    settings = rig_settings(rig)
     use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."
-    return f"{comment}\n{use}\n{dump_data(rig_settings(rig))}"
+    if not settings:
+        use = "# No setting differs from what was assumed: there is nothing to include."
+    return f"{comment}\n{use}\n{dump_data(settings)}"
 
 
 def _row(quantity: Quantity) -> Sequence[str]:

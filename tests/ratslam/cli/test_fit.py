@@ -11,7 +11,7 @@ from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import dump_data
 from ratslam.fit.head import walls_of
-from ratslam.fit.rig import Quantity, Rig, rig_settings
+from ratslam.fit.rig import Quantity, Rig, rig_file, rig_settings
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions
@@ -68,6 +68,30 @@ def test_a_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[s
     assert main(["fit", str(folder / "drive_odometry.csv"), "-o", str(file)]) == 2
     assert "exists already" in capsys.readouterr().err
     assert file.read_text() == "touch: {}\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["drive_odometry.csv", "-o", "absent/rig.yaml"], "absent: no such folder"),
+        (["drive_odometry.csv", "--seed", "-1"], "--seed: -1; expected a non-negative integer"),
+        (["drive_truth.csv"], "ratslam doctor drive_truth.csv` says what is missing"),
+        (["drive_truth.mcap"], "drive_truth.mcap: is empty"),
+    ],
+)
+def test_each_mistake_gets_one_error(
+    folder: Path,
+    options: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    Path("drive_truth.mcap").touch()
+    assert main(["fit", *options]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("error")) == ("", 1)
+    assert message in said.err
 
 
 def test_the_head_and_its_dead_whiskers_are_measured(
@@ -132,6 +156,7 @@ def test_settings_are_those_that_differ() -> None:
         "touch": {"head": {"dead": [2]}},
     }
     assert "turn_scale: 1.1" in dump_data(rig_settings(rig))
+    assert "nothing to include" in rig_file(Rig(), "a.csv")
     assert set(rig_settings(rig)) <= set(RunConfig.model_fields)
 
 
