@@ -119,11 +119,16 @@ def signal_lines(record: SignalRecord, fit: SignalFit) -> tuple[str, ...]:
     reasons |= {int(k): "dead: no signal" for k in np.flatnonzero(fit.dead)}
     lines = [f"each channel: baseline; noise; correlation; drift ({record.unit}, {record.unit}/sqrt(s))"]
     for k, name in enumerate(record.names):
-        parts = (" ".join(f"{value:.3g}" for value in column[k]) for column in _columns(fit))
+        parts = (" ".join(map(_shown, column[k])) for column in _columns(fit))
         lines.append(f"  {name}: " + (reasons[k] if fit.dead[k] else "; ".join(parts)))
         if k in reasons and not fit.dead[k]:
             lines.append(f"    {reasons[k]}")
     return tuple(lines)
+
+
+def _shown(value: float) -> str:
+    """A number, or '-' where the record does not tell it."""
+    return f"{value:.3g}" if np.isfinite(value) else "-"
 
 
 def _columns(fit: SignalFit) -> tuple[np.ndarray, ...]:

@@ -68,6 +68,7 @@ def test_whiskers_of_the_arm_in_clutter(reference_data: Path, tmp_path: Path) ->
     assert all(f"drift of left{k}" not in unknown for k in (4, 5, 6, 7))  # they never touch
     assert "drift of right4" in unknown
     assert "stage-to-signal map: no known touch" in unknown
+    assert not any("nan" in line for line in rig.notes)
     assert rig_settings(rig) == {}
 
 
