@@ -13,7 +13,7 @@ import numpy as np
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action
-from tactile.base.se2 import between, wrap
+from tactile.base.se2 import between, compose, wrap
 
 if TYPE_CHECKING:
     import networkx
@@ -38,7 +38,8 @@ class Experiences(Checkpointed):
 
     def __init__(self, radius: float, heading: float) -> None:
         self.radius, self.heading = radius, heading
-        self._frame = GrowableArray((), np.int64)  # the first keyframe of each experience
+        self._frame = GrowableArray((), np.int64)  # the keyframe that holds each experience
+        self._offset = GrowableArray((3,), np.float64)  # the pose of each experience in its keyframe's frame
         self._place = GrowableArray((), np.int64)  # the experience of each keyframe
         self._link = GrowableArray((3,), np.int64)  # from, to, traversals
         self._link_of: dict[tuple[int, int], int] = {}
@@ -61,6 +62,7 @@ class Experiences(Checkpointed):
         if place < 0:
             place, action = len(self._frame.rows), Action.CREATE
             self._frame.append(frame)
+            self._offset.append((0.0, 0.0, 0.0))
         elif place != previous:
             known = (previous, place) in self._link_of or (place, previous) in self._link_of
             action = Action.SET if known or previous < 0 else Action.LINK
@@ -70,9 +72,14 @@ class Experiences(Checkpointed):
         self._current = place
         return ExperienceChange(place, previous, action)
 
-    def merge(self, source: np.ndarray, onto: np.ndarray) -> None:
-        """Follows a merge of keyframes; see `MergedRows`."""
-        self._frame.rows[:] = onto[self._frame.rows]
+    def merge(self, source: np.ndarray, onto: np.ndarray, offset: np.ndarray) -> None:
+        """Follows a merge of keyframes, see `MergedRows`.
+
+        An experience keeps its pose, also where its keyframe is merged with one that faces the other way.
+        """
+        frame = self._frame.rows
+        self._offset.rows[:] = compose(offset[frame], self._offset.rows)
+        frame[:] = onto[frame]
         self._place.replace(self._place.rows[source])
 
     def graph(self, poses: np.ndarray, taken: np.ndarray) -> networkx.DiGraph:
@@ -84,20 +91,24 @@ class Experiences(Checkpointed):
         import networkx  # slow to import
 
         graph: networkx.DiGraph = networkx.DiGraph()
+        places = self._poses(poses)
         for place, frame in enumerate(self._frame.rows.tolist()):
-            x, y, heading = map(float, poses[frame])
+            x, y, heading = map(float, places[place])
             graph.add_node(place, x=x, y=y, heading=heading, keyframe=int(taken[frame]))
         for a, b, traversals in self._link.rows.tolist():
-            ends = poses[self._frame.rows[[a, b]]]
-            dx, dy, dtheta = map(float, between(ends[0], ends[1]))
+            dx, dy, dtheta = map(float, between(places[a], places[b]))
             graph.add_edge(a, b, dx=dx, dy=dy, dtheta=dtheta, traversals=traversals)
         return graph
+
+    def _poses(self, poses: np.ndarray) -> np.ndarray:
+        """[E, 3] poses of the experiences."""
+        return compose(poses[self._frame.rows], self._offset.rows)
 
     def _near(self, poses: np.ndarray, frame: int, reliable: bool) -> int:
         """The current experience if in reach, else the nearest in reach if the pose is reliable, or -1."""
         if not len(self._frame.rows):
             return -1
-        apart = poses[self._frame.rows] - poses[frame]
+        apart = self._poses(poses) - poses[frame]
         turned = wrap(apart[:, 2])
         far = np.hypot(np.hypot(apart[:, 0], apart[:, 1]) / self.radius, turned / self.heading)
         if far[self._current] <= 1:

@@ -59,7 +59,7 @@ class KeyframeMerger(Checkpointed):
             return None
         self._archive.merge(merge, graph, log)
         _merge(merge, graph, log, selection)
-        experiences.merge(merge.kept, merge.onto)
+        experiences.merge(merge.kept, merge.onto, merge.offset)
         views = graph.appearance.stored(graph.taken.rows)
         return MergedRows(merge.kept, *views, merge.onto, merge.offset)
 
@@ -80,7 +80,7 @@ class KeyframeMerger(Checkpointed):
         _merge(merge, graph, log, selection)
         graph.optimise(log)
         source, onto = row[merge.kept], merge.onto[taken]
-        experiences.merge(source, onto)
+        experiences.merge(source, onto, merge.offset[taken])
         return MergedRows(source, *graph.appearance.stored(merge.kept), onto, merge.offset[taken])
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ratslam.core.types import Action
 from ratslam.keyframes.experiences import ExperienceChange, Experiences
-from tactile.base.se2 import compose, wrap
+from tactile.base.se2 import between, compose, wrap
 
 RADIUS, HEADING = 1.0, 0.5
 
@@ -127,7 +127,7 @@ def test_the_graph_follows_from_the_changes(steps, cut):
     assert [graph.nodes[place]["keyframe"] for place in graph] == made
     assert {(a, b): data["traversals"] for a, b, data in graph.edges(data=True)} == ways
     stands = [np.array([node["x"], node["y"], node["heading"]]) for node in graph.nodes.values()]
-    assert np.array_equal(stands, moved[made])
+    np.testing.assert_allclose(stands, moved[made], rtol=0, atol=1e-12)
     for a, b, way in graph.edges(data=True):
         gap = compose(stands[a], np.array([way["dx"], way["dy"], way["dtheta"]])) - stands[b]
         assert np.allclose([*gap[:2], wrap(gap[2])], 0, atol=1e-9)
@@ -139,3 +139,19 @@ def test_the_graph_follows_from_the_changes(steps, cut):
         assert again.arrive(poses[: k + 1], k, *steps[k][3:]) == changes[k]
     assert again.stay() == world.stay()
     assert all(np.array_equal(again.arrays()[name], rows) for name, rows in world.arrays().items())
+
+
+def test_an_experience_keeps_its_pose_when_its_frame_is_merged_with_one_that_faces_back():
+    world, _, poses = walk(at(0.0), at(5.0), at(5.02, 0.01, np.pi), at(0.0, 0.0, np.pi))
+    poses = poses - [0.0, 0.0, 0.1]
+    before = world.graph(poses, np.arange(4))
+    kept, onto = np.array([0, 1]), np.array([0, 1, 1, 0])
+    offset = between(poses[kept[onto]], poses)
+    world.merge(kept, onto, offset)
+    after = world.graph(poses[kept], kept)
+    assert len(after) == len(before) == 4
+    for place in before:
+        for key in ("x", "y", "heading"):
+            assert after.nodes[place][key] == pytest.approx(before.nodes[place][key], abs=1e-12)
+    # The robot comes back the other way and finds the experience, not the one of its merged frame.
+    assert world.arrive(np.vstack([poses[kept], poses[2]]), 2, -1, True).place == 2
