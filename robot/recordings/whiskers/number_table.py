@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,8 @@ def read_columns(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, str]:
             numbers.
     """
     content = read_bytes(path)
-    header, _, rows = content.partition(b"\n")
-    names = header.decode("utf-8", "replace").strip().split(",")
+    header, _, rows = _text(path, content).partition("\n")
+    names = header.strip().split(",")
     if lacking := [name for name in columns if name not in names]:
         raise missing_error(str(path), "column", lacking[0], names)
     if names != list(columns):
@@ -38,21 +38,28 @@ def read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
     """
     content = read_bytes(path)
     columns = [f"column {number}" for number in range(1, count + 1)]
-    return _parse(path, content, columns, first_line=1), digest_of([content])
+    return _parse(path, _text(path, content), columns, first_line=1), digest_of([content])
 
 
-def _parse(path: Path, rows: bytes, columns: Sequence[str], first_line: int) -> np.ndarray:
+def _text(path: Path, content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(str(path), "bytes that are not UTF-8", "a CSV file in UTF-8") from None
+
+
+def _parse(path: Path, rows: str, columns: Sequence[str], first_line: int) -> np.ndarray:
     expected = f"{len(columns)} numbers in each line"
     if not rows.strip():
         raise InputError(str(path), "no rows", expected, "was it copied completely?")
-    if not rows.endswith(b"\n"):
+    if not rows.endswith("\n"):
         raise InputError(str(path), "the last line is cut", cure="copy the file again")
     try:
-        table = np.loadtxt(BytesIO(rows), delimiter=",", comments=None, ndmin=2)
-    except ValueError as error:
-        raise InputError(str(path), str(error), expected) from None
+        table = np.loadtxt(StringIO(rows), delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        table = np.empty((0, 0))
     if table.shape[1] != len(columns):
-        raise InputError(str(path), f"{table.shape[1]} columns", expected)
+        raise _first_fault(path, rows, columns, first_line)
     raise_errors(
         [
             error
@@ -61,3 +68,17 @@ def _parse(path: Path, rows: bytes, columns: Sequence[str], first_line: int) -> 
         ]
     )
     return table
+
+
+def _first_fault(path: Path, rows: str, columns: Sequence[str], first_line: int) -> InputError:
+    """The first line that does not hold the numbers, and what it holds."""
+    for number, line in enumerate(rows.splitlines(), start=first_line):
+        cells, where = line.split(","), f"{path}:{number}"
+        if line.strip() and len(cells) != len(columns):
+            return InputError(where, f"{len(cells)} cells", f"{len(columns)} numbers")
+        for column, cell in zip(columns, cells, strict=False):
+            try:
+                float(cell or "empty")
+            except ValueError:
+                return InputError(where, f"{cell!r} in {column}", "a number")
+    return InputError(str(path), "lines of different lengths", f"{len(columns)} numbers in each line")

@@ -53,15 +53,16 @@ def test_a_calibration_is_above_the_signal_at_the_base() -> None:
         ("", "is empty"),
         (HEADER + "\n", "no rows"),
         (",x,y,z,sx,sy,sz\n" + ROW, "no column 'px'"),
-        (HEADER + "\n" + ROW + "\n1,1.0,2.0,3.0,4.0\n", "columns changed"),
+        (HEADER + "\n" + ROW + "\n1,1.0,2.0,3.0,4.0\n", r"bad\.csv:3: 5 cells"),
         (HEADER + "\n" + ROW, "last line is cut"),
         (HEADER + "\n0,1.0,2.0,3.0,nan,5.0,6.0\n", r"bad\.csv:2: sx is nan"),
-        (HEADER + "\n0,1.0,2.0,3.0,four,5.0,6.0\n", "'four'"),
+        (HEADER + "\n0,1.0,2.0,3.0,four,5.0,6.0\n", r"bad\.csv:2: 'four' in sx; expected a number"),
+        ("\udcff" + HEADER + "\n" + ROW + "\n", "not UTF-8"),
     ],
 )
 def test_a_bad_file_gives_one_error(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "bad.csv"
-    path.write_text(text)
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(InputError, match=found):
         read_stage(path)
 
