@@ -118,8 +118,13 @@ def load_into_memory(source: Source) -> InMemorySource:
 
 def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
     """The first steps of a source in memory; its digest is the original one followed by their number."""
-    columns = ("time", "motion", "moved", "views", "seen", "label", "truth", "contact", "point")
-    cut = {name: getattr(log, name)[:steps] for name in columns if getattr(log, name) is not None}
-    if log.alive.ndim == 2:
-        cut["alive"] = log.alive[:steps]
-    return replace(log, digest=f"{log.digest}[:{steps}]", **cut)
+    return replace(select_rows(log, np.arange(log.length)[:steps]), digest=f"{log.digest}[:{steps}]")
+
+
+def select_rows(log: InMemorySource, rows: np.ndarray) -> InMemorySource:
+    """The rows of a source in memory with these numbers [n]; motions stay as they are, and so does the
+    digest."""
+    columns = ["time", "motion", "moved", "views", "seen", "label", "truth", "contact", "point"]
+    columns += ["alive"] * (log.alive.ndim == 2)
+    chosen = {name: getattr(log, name)[rows] for name in columns if getattr(log, name) is not None}
+    return replace(log, **chosen)

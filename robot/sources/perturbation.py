@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.sources.in_memory import InMemorySource
+from robot.sources.in_memory import InMemorySource, select_rows
 from tactile.base.se2 import compose
 
 VIEW_NOISE = 0.01
@@ -153,16 +153,8 @@ def _draw_share(rows: np.ndarray, stream: np.random.Generator) -> np.ndarray:
 def _cut(log: InMemorySource, first: int, rows: np.ndarray) -> InMemorySource:
     """The remaining rows, each with the motion since the remaining row before it."""
     motion = _merge_motions(log.motion, rows, first)
-    return replace(
-        log,
-        time=log.time[rows],
-        motion=motion,
-        moved=log.moved[rows] | motion[:, :3].any(axis=1),
-        views=log.views[rows],
-        seen=log.seen[rows],
-        label=log.label[rows],
-        truth=None if log.truth is None else log.truth[rows],
-    )
+    moved = log.moved[rows] | motion[:, :3].any(axis=1)
+    return replace(select_rows(log, rows), motion=motion, moved=moved)
 
 
 def _merge_motions(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:

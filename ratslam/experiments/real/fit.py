@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from ratslam.fit.revisits import RevisitFit, fit_revisits
 from ratslam.fit.wheels import WheelFit, fit_wheels
 from ratslam.fit.whiskers import read_signals_of_reach
 from ratslam.pipeline.source import open_source
-from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
@@ -114,13 +113,7 @@ def _measure_wheels(name: str, log: InMemorySource, folder: Path) -> RecordResul
 
 def _halves(log: InMemorySource) -> tuple[InMemorySource, InMemorySource]:
     half = log.length // 2
-    return _rows(log, slice(None, half)), _rows(log, slice(half, None))
-
-
-def _rows(log: InMemorySource, rows: slice) -> InMemorySource:
-    assert log.truth is not None
-    columns = ("time", "motion", "moved", "views", "seen", "label", "truth")
-    return replace(log, **{name: getattr(log, name)[rows] for name in columns})
+    return select_rows(log, np.arange(half)), select_rows(log, np.arange(half, log.length))
 
 
 def _pairs(log: InMemorySource, result: RecordResult) -> list[tuple[InMemorySource, WheelFit]]:

@@ -17,7 +17,7 @@ from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
 FILES = {path.stem: path for path in (ROOT / "configs").glob("*.yaml")}
-REAL = {"building", "create_lab", "intel_laser", "tuc_lecture_hall"}
+REAL = {"building", "create_bumps", "create_lab", "intel_laser", "tuc_lecture_hall"}
 
 
 @pytest.fixture(autouse=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from robot.sources.in_memory import InMemorySource, load_into_memory, truncate_log
+from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows, truncate_log
 
 ROWS, WHISKERS = 6, 4
 
@@ -30,6 +32,17 @@ def test_a_whisker_may_be_bent_for_a_part_of_the_session() -> None:
     assert log.whiskers == WHISKERS
     np.testing.assert_array_equal([sample.reading.alive for sample in log], alive)
     np.testing.assert_array_equal([sample.reading.alive for sample in truncate_log(log, 3)], alive[:3])
+
+
+def test_rows_left_out_leave_out_their_flags_and_contacts() -> None:
+    alive = np.arange(ROWS)[:, None] % 3 != np.arange(WHISKERS) % 3
+    point = np.arange(ROWS * WHISKERS * 2, dtype=float).reshape(ROWS, WHISKERS, 2)
+    log = replace(source(alive), contact=alive, point=point)
+    rows = np.array([1, 4, 5])
+    for row, sample in zip(rows, select_rows(log, rows), strict=True):
+        np.testing.assert_array_equal(sample.reading.alive, alive[row])
+        np.testing.assert_array_equal(sample.reading.contact, alive[row])
+        np.testing.assert_array_equal(sample.reading.point, point[row])
 
 
 def test_one_row_of_flags_holds_for_all() -> None:
