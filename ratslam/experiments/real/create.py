@@ -181,7 +181,7 @@ def draw_create(result: CreateResult, png: Path) -> None:
         path = result.paths[name]
         room.plot(path[:, 0], path[:, 1], color=colour, lw=0.9, label=label)
     room.set_aspect("equal")
-    room.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(-0.42, 0.1))
+    room.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.88, 1.0))
     name_axes(room, "x (m)", "y (m)")
     below = add_axes(figure, 0.62, 0.55, 7.0, 1.8)
     bins = np.arange(0.1, 0.8, 0.01)
