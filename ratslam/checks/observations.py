@@ -34,18 +34,24 @@ def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what:
         require(fits, f"{path} of {what} is {text}", f"NumPy {names[kind]} {shape}")
 
 
-def require_masks(found: Observation, what: str, signed: bool = False) -> None:
-    """Raises `Violation` if an observation has NaN or infinite values, or a view outside 0..1.
+def require_finite(found: Observation, what: str) -> None:
+    """Raises `Violation` if an observation has NaN or infinite values.
 
     Args:
-        what: the observation, for the message. signed: views may have any finite values (`signed_views`).
+        what: the observation, for the message.
     """
     for path, leaf in leaves(found):
         finite = bool(np.isfinite(leaf).all())
         require(
             finite, f"{path} of {what} has NaN or infinity", "absent values masked, for example view_seen"
         )
-    if signed:
-        return
+
+
+def require_brightness(found: Observation, what: str) -> None:
+    """Raises `Violation` if the view of an observation has values outside 0..1.
+
+    Args:
+        what: the observation, for the message.
+    """
     low, high = float(np.min(found.view, initial=0.0)), float(np.max(found.view, initial=0.0))
     require(low >= 0 and high <= 1, f"view of {what} has values {low:g} to {high:g}", "values in 0..1")

@@ -18,7 +18,7 @@ from ratslam.checks.common import (
     require_settings_class,
     run_checks,
 )
-from ratslam.checks.observations import require_masks, require_shapes
+from ratslam.checks.observations import require_brightness, require_finite, require_shapes
 from ratslam.checks.source_trial import SAMPLES, SourceTrial, is_recording, read
 from robot.sources.registry import SOURCES
 from robot.sources.source import Sample, rate_of
@@ -136,7 +136,9 @@ def _views(trial: SourceTrial) -> str:
 
 def _masks(trial: SourceTrial) -> str:
     for k, observation in enumerate(trial.observations):
-        require_masks(observation, f"observation {k}", trial.observing.info.signed_views)
+        require_finite(observation, f"observation {k}")
+        if not trial.observing.info.signed_views:
+            require_brightness(observation, f"observation {k}")
     return ""
 
 

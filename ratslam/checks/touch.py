@@ -18,7 +18,7 @@ from ratslam.checks.common import (
     require_settings_class,
     run_checks,
 )
-from ratslam.checks.observations import require_masks, require_shapes
+from ratslam.checks.observations import require_brightness, require_finite, require_shapes
 from ratslam.checks.source_trial import Reading, read
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.registry import SOURCES
@@ -129,7 +129,8 @@ def _shapes(trial: TouchTrial) -> str:
 
 def _masks(trial: TouchTrial) -> str:
     for what, one in trial.observations():
-        require_masks(one, what)
+        require_finite(one, what)
+        require_brightness(one, what)
     return ""
 
 

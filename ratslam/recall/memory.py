@@ -73,8 +73,7 @@ class Memory(NamedTuple):
 
     Attributes:
         view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32. packet: [C, 3]
-            pose-cell packet when the
-            keyframe was taken, cells.
+            pose-cell packet when the keyframe was taken, cells.
         x, y, cosine, sine: [C] poses in the map. count, distinct: number of keyframes and of known labels,
             int32.
         anchor: [K] int32 keyframes of the modes, offset: [K, 3] pose of each mode in its keyframe's frame
