@@ -138,7 +138,7 @@ prepare_jax()
 import evaluation.metrics.scorecard
 from ratslam.config.run_config import load_config
 from ratslam.pipeline.run import open_observations
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 with open_observations(load_config("configs/whisker_maze.yaml")) as (config, source):
     build_session(config, source)
     next(iter(source))

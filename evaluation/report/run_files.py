@@ -24,7 +24,7 @@ FILES = {
     "views.npz": "whisker images of all steps",
     "map.json": "experiences and their links as a node-link graph",
     "map.g2o": "the pose graph, for other optimisers",
-    "map.npz": "checkpoint; `run --continue` goes on from it",
+    "map.npz": "the map; `run --continue` goes on from it",
     "calibration.yaml": "calibration of the odometry, as settings for the next session",
     "grid.npz": "occupancy grid: probability, origin, cell",
     "map.pgm": "occupancy grid as an image, for nav2",

@@ -58,6 +58,10 @@ class BackendEntry(NamedTuple):
         hints = get_type_hints(self.evidence, include_extras=True)
         return tuple(name for name, hint in hints.items() if hint == Scalar and name != "outcome")
 
+    def outcome(self, evidence: Any) -> str:
+        """The name of a step's outcome, as in `steps.csv`."""
+        return self.outcomes(int(evidence.outcome)).name.lower()
+
 
 BACKENDS = Registry(
     "ratslam.backends",

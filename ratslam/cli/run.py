@@ -17,9 +17,9 @@ def add_commands(commands: Commands) -> None:
     add_config(run)
     add_run_directory(run)
     run.add_argument(
-        "--continue", dest="resume", type=Path, metavar="NPZ",
-        help="checkpoint (map.npz) to continue from: after its last sample if the recording is the same, "
-        "else from the first sample",
+        "--continue", dest="resume", type=Path, metavar="MAP",
+        help="map to continue from, a run directory or its map.npz: after its last sample if the recording "
+        "is the same, else from the first sample",
     )  # fmt: skip
     run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations
 from robot.touch_source import observation_of
 

@@ -267,7 +267,8 @@ def run_mapper(line: Connection) -> None:
 def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
     from ratslam.core.types import Action
-    from ratslam.pipeline.runner import build_session, open_runner
+    from ratslam.pipeline.build_session import build_session
+    from ratslam.pipeline.runner import open_runner
     from ratslam.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation

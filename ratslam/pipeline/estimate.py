@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -67,3 +68,25 @@ def pose_estimate(step: Step, outcome: str) -> PoseEstimate:
     return PoseEstimate(
         pose, spread @ spread.T, int(estimate.place), outcome, Health(float(step.doubt)), bool(estimate.lost)
     )
+
+
+def estimate_arrays(estimate: PoseEstimate) -> dict[str, np.ndarray]:
+    """An estimate as arrays of a file."""
+    named = estimate._asdict()
+    named["doubt"] = named.pop("health").doubt
+    return {name: np.array(value) for name, value in named.items()}
+
+
+def read_estimate(arrays: Mapping[str, np.ndarray]) -> PoseEstimate:
+    """The estimate of `estimate_arrays`; that before the first step if there are none.
+
+    Raises:
+        KeyError, ValueError: arrays are missing or of other shapes.
+    """
+    if not arrays:
+        return START
+    pose, covariance = np.array(arrays["pose"], float), np.array(arrays["covariance"], float)
+    if pose.shape != (3,) or covariance.shape != (3, 3):
+        raise ValueError(f"an estimate of shapes {pose.shape} and {covariance.shape}")
+    place, outcome, doubt = int(arrays["place"]), str(arrays["outcome"]), float(arrays["doubt"])
+    return PoseEstimate(pose, covariance, place, outcome, Health(doubt), bool(arrays["lost"]))

@@ -43,7 +43,7 @@ def run(
     Args:
         config: a configuration, its file, or its name. directory: the new run directory; None: runs/NAME, or
             runs/NAME-2 and so on if there is one, so that nothing is lost or overwritten.
-        resume: checkpoint (map.npz) to continue from.
+        resume: map to continue from, a run directory or its map.npz.
 
     Returns:
         the result; after Ctrl-C that of the steps so far, with `interrupted`.

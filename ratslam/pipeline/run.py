@@ -32,8 +32,8 @@ def run(
     """Maps the source of a configuration and scores the result.
 
     Args:
-        config: with absolute paths. directory: the new run directory. resume: checkpoint to continue from.
-        observers: are told of the progress.
+        config: with absolute paths. directory: the new run directory.
+        resume: map to continue from, a run directory or a file. observers: are told of the progress.
 
     Returns:
         the scorecard, and whether Ctrl-C ended the run early; the results are then those up to that step.

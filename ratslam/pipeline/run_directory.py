@@ -6,13 +6,10 @@ interrupt, a kill or a full disk leaves a readable prefix.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
-
-import numpy as np
 
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
@@ -74,24 +71,3 @@ class RunDirectory:
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Writes any file atomically: `write(path)` gets a temporary path with the same suffix."""
         write_atomically(self.path / name, write)
-
-
-def read_checkpoint(path: Path, expected: str = "the map.npz of a run directory") -> dict[str, np.ndarray]:
-    """The arrays of a checkpoint.
-
-    Args:
-        expected: kind of checkpoint, for errors.
-
-    Raises:
-        InputError: there is no such file, or it is not a complete checkpoint.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", expected) from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"not a checkpoint ({error})", expected) from None
-    if "steps" not in arrays:
-        raise InputError(str(path), "an archive of other arrays", expected)
-    return arrays

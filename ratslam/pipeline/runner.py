@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,14 +23,12 @@ from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import write_tum
 from evaluation.plots.run_plots import plot_writers
-from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors, build
+from ratslam.backends.registry import BACKENDS, BackendEntry
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
-from ratslam.keyframes.config import FULL, Ablation
 from ratslam.pipeline.artifacts import (
     WhiskerView,
     save_closure_views,
@@ -37,11 +36,15 @@ from ratslam.pipeline.artifacts import (
     save_whisker_views,
     save_world,
 )
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
-from ratslam.pipeline.run_directory import RunDirectory, read_checkpoint
+from ratslam.pipeline.run_directory import RunDirectory
+from ratslam.pipeline.saved_map import NAME, describe_readings, read_map, write_map
+from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Sample, Source
-from robot.touch_source import observation_of, planar_whiskers_of
+from robot.touch_source import observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation
@@ -51,13 +54,13 @@ CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
 A run continued after a kill repeats at most these. The interval grows, because each checkpoint holds the
 whole run and would make the total cost O(N^2) at a fixed interval."""
-RESERVED = 4096
-"""Longest source, in steps, that has its rows reserved from the start, so that the kernel is compiled once.
-Longer sources seldom fill their rows, and a step takes time for each row, in use or not."""
 
 
 class Runner:
     """Processes the samples of a source; `open_runner` makes one.
+
+    Args:
+        estimate: of the last step of a resumed session.
 
     Attributes:
         session: the backend's session. skipped: samples that a resumed session has processed before.
@@ -70,8 +73,9 @@ class Runner:
         directory: RunDirectory,
         manifest: dict[str, Any],
         session: Session,
-        skipped: int,
+        skipped: int = 0,
         observers: Sequence[Observer] = (),
+        estimate: PoseEstimate = START,
     ) -> None:
         self.session, self.skipped = session, skipped
         self._config, self._source, self._directory, self._manifest = config, source, directory, manifest
@@ -80,7 +84,7 @@ class Runner:
         self._odometry_pose = np.zeros(3)
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
-        self._saved = session.steps
+        self._saved, self._estimate = session.steps, estimate
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
             observer.begin(_describe(config, source, session))
@@ -98,8 +102,10 @@ class Runner:
             self._odometry_pose = compose(self._odometry_pose, np.array(observation.odometry[:3], float))
             odometry.append(self._odometry_pose)
             self._truth.append(np.nan if sample.truth is None else sample.truth)
-        self._directory.append(
-            _lines(samples, steps, odometry, BACKENDS.get(self._config.backend, "backend"))
+        entry = BACKENDS.get(self._config.backend, "backend")
+        self._directory.append(_lines(samples, steps, odometry, entry))
+        self._estimate = pose_estimate(
+            steps[-1], entry.outcomes(int(steps[-1].evidence.outcome)).name.lower()
         )
         self._directory.append({"timing.csv": f"{self.session.steps},{len(steps)},{took:.6f}\n"})
         error = self._online_error.update(self.session, self._truth.rows)
@@ -170,8 +176,10 @@ class Runner:
         return MapReport(session.map.judged_closures(), session.backend.activity(session.state))
 
     def _checkpoint(self) -> None:
-        arrays: dict[str, Any] = self.session.arrays() | {"digest": np.array(self._source.digest)}
-        self._directory.file("map.npz", lambda path: np.savez_compressed(path, **arrays))
+        write_map(
+            self._directory.path / NAME, self.session, self._config, describe_readings(self._source),
+            recording=self._source.digest, estimate=self._estimate,
+        )  # fmt: skip
 
 
 @contextmanager
@@ -187,18 +195,18 @@ def open_runner(
 
     Args:
         config: completed for the source. source: of observations. directory: its path.
-        resume: checkpoint to restore the session from. session: one that `build_session` has made for them
-            before; None makes it.
+        resume: map to restore the session from, a run directory or a file.
+        session: one that `build_session` has made for them before; None makes it.
         observers: are told of the progress; results are the same with and without.
 
     Raises:
-        InputError: the relations, the checkpoint or the run directory cannot be used.
+        InputError: the relations, the map or the run directory cannot be used.
     """
     if config.score.relations:
         read_relations(config.score.relations)  # fails before the directory is created
     build_metrics(config.score.metrics)
     session = session or build_session(config, source)
-    skip = _resume(session, resume, source.digest) if resume else 0
+    skip, estimate = _resume(session, resume, config, source) if resume else (0, START)
     if source.length is not None and source.length <= skip:
         found = f"already holds all {skip} samples of {source.name}"
         raise InputError(str(resume), found, "that of an unfinished run")
@@ -208,31 +216,7 @@ def open_runner(
         manifest = _manifest(config, text, source, resume)
         _write_manifest(files, manifest | {"status": "running"})
         save_world(source.info, files)
-        yield Runner(config, source, files, manifest, session, skip, observers)
-
-
-def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
-    """A new session for a completed configuration and its source of observations; prepares JAX's precision.
-
-    Args:
-        ablation: parts of the keyframe map to switch off.
-
-    A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
-    configurations give equal capacities, and so equal bits.
-    """
-    prepare_precision(config.session.precision)
-    sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
-    return Session(
-        build(config.backend, config, sensors, config.session.precision, ablation),
-        seed=config.session.seed,
-        reserve=config.session.reserve or _known_rows(source.length),
-        precision=config.session.precision,
-    )
-
-
-def _known_rows(length: int | None) -> int:
-    """Rows to reserve for a source of this length, 0 if they are not worth it: a step adds at most one."""
-    return length if length is not None and length <= RESERVED else 0
+        yield Runner(config, source, files, manifest, session, skip, observers, estimate)
 
 
 def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
@@ -283,7 +267,7 @@ def _step_line(time: float, step: Step, entry: BackendEntry, columns: Sequence[s
         *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
         str(int(estimate.lost)),
         _cell(np.asarray(step.doubt)),
-        entry.outcomes(int(step.evidence.outcome)).name.lower(),
+        entry.outcome(step.evidence),
         *(_cell(getattr(step.evidence, name)) for name in columns),
     ]
     return ",".join(cells) + "\n"
@@ -312,14 +296,13 @@ def _write_final_map(session: Session, directory: RunDirectory) -> None:
         directory.file("closures.csv", lambda path: write_closure_pairs(path, pairs))
 
 
-def _resume(session: Session, path: Path, digest: str) -> int:
-    """Restores a checkpoint; returns how many samples of the source it has already processed."""
-    arrays = read_checkpoint(path)
-    try:
-        session.restore(arrays)
-    except (ValueError, KeyError) as error:
-        raise InputError(str(path), str(error), "a checkpoint made with this configuration") from None
-    return session.steps if str(arrays.get("digest", "")) == digest else 0
+def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> tuple[int, PoseEstimate]:
+    """Restores a map; returns how many samples of the source it has already processed, and its estimate."""
+    saved = read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
+    check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+    saved.restore(session)
+    same = bool(source.digest) and saved.recording == source.digest
+    return session.steps if same else 0, saved.estimate
 
 
 def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +11,16 @@ import numpy as np
 
 from ratslam.backends.registry import BACKENDS
 from ratslam.config.completion import complete
-from ratslam.config.run_config import LoopConfig, RunConfig
-from ratslam.config.strict_yaml import dump, parse, validate
+from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import with_prefix
-from ratslam.pipeline.estimate import START, Health, PoseEstimate, pose_estimate
-from ratslam.pipeline.run_directory import read_checkpoint
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
+from ratslam.pipeline.saved_map import describe_readings, read_map, write_map
 from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
-from robot.sources.description import SourceDescription, describe
+from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 from tactile.features.whisker_image import view_shape
@@ -64,7 +62,7 @@ class Slam:
 
     def _build(self, config: RunConfig, source: Source) -> None:
         observed = open_touch_source(source, config.touch)
-        self.config, self.source = config, describe(source)
+        self.config, self.source = config, describe_readings(observed)
         self.session = build_session(config, observed)
         self.estimate = START
         self._frontend = observed.start() if isinstance(observed, TouchSource) else None
@@ -99,8 +97,8 @@ class Slam:
         observed = self._observe(reading.reading if isinstance(reading, Sample) else reading)
         if observed is not None:
             step = self.session.step(match_observation(observed, self._blank))
-            outcome = BACKENDS.get(self.config.backend, "backend").outcomes(int(step.evidence.outcome))
-            self.estimate = pose_estimate(step, outcome.name.lower())
+            entry = BACKENDS.get(self.config.backend, "backend")
+            self.estimate = pose_estimate(step, entry.outcome(step.evidence))
         return self.estimate
 
     def trajectory(self) -> np.ndarray:
@@ -109,63 +107,39 @@ class Slam:
         return self.map.trajectory() if self.steps else np.zeros((0, 3))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a checkpoint (NumPy's .npz) with the configuration and the description of the source.
+        """Writes the map (`ratslam.pipeline.saved_map`), with which a run continues too.
 
         Args:
             path: of the file; its folder is made, and an older file is replaced.
         """
-        before = self.estimate
-        arrays: dict[str, Any] = self.session.arrays() | {
-            "config": np.array(dump(self.config)),
-            "source": np.array(self.source.to_json()),
-            "estimate/pose": before.pose,
-            "estimate/covariance": before.covariance,
-            "estimate/place": np.array(before.place),
-            "estimate/outcome": np.array(before.outcome),
-            "estimate/doubt": np.array(before.health.doubt),
-            "estimate/lost": np.array(before.lost),
-        }
-        memory = {} if self._frontend is None else self._frontend.arrays()
-        arrays |= {f"frontend/{name}": value for name, value in memory.items()}
         file = Path(path)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, lambda temporary: _write_arrays(temporary, arrays))
+        frontend = {} if self._frontend is None else self._frontend.arrays()
+        write_map(file, self.session, self.config, self.source, estimate=self.estimate, frontend=frontend)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Slam:
-        """Continues from a checkpoint made by `save`, to the same bits; the first step compiles.
+        """Continues from a map to the same bits; the first step compiles.
+
+        Args:
+            path: of a map written by `save`, or of a run directory or its map.npz; the touch front end of a
+                run starts anew.
 
         Raises:
-            InputError: there is no such file, or `save` did not write it.
+            InputError: there is no map, or it cannot be used (`read_map`).
         """
-        expected = "a checkpoint written by Slam.save"
-        arrays = read_checkpoint(Path(path), expected)
+        saved = read_map(Path(path), warnings.warn)
         slam = cls.__new__(cls)
-        try:
-            config = validate(parse(str(arrays["config"]), str(path)), LoopConfig)
-            slam._build(config, SourceDescription.from_json(str(arrays["source"])))
-            slam._restore(arrays)
-        except KeyError as error:
-            raise InputError(str(path), f"a checkpoint without {error}", expected) from None
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(str(path), str(error), expected) from None
+        slam._build(saved.config, saved.source)
+        saved.restore(slam.session)
+        slam.estimate = saved.estimate
+        if slam._frontend is not None and saved.frontend:
+            try:
+                slam._frontend.restore(dict(saved.frontend))
+            except (LookupError, ValueError, TypeError) as error:
+                found = f"the front end's arrays do not fit it ({error})"
+                raise InputError(str(path), found, "a map of this front end") from None
         return slam
-
-    def _restore(self, arrays: dict[str, np.ndarray]) -> None:
-        self.session.restore(arrays)
-        last = with_prefix(arrays, "estimate/")
-        self.estimate = PoseEstimate(
-            last["pose"],
-            last["covariance"],
-            int(last["place"]),
-            str(last["outcome"]),
-            Health(float(last["doubt"])),
-            bool(last["lost"]),
-        )
-        if self._frontend is not None:
-            self._frontend.restore(with_prefix(arrays, "frontend/"))
 
     def _observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation | None:
         if isinstance(reading, Observation) and self.config.touch.frontend is None:
@@ -215,8 +189,3 @@ def describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription
         )
     head = ur10_head(head_config_of(info, touch.head))
     return SourceDescription(view_shape(touch.image, head), len(head.length), info=info)
-
-
-def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    with path.open("wb") as file:  # with a path, NumPy would add a suffix
-        np.savez_compressed(file, **arrays)

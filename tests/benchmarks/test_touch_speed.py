@@ -11,7 +11,7 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_source, read_observations
 from robot.touch_source import open_touch_source
 

@@ -16,7 +16,7 @@ import numpy as np
 from evaluation.metrics.experience_metric import experience_metric
 from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Action
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
 from tactile.base.types import Observation
 

@@ -19,7 +19,7 @@ from ratslam.core.types import GridDrawing
 from ratslam.experiments.real.figure import RealFigure, require_recordings
 from ratslam.experiments.real.wall_distance import wall_distances
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations
 from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
 from robot.sources.odometry_correction import correct_observations

@@ -16,7 +16,7 @@ from evaluation.metrics.trajectory import ate
 from ratslam.core.session import Session
 from ratslam.experiments.studies.growth import Ground, GrowthTask
 from ratslam.experiments.studies.machine import Machine, compilations, machine
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
 from tactile.base.config import Settings
 from tactile.base.se2 import integrate

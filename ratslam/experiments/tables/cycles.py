@@ -17,7 +17,7 @@ from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of

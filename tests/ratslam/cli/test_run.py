@@ -287,7 +287,7 @@ def test_an_existing_directory_is_not_changed(capsys, square):
 def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
     again = ["run", SQUARE, "-o", tmp_path / "run", "--continue"]
     refuses(capsys, [*again, square / "map.npz"], "already")
-    refuses(capsys, [*again, square / "steps.csv"], "checkpoint")
+    refuses(capsys, [*again, square / "steps.csv"], "not a map")
     refuses(capsys, [*again, tmp_path / "none.npz"], "none.npz")
     refuses(capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_xy=25"], "configuration")
     assert not (tmp_path / "run").exists()

@@ -115,9 +115,10 @@ def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     from ratslam.backends.registry import BACKENDS
     from ratslam.config.run_config import RunConfig
+    from ratslam.pipeline.build_session import build_session
     from ratslam.pipeline.run import process_source
     from ratslam.pipeline.run_directory import RunDirectory
-    from ratslam.pipeline.runner import Runner, build_session
+    from ratslam.pipeline.runner import Runner
 
     source = Circuit(kind, steps)
     config = RunConfig.model_validate(

@@ -13,7 +13,7 @@ from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
-from ratslam.pipeline.runner import build_session
+from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import read_observations
 from robot.simulation.head.session import HeadSimulation
 from robot.touch_source import open_touch_source

@@ -1,0 +1,39 @@
+"""Makes the session of a configuration and its source."""
+
+from __future__ import annotations
+
+from ratslam.backends.registry import Sensors, build
+from ratslam.config.run_config import RunConfig
+from ratslam.core.precision import prepare_precision
+from ratslam.core.session import Session
+from ratslam.keyframes.config import FULL, Ablation
+from robot.sources.source import Source
+from robot.touch_source import planar_whiskers_of
+
+RESERVED = 4096
+"""Longest source, in steps, that has its rows reserved from the start, so that the kernel is compiled once.
+Longer sources seldom fill their rows, and a step takes time for each row, in use or not."""
+
+
+def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) -> Session:
+    """A new session for a completed configuration and its source of observations; prepares JAX's precision.
+
+    Args:
+        ablation: parts of the keyframe map to switch off.
+
+    A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
+    configurations give equal capacities, and so equal bits.
+    """
+    prepare_precision(config.session.precision)
+    sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
+    return Session(
+        build(config.backend, config, sensors, config.session.precision, ablation),
+        seed=config.session.seed,
+        reserve=config.session.reserve or _known_rows(source.length),
+        precision=config.session.precision,
+    )
+
+
+def _known_rows(length: int | None) -> int:
+    """Rows to reserve for a source of this length, 0 if they are not worth it: a step adds at most one."""
+    return length if length is not None and length <= RESERVED else 0
