@@ -143,6 +143,10 @@ class RecallBackend(Backend):
         """The memory of the keyframes that remain."""
         return state._replace(memory=recall_memory.merge_rows(state.memory, merged))
 
+    def begin_piece(self, state: RecallState) -> RecallState:
+        """The filter knows no place; its health is that of the start."""
+        return state._replace(memory=recall_memory.begin_piece(state.memory), health=jnp.ones((), self.dtype))
+
     def kernel(
         self, state: RecallState, observation: Observation
     ) -> tuple[RecallState, Estimate, RecallEvidence]:

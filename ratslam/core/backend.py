@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from ratslam.core.types import Estimate, GridDrawing, PoseCellActivity
+from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
 if TYPE_CHECKING:
@@ -54,6 +55,17 @@ class Map(Protocol):
         """Merges rows of the memory, or restores merged ones, and returns the record that the kernel needs to
         follow; None if nothing is to be done. Called before `feedback`."""
         return None
+
+    def begin_piece(self) -> None:
+        """The robot may stand anywhere: the next step begins a new piece, to which no odometry leads. The
+        poses of a piece can be compared with others only once loop closures have joined them.
+
+        Raises:
+            InputError: the map cannot hold pieces.
+        """
+        raise InputError(
+            "map", "a method whose map is one piece", "`backend: recall`, whose map can begin a new piece"
+        )
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the robot's current pose in the map frame: x m, y m, heading rad."""
@@ -136,6 +148,11 @@ class Backend(Protocol):
     def merge_rows(self, state: State, merged: Any) -> State:
         """The state, which holds `merged.rows` rows at least, after rows of the memory were merged or
         restored; same shapes and dtypes."""
+        return state
+
+    def begin_piece(self, state: State) -> State:
+        """The state of a robot that may stand anywhere, with the same memory; see `Map.begin_piece`. The
+        map's feedback is applied to it at once."""
         return state
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:

@@ -89,6 +89,18 @@ class Session:
         while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):
             yield from self._advance(chunk)
 
+    def begin_piece(self) -> None:
+        """Lets the next step begin a new piece of the map (`Map.begin_piece`), because the robot may stand
+        anywhere: it was carried, or begins another session in the map. Live and replay give the same bits
+        where both call it before the same step.
+
+        Raises:
+            InputError: the map cannot hold pieces.
+        """
+        self.map.begin_piece()
+        state = self.backend.begin_piece(self.state)
+        self.state = self.backend.apply_map_feedback(state, self.map.feedback())
+
     def warm(self, observation: Observation) -> None:
         """Compiles for observations like this one; results of later steps do not change."""
         self._layout = self._layout or layout_of(observation)

@@ -11,6 +11,7 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, solved_map
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.optimizer import CalibrationPrior
+from ratslam.keyframes.piece_joining import join_pieces, joins_pieces
 from ratslam.keyframes.verification import verify_sequence
 
 
@@ -52,6 +53,8 @@ class AcceptByEvidence(Acceptance):
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         if log.verdict(sequence) != Verdict.OPEN:
             return False
+        if joins_pieces(graph, log, candidate):
+            return join_pieces(graph, log, candidate)
         test = verify_sequence(graph, log, sequence, candidate)
         if test is None:
             return False

@@ -6,6 +6,7 @@ import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.appearance import ConfirmedPairs
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog
 from ratslam.keyframes.map_solution import MapSolution
@@ -46,8 +47,7 @@ class Archive(Checkpointed):
     def append(self, graph: KeyframeGraph) -> None:
         """Takes over the newest keyframe of the map."""
         if self.begun:
-            newest = (graph.pose, graph.motion, graph.length, graph.turn)
-            self.graph.append(*(array.rows[-1] for array in newest))
+            self.graph.append_newest(graph)
             self.row.append(graph.count - 1)
             self.offset.append(np.zeros(3))
 
@@ -75,6 +75,11 @@ class Archive(Checkpointed):
         whole.follow(log)
         return whole
 
+    def confirmed_pairs(self, graph: KeyframeGraph, log: ClosureLog) -> ConfirmedPairs:
+        """Closures with a high posterior that the map has accepted, of merged keyframes the newest."""
+        pairs = np.concatenate([self.pairs.rows, confirmed_pairs(graph, log)])
+        return ConfirmedPairs(pairs[:, 0], pairs[:, 1], pairs[:, 2] > 0)
+
     def poses(self, poses: np.ndarray) -> np.ndarray:
         """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any merge."""
         return compose(poses[self.row.rows], self.offset.rows) if self.begun else poses
@@ -98,7 +103,7 @@ class Archive(Checkpointed):
         if self.graph.count <= MOST_SOLVED:
             fit = self.graph.solve(log, self.graph.config.settling)
             log.weigh(fit.weights)
-        return MapSolution(fit, log, cut)
+        return MapSolution(fit, log, cut).placed(self.graph)
 
     def _begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         self.graph.restore(graph.arrays())

@@ -69,6 +69,7 @@ class UnmergedMap(Checkpointed):
         whole.confirm(graph.config.merge_stood)
         log.restore(whole.arrays())
         graph.replace(archive.graph, compose(fit_rigid_motion(poses, before), poses), cut)
+        graph.place_pieces(log)
         graph.bias, graph.turn_error = selected.calibration
         graph.heading_noise = selected.noise
         rest = np.arange(size, count)

@@ -22,6 +22,7 @@ from ratslam.keyframes.null_model import estimate_null, log_odds
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.odometry_scan import OdometryScan
 from ratslam.keyframes.optimizer import CalibrationPrior
+from ratslam.keyframes.piece_joining import join_pieces, joins_pieces, spans_beginnings, spans_pieces
 from ratslam.keyframes.verification import continues_sequence, judge_by_map
 from ratslam.recall.mirror import MIRROR
 
@@ -87,6 +88,7 @@ class AcceptByOdds(Acceptance):
         length = len(log.members(sequence))
         if length < graph.config.min_length:
             return False
+        joined = joins_pieces(graph, log, candidate) and join_pieces(graph, log, candidate)
         if is_round(length) or length == graph.config.min_length:
             self._rate(log, sequence)
         ballot = self._vote(graph, log)
@@ -94,7 +96,7 @@ class AcceptByOdds(Acceptance):
         due = candidate.keyframe % REVIEW_EVERY == 0
         among = np.arange(log.sequences) if due else np.array([sequence])
         accepted = self._accept(graph, log, among, ballot)
-        return accepted or self._break(graph, log, sequence)
+        return joined or accepted or self._break(graph, log, sequence)
 
     def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
         return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))
@@ -134,8 +136,9 @@ class AcceptByOdds(Acceptance):
         whether there was any."""
         sequences, score_odds, result = ballot
         odds, open_ = result.odds, log.verdicts()[sequences] == Verdict.OPEN
-        open_ &= np.isin(sequences, among)
-        accepted = odds >= MIN_LOG_ODDS
+        open_ &= np.isin(sequences, among) & ~spans_pieces(graph, log)[sequences]
+        # Odometry foretells nothing where a piece begins: there only the map can.
+        accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph, log)[sequences]
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
         doubtful = open_ & accepted & graph.config.may_be_carried
         if (undecided | doubtful).any():
@@ -158,7 +161,8 @@ class AcceptByOdds(Acceptance):
         """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
         config = graph.config
         long = len(log.members(sequence)) >= config.break_length and log.score(sequence) >= config.break_score
-        if not (config.may_be_carried and long) or log.verdict(sequence) != Verdict.OPEN:
+        apart = bool(spans_pieces(graph, log)[sequence])
+        if not (config.may_be_carried and long) or apart or log.verdict(sequence) != Verdict.OPEN:
             return False
         break_odometry(graph, log, sequence)
         for other in np.flatnonzero(np.isfinite(self._log_ratio.rows).any(axis=1)).tolist():

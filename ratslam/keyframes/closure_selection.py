@@ -46,7 +46,7 @@ class SelectionProblem(NamedTuple):
     Attributes:
         measurements: with the closures of all R sequences. evidence: [R] log-likelihood ratios. first, last:
             [R] first and last keyframe of each sequence. views_cost: what the views say against poses [N, 3],
-            chi-square.
+            chi-square. place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
     """
 
     measurements: MapProblem
@@ -54,6 +54,7 @@ class SelectionProblem(NamedTuple):
     first: np.ndarray
     last: np.ndarray
     views_cost: ViewsCost
+    place: Callable[[np.ndarray], np.ndarray] = np.copy
 
 
 class Selection(NamedTuple):

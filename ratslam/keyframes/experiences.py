@@ -49,14 +49,17 @@ class Experiences(Checkpointed):
         """The result of a step without a keyframe."""
         return ExperienceChange(self._current, self._current, Action.NONE)
 
-    def arrive(self, poses: np.ndarray, frame: int, matched: int, reliable: bool) -> ExperienceChange:
+    def arrive(
+        self, poses: np.ndarray, frame: int, matched: int, reliable: bool, begins: bool = False
+    ) -> ExperienceChange:
         """The experience of a new keyframe.
 
         Args:
             poses: [N, 3] of all keyframes. matched: the keyframe of a confirmed closure, or -1.
-            reliable: the map's pose is accurate enough to find a known experience.
+            reliable: the map's pose is accurate enough to find a known experience. begins: a piece begins
+                with the keyframe: no link leads to its experience.
         """
-        previous = self._current
+        previous = -1 if begins else self._current
         place = int(self._place.rows[matched]) if matched >= 0 else self._near(poses, frame, reliable)
         action = Action.NONE
         if place < 0:

@@ -23,8 +23,10 @@ from ratslam.keyframes.optimizer import (
     OdometryChain,
     solve,
 )
+from ratslam.keyframes.piece_placement import NOTHING_JOINED, PiecePlacement, piece_start
+from ratslam.keyframes.pieces import number_pieces
 from ratslam.pose_graph import Edges
-from tactile.base.se2 import compose, correct_heading, fit_rigid_motion, integrate
+from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion, integrate
 
 LOOSE = 1e4
 """Standard deviation of odometry across a break, cells and rad."""
@@ -42,7 +44,8 @@ class KeyframeGraph(Checkpointed):
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
-            that shows a break of the odometry before the keyframe, -1 for none.
+            that shows a break of the odometry before the keyframe, -1 for none. begins: [N] a piece of the
+            map begins with the keyframe, to which no odometry leads (`begin_piece`).
             seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
             in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
@@ -63,6 +66,7 @@ class KeyframeGraph(Checkpointed):
         self.length = GrowableArray((), np.float64)
         self.turn = GrowableArray((), np.float64)
         self.cut = GrowableArray((), np.int64)
+        self.begins = GrowableArray((), np.bool_)
         self.seam = GrowableArray((), np.bool_)
         self.taken = GrowableArray((), np.int64)
         self.links = NO_LINKS
@@ -97,12 +101,37 @@ class KeyframeGraph(Checkpointed):
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
         self.reckoned = self.reckoned_after(motion, length) if self.count else np.array(pose, float)
+        self._append(pose, motion, length, turn, begins=False)
+
+    def begin_piece(self) -> None:
+        """Adds a keyframe to which no odometry leads, as the start of a new piece (`piece_placement`); an
+        empty graph gets its first keyframe."""
+        self.reckoned = self.next_start()
+        motion = between(self.pose.rows[-1], self.reckoned) if self.count else np.zeros(3)
+        self._append(self.reckoned, motion, 0.0, 0.0, begins=self.count > 0)
+
+    def append_newest(self, other: KeyframeGraph) -> None:
+        """Adds the newest keyframe of another graph."""
+        pose, motion, length, turn, begins = (
+            array.rows[-1] for array in (other.pose, other.motion, other.length, other.turn, other.begins)
+        )
+        self.reckoned = other.reckoned
+        self._append(pose, motion, length, turn, begins=bool(begins))
+
+    def next_start(self) -> np.ndarray:
+        """[3] the pose of the next keyframe if it begins a piece."""
+        return piece_start(int(self.begins.rows.sum()) + min(self.count, 1), self.cell)
+
+    def _append(
+        self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float, *, begins: bool
+    ) -> None:
         self.taken.append(self.ever)
         self.pose.append(pose)
         self.motion.append(motion)
         self.length.append(length)
         self.turn.append(turn)
         self.cut.append(-1)
+        self.begins.append(begins)
         self.seam.append(False)
 
     def replace(self, other: KeyframeGraph, poses: np.ndarray, cut: np.ndarray) -> None:
@@ -127,22 +156,47 @@ class KeyframeGraph(Checkpointed):
         return correct_heading(motion, length, self.bias, self.turn_error)
 
     def dead_reckoned(self, bias: float = 0.0, turn_error: float = 0.0) -> np.ndarray:
-        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's."""
+        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's; each
+        piece from its own start."""
         first = self.pose.rows[:1]
         if not len(first):
             return first
         motion = correct_heading(self.motion.rows[1:], self.length.rows[1:], bias, turn_error)
-        return np.concatenate([first, integrate(motion, first[0])])
+        poses = np.concatenate([first, integrate(motion, first[0])])
+        return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell).place(poses)
 
     def dead_reckon(self) -> None:
         """Replaces all poses by odometry with the current calibration."""
         self.pose.rows[:] = self.dead_reckoned(self.bias, self.turn_error)
 
-    def move_to(self, fit: MapFit) -> None:
-        """Takes over a fit, moved as a whole so that the keyframes move as little as possible."""
-        before = self.pose.rows.copy()
-        self.pose.rows[:] = compose(fit_rigid_motion(fit.poses, before), fit.poses)
+    def move_to(self, fit: MapFit, log: ClosureLog) -> None:
+        """Takes over a fit, moved as a whole so that the keyframes move as little as possible; pieces that
+        nothing joins to the first one start where they started."""
+        before, first = self.pose.rows.copy(), slice(None)
+        if self.begins.rows.any():
+            first = self.pieces(log) == 0
+        poses = compose(fit_rigid_motion(fit.poses[first], before[first]), fit.poses)
+        self.pose.rows[:] = self.placement(log).place(poses)
         self.bias, self.turn_error = fit.bias, fit.turn_error
+
+    def pieces(self, log: ClosureLog) -> np.ndarray:
+        """[N] the piece of each keyframe: pieces are joined by accepted closures; a cut separates none."""
+        placement = self.placement(log)
+        return number_pieces(self.begins.rows, np.column_stack([placement.j, placement.i]))
+
+    def placement(self, log: ClosureLog) -> PiecePlacement:
+        """What joins the pieces: the closures accepted in a log, and odometry links."""
+        if not self.begins.rows.any():
+            return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell)
+        table = log.table()[log.accepted_middle_first()]
+        match, frame = table[:, 1].astype(int), table[:, 0].astype(int)
+        turn = np.concatenate([-table[:, 2] * self.sector_angle, np.full(len(self.links.i), np.nan)])
+        i, j = np.concatenate([match, self.links.i]), np.concatenate([frame, self.links.j])
+        return PiecePlacement(self.begins.rows.copy(), i, j, turn, self.cell)
+
+    def place_pieces(self, log: ClosureLog) -> None:
+        """Moves pieces as wholes to where the accepted closures claim them, see `PiecePlacement`."""
+        self.pose.rows[:] = self.placement(log).place(self.pose.rows)
 
     def fit(self) -> MapFit:
         """The current poses (not copied) and calibration."""
@@ -153,15 +207,19 @@ class KeyframeGraph(Checkpointed):
         return self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
 
     def odometry(self, cut: GrowableArray) -> OdometryChain:
-        """The odometry between keyframes with its variances, loose at the breaks `cut`."""
+        """The odometry between keyframes with its variances, loose at the breaks `cut` and between pieces."""
         return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
-        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut` and at seams."""
+        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`, where a piece
+        begins, and at seams."""
         variance = self._odometry_variance(self.length.rows, self.turn.rows)
-        loose = np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
-        broken = (cut.rows >= 0) | self.seam.rows
-        return np.where(broken[:, None], loose, variance)
+        loose = self.is_broken(cut) | self.seam.rows
+        return np.where(loose[:, None], self._loose_variance(), variance)
+
+    def is_broken(self, cut: GrowableArray) -> np.ndarray:
+        """[N] bool: no odometry leads to the keyframe, for a break of `cut` or because a piece begins."""
+        return (cut.rows >= 0) | self.begins.rows
 
     def own_variances(self) -> np.ndarray:
         """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
@@ -180,6 +238,8 @@ class KeyframeGraph(Checkpointed):
 
     def newest_variance(self) -> np.ndarray:
         """[3] variance of the odometry into the newest keyframe."""
+        if self.begins.rows[-1]:
+            return self._loose_variance()
         return self._odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
 
     def closure_variance(self) -> np.ndarray:
@@ -224,7 +284,7 @@ class KeyframeGraph(Checkpointed):
         """Solves for the poses and the bias, and stores the robust weights in the log."""
         fit = self.solve(log, self.config.iterations)
         log.weigh(fit.weights)
-        self.move_to(fit)
+        self.move_to(fit, log)
 
     def calibration(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> CalibrationPrior:
         """Means and standard deviations of the calibration of a solution."""
@@ -240,19 +300,32 @@ class KeyframeGraph(Checkpointed):
         """The covariance of the current map."""
         return MapCovariance(self.fit(), self.problem(log, self.cut))
 
+    def newest_covariance(self, log: ClosureLog) -> np.ndarray:
+        """[3, 3] covariance of the newest keyframe's pose in the frame of the first one of its piece (m, m,
+        rad)."""
+        if self.count < 2:
+            return np.zeros((3, 3))
+        piece = self.pieces(log)
+        first = int(np.flatnonzero(piece == piece[-1])[0])
+        return self.map_covariance(log).relative(first, self.count - 1, 0.0)
+
     def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
-        """Edges of a solution: odometry corrected by its bias, and closures with their robust weights."""
+        """Edges of a solution: odometry corrected by its bias, none where it is broken, and closures with
+        their robust weights."""
         chain, closures, _, links = self.problem(log, cut)
-        steps = np.arange(len(chain.length))
+        steps = np.flatnonzero(~self.is_broken(cut)[1:])
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)
         trust = log.weights()[:, None] / closures.variance
         return Edges(
             np.concatenate([steps, links.i, closures.i]),
             np.concatenate([steps + 1, links.j, closures.j]),
-            np.concatenate([fit.corrected(chain), fit.corrected_links(links), turned]),
-            np.concatenate([1 / chain.variance, 1 / links.variance, trust]),
+            np.concatenate([fit.corrected(chain)[steps], fit.corrected_links(links), turned]),
+            np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]),
         )
+
+    def _loose_variance(self) -> np.ndarray:
+        return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
 
     def _odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """[n, 3] variances of odometry over these distances [n] and sums of absolute turns [n]."""

@@ -31,8 +31,12 @@ class LiveFilter(Checkpointed):
         self.covariance = np.zeros((3, 3))
 
     def advance(self, graph: KeyframeGraph) -> None:
-        """Adds the noise of the odometry into the newest keyframe of `graph`."""
+        """Adds the noise of the odometry into the newest keyframe of `graph`; all is forgotten where a piece
+        begins."""
         if graph.count < 2:
+            return
+        if graph.begins.rows[-1]:
+            self.covariance = np.diag(graph.newest_variance())
             return
         before, after = graph.pose.rows[-2:]
         dx, dy = (after - before)[:2]

@@ -38,6 +38,10 @@ class Verdict(IntEnum):
     """Removed: by the user, or a candidate after a break of the odometry."""
 
 
+SIGNS = np.array([0, 1, -1])
+"""Of verdicts: open, accepted, removed."""
+
+
 class Candidate(NamedTuple):
     """A proposed closure: the keyframe, the older keyframe matched, the sector shift, the posterior mass, and
     the log-likelihood ratio against novelty."""
@@ -221,6 +225,28 @@ class ClosureLog(Checkpointed):
             sequence = self._candidate.rows[:, 3]
             self._lines = np.flatnonzero((sequence >= 0) & (self._verdict.rows[sequence] == Verdict.ACCEPTED))
         return self._lines
+
+    def accepted_pairs(self) -> np.ndarray:
+        """[M, 2] keyframe and match of the accepted candidates."""
+        return self._candidate.rows[self.accepted_rows(), :2]
+
+    def judged(self) -> np.ndarray:
+        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
+        sign = np.where(
+            self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
+        )
+        return np.column_stack([self._candidate.rows[:, 1::-1], sign])
+
+    def accepted_middle_first(self) -> np.ndarray:
+        """[M] rows of the accepted candidates, those in the middle of their sequences first."""
+        rows = self.accepted_rows()
+        sequence = self._candidate.rows[rows, 3]
+        order = np.argsort(sequence, kind="stable")
+        _, start, count = np.unique(sequence[order], return_index=True, return_counts=True)
+        within = np.arange(len(rows)) - np.repeat(start, count)
+        off = np.abs(within - np.repeat(count // 2, count))
+        ordered: np.ndarray = rows[order][np.argsort(off, kind="stable")]
+        return ordered
 
     def closures(
         self, angle: float, variance: np.ndarray, scales: tuple[float, float, float]

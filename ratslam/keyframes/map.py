@@ -20,31 +20,30 @@ from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.types import Estimate
 from ratslam.keyframes.acceptance import Acceptance
-from ratslam.keyframes.appearance import Appearance, ConfirmedPairs
-from ratslam.keyframes.archive import Archive, confirmed_pairs
-from ratslam.keyframes.calibration import calibration_from_views, write_calibration
+from ratslam.keyframes.appearance import Appearance
+from ratslam.keyframes.archive import Archive
+from ratslam.keyframes.calibration import calibration_from_views
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
-from ratslam.keyframes.experiences import Experiences
+from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.keyframe_merger import KeyframeMerger
 from ratslam.keyframes.live_filter import LiveFilter
-from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candidate
+from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
-from ratslam.keyframes.map_solution import MapSolution, selected_solution, solution_pieces, solved_map
+from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence, has_same_heading
 from ratslam.pose_graph import Edges
-from ratslam.pose_graph.io import write_g2o, write_json
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
 if TYPE_CHECKING:
     import networkx
 
-SIGN_OF_VERDICT = np.array([0, 1, -1])  # open, accepted, undone
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
 
@@ -61,7 +60,7 @@ class KeyframeMap(Checkpointed, Map):
         log: of the keyframes that are not merged. archive, appearance: of all. merger, selection: at work.
     """
 
-    VALUES = ("_travel", "_since", "_turned", "_solved", "_doubt")
+    VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
         "_live", "selection",
@@ -91,6 +90,7 @@ class KeyframeMap(Checkpointed, Map):
         self._steps = StepRecord()
         self._travel = HALT
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
+        self._begins = False  # the next keyframe begins a piece
         self._solved = (-1, -1)  # sequence and number of the keyframe of the last optimisation
         self._solution: MapSolution | None = None
         self._kept: MapSolution | None = None  # the same without merged keyframes
@@ -102,7 +102,8 @@ class KeyframeMap(Checkpointed, Map):
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
         graph, metric = self._graph, self.appearance.metric()
-        return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric)
+        start = graph.next_start() if self._begins else None
+        return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric, start)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the newest keyframe's pose and the motion since; by odometry until a closure is accepted, as
@@ -135,35 +136,42 @@ class KeyframeMap(Checkpointed, Map):
 
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
-        log = self.solution().log
-        return self.keyframe_steps()[log.table()[log.accepted_rows(), :2].astype(int)].reshape(-1, 2)
+        return self.keyframe_steps()[self.solution().log.accepted_pairs()]
 
     def judged_closures(self) -> np.ndarray:
         """[n, 3] see `Map`; candidates of merged keyframes are left out."""
-        table, step = self.log.table(), self.keyframe_steps()[self._graph.taken.rows]
-        signs = SIGN_OF_VERDICT[table[:, 7].astype(int)]
-        return np.column_stack([step[table[:, 1::-1].astype(int)], signs])
+        judged, step = self.log.judged(), self.keyframe_steps()[self._graph.taken.rows]
+        return np.column_stack([step[judged[:, :2]], judged[:, 2]])
 
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step, see `ratslam.keyframes.pieces`."""
-        return self._steps.of_keyframes(solution_pieces(self.solution()))
+        return self._steps.of_keyframes(self.keyframe_pieces())
+
+    def keyframe_pieces(self) -> np.ndarray:
+        """[N] the piece of each keyframe; those of odometry where that is given."""
+        return self.solution().pieces(self.keyframes(), doubted=self.final_doubt() > DOUBTED)
 
     def candidates(self) -> np.ndarray:
         """[n, 10] all candidates of recall and their verdicts, see `ClosureLog.table`."""
         return self.solution().log.table()
 
     def covariance(self) -> np.ndarray:
-        """[3, 3] covariance of the newest keyframe's pose in the frame of the first one (m, m, rad)."""
-        if self._graph.count < 2:
-            return np.zeros((3, 3))
-        return self._graph.map_covariance(self.log).relative(0, self._graph.count - 1, 0.0)
+        """[3, 3] covariance of the newest keyframe's pose in the frame of the first one of its piece (m, m,
+        rad)."""
+        return self._graph.newest_covariance(self.log)
 
     def solution(self) -> MapSolution:
         """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
-            kept, archive = self._kept_solution(), self.archive
+            kept, archive = self.kept_solution(), self.archive
             self._solution = archive.solve(kept, self._graph) if archive.begun else kept
         return self._solution
+
+    def kept_solution(self) -> MapSolution:
+        """The final map of the keyframes that are not merged."""
+        if self._kept is None:
+            self._kept = self._solve_finally().placed(self._graph)
+        return self._kept
 
     def graph(self) -> networkx.DiGraph:
         """Experiences with x, y (m), heading (rad) and their first keyframe; links with their evidence."""
@@ -173,17 +181,11 @@ class KeyframeMap(Checkpointed, Map):
     def edges(self) -> Edges:
         """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with their
         robust weights."""
-        return self._graph.edges(*self._kept_solution())
+        return self._graph.edges(*self.kept_solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """Experiences as node-link JSON, keyframes as a g2o graph, the closures with their evidence, and
-        the calibration of the odometry unless the map is doubted."""
-        calibration = {} if self.final_doubt() > DOUBTED else {"calibration.yaml": self._write_calibration}
-        return calibration | {
-            "map.json": lambda path: write_json(path, self.graph()),
-            "map.g2o": lambda path: write_g2o(path, self._kept_solution().fit.poses, self.edges()),
-            "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
-        }
+        """See `ratslam.keyframes.map_files`."""
+        return map_files(self, calibrated=self.final_doubt() <= DOUBTED)
 
     def keyframes(self) -> KeyframeGraph:
         """All keyframes, merged ones included, with their views; poses are those of the last solution."""
@@ -198,6 +200,12 @@ class KeyframeMap(Checkpointed, Map):
         return self._steps.first_steps(self._graph.ever)
 
     # Changes
+
+    def begin_piece(self) -> None:
+        """The next keyframe begins a piece; steps until then count to the keyframe before."""
+        self._begins = self._graph.count > 0
+        self._travel = HALT
+        self._since = self._turned = 0.0
 
     def merge(self) -> MergedRows | None:
         """Merges keyframes of known ground (`ratslam.keyframes.merging`)."""
@@ -217,8 +225,7 @@ class KeyframeMap(Checkpointed, Map):
             matched = self._consider(evidence)
             self._select()
             self._judge()
-            poses = self._graph.pose.rows
-            change = self._experiences.arrive(poses, len(poses) - 1, matched, self._is_pose_reliable())
+            change = self._arrive(matched)
         self._steps.append(self._graph.ever - 1, self._travel)
         self._forget_solution()
         return estimate._replace(place=change.place, previous=change.previous, action=change.action)
@@ -239,27 +246,22 @@ class KeyframeMap(Checkpointed, Map):
         self.log.judge(sequence, Verdict.UNDONE)
         self._optimise()
 
-    def _kept_solution(self) -> MapSolution:
-        """The final map of the keyframes that are not merged."""
-        if self._kept is None:
-            self._kept = self._solve_finally()
-        return self._kept
-
     def _solve_finally(self) -> MapSolution:
-        if not self.closes_loops:
-            return solved_map(self._graph, self.log)
         graph, log, selected = self._graph, self.log, None
+        if not self.closes_loops:
+            return solved_map(graph, log)
         if self.config.select_every:
             selected = selected_solution(graph, log, deepcopy(self.selection.hypotheses))
         return selected or self._acceptance.solution(graph, log)
 
-    def _write_calibration(self, path: Path) -> None:
-        noise = self._graph.heading_noise if self.config.select_every else None
-        write_calibration(path, self._graph.calibration(*self._kept_solution()), noise)
-
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
-        self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
+        if self._begins:
+            self._graph.begin_piece()
+            motion, length, turn = HALT
+        else:
+            self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
+        self._begins = False
         self.archive.append(self._graph)
         self._live.advance(self._graph)
         self._since += length
@@ -267,17 +269,16 @@ class KeyframeMap(Checkpointed, Map):
         self._travel = HALT
         self.appearance.append(observation, motion[2], length)
 
+    def _arrive(self, matched: int) -> ExperienceChange:
+        poses, begins = self._graph.pose.rows, bool(self._graph.begins.rows[-1])
+        return self._experiences.arrive(poses, len(poses) - 1, matched, self._is_pose_reliable(), begins)
+
     def _learn(self, evidence: Evidence) -> None:
         """Updates the view metric, and the prior of the heading bias from ordered views."""
-        shown = self.appearance.learn(evidence, self._confirmed_pairs)
+        shown = self.appearance.learn(evidence, lambda: self.archive.confirmed_pairs(self._graph, self.log))
         if self.closes_loops and np.isfinite(shown.error) and self.config.bias_from_views:
             prior = calibration_from_views(self.config, self.cell, self._graph.start, shown)
             self._acceptance.learn_bias(self._graph, self.log, prior)
-
-    def _confirmed_pairs(self) -> ConfirmedPairs:
-        """Closures with a high posterior that the map has accepted."""
-        pairs = np.concatenate([self.archive.pairs.rows, confirmed_pairs(self._graph, self.log)])
-        return ConfirmedPairs(pairs[:, 0], pairs[:, 1], pairs[:, 2] > 0)
 
     def _consider(self, evidence: Evidence) -> int:
         """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or -1."""

@@ -53,7 +53,7 @@ class MapHypotheses(Checkpointed):
         """
         self._extend(case.measurements)
         known = np.isin(sequences, self._followed)
-        fits = self._fits(int(known.sum()))
+        fits = [fit._replace(poses=case.place(fit.poses)) for fit in self._fits(int(known.sum()))]
         for k in np.flatnonzero(~known).tolist():
             fits = _branch(fits, case, known, k)
             known[k] = True
@@ -100,6 +100,7 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
         maps.append(free)
         if free.weights[at] < FITS:
             maps.append(system.solve(forcing.solve(free, STEPS, FINE), STEPS, FINE))
+    maps = [fit._replace(poses=case.place(fit.poses)) for fit in maps]
     costs = [system.robust_cost(fit) for fit in maps]
     different: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():

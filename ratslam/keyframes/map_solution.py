@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
@@ -25,6 +25,7 @@ from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.odometry_breaks import find_break
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, System, solve
+from ratslam.keyframes.piece_joining import spans_pieces
 from ratslam.keyframes.pieces import number_pieces
 
 
@@ -36,6 +37,19 @@ class MapSolution(NamedTuple):
     log: ClosureLog
     cut: GrowableArray
 
+    def placed(self, graph: KeyframeGraph) -> MapSolution:
+        """The map with the pieces of `graph` where they belong, see `PiecePlacement`; the fit may have moved
+        them."""
+        poses = graph.placement(self.log).place(self.fit.poses)
+        return self._replace(fit=self.fit._replace(poses=poses))
+
+    def pieces(self, graph: KeyframeGraph, *, doubted: bool = False) -> np.ndarray:
+        """[N] the piece of each keyframe of a graph that is not merged; `doubted`: by odometry, without cuts
+        and closures."""
+        if doubted:
+            return number_pieces(graph.begins.rows, np.zeros((0, 2), int))
+        return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
+
 
 def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
     """The map with the closures accepted so far, optimised; dead reckoning without any."""
@@ -44,17 +58,13 @@ def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
     return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
 
 
-def solution_pieces(solution: MapSolution) -> np.ndarray:
-    """[N] the piece of each keyframe."""
-    closures = solution.log.table()[solution.log.accepted_rows(), :2].astype(int)
-    return number_pieces(solution.cut.rows >= 0, closures)
-
-
 def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
-    starts = [graph.fit(), *(_dead_reckoned(graph, prior) for prior in priors)]
+    place = graph.placement(log).place
+    reckoned = (_dead_reckoned(graph, prior) for prior in priors)
+    starts = [graph.fit(), *(fit._replace(poses=place(fit.poses)) for fit in reckoned)]
     system = System(problem)
     fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
     log.weigh(fit.weights)
@@ -68,16 +78,17 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
     scores = log.scores()
     candidates = (scores >= config.select_score) & (log.sizes() >= config.select_length)
     left = log.left() > 0
-    candidates &= left & (log.verdicts() != Verdict.UNDONE)
+    candidates &= left & (log.verdicts() != Verdict.UNDONE) & ~spans_pieces(graph, log)
     if not (candidates & (scores >= config.min_score)).any():
         return None
+    place = graph.placement(log).place
     sequences = np.flatnonzero(candidates)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
     earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
     cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
     for sequence in np.flatnonzero(left & (log.verdicts() != Verdict.UNDONE)).tolist():
         log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
-    selection = _select(graph, log, cut, sequences, earlier, hypotheses)
+    selection = _select(graph, log, cut, sequences, earlier, hypotheses, place)
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
         log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
     for frame, sequence in selection.cuts:
@@ -95,13 +106,14 @@ def _select(
     sequences: np.ndarray,
     earlier: tuple[tuple[int, int], ...],
     hypotheses: MapHypotheses,
+    place: Callable[[np.ndarray], np.ndarray],
 ) -> Selection:
     """Selects among the sequences `sequences`, starting from the current map and from the hypotheses. The
     odometry is cut only if the robot may be carried."""
     problem, pose = graph.problem(log, cut), graph.pose.rows
     present = graph.fit()._replace(poses=pose.copy())
     first, last = log.spans()[sequences].T
-    case = SelectionProblem(problem, log.scores()[sequences], first, last, partial(claims_cost, graph))
+    case = SelectionProblem(problem, log.scores()[sequences], first, last, partial(claims_cost, graph), place)
     starts = [present, *hypotheses.follow(case, sequences)]
     if not graph.config.may_be_carried:
         return select_closures(case, starts)

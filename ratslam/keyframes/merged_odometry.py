@@ -31,7 +31,7 @@ def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     graph.length.replace(length[rows])
     graph.turn.replace(turn[rows])
     graph.seam.replace(seam[rows])
-    for array in (graph.pose, graph.cut, graph.taken):
+    for array in (graph.pose, graph.cut, graph.begins, graph.taken):
         array.replace(array.rows[rows])
     graph.links = links
 
@@ -40,7 +40,7 @@ def _links(graph: KeyframeGraph, merge: Merge) -> OdometryLinks:
     """Links between the remaining keyframes: those so far, and the odometry from and to merged ones; parallel
     ones as one. Variances of headings are those without learned noise."""
     old, kept = graph.links, merge.is_kept()
-    broken = graph.seam.rows | (graph.cut.rows >= 0)
+    broken = graph.seam.rows | graph.is_broken(graph.cut)
     later = np.flatnonzero((~kept[1:] | ~kept[:-1]) & ~broken[1:]) + 1
     attached = (ATTACHED * graph.cell) ** 2 * np.array([1.0, 1.0, 0.0])
     own = graph.own_variances()[later] + attached

@@ -51,19 +51,21 @@ def no_merge(count: int) -> Merge:
 
 
 def find_merge(graph: KeyframeGraph, log: ClosureLog) -> Merge | None:
-    """The keyframes of confirmed ground and the older ones at the same pose; None without any."""
+    """The keyframes of confirmed ground and the older ones at the same pose in the same piece; None without
+    any."""
     count, guard = graph.count, graph.guard
     sure = np.flatnonzero(_confirmed_ground(graph, log))
     sure = sure[(sure > guard) & (sure < count - graph.config.merge_newest)]
     kept, onto, offset = np.ones(count, bool), np.arange(count), np.zeros((count, 3))
-    pose = graph.pose.rows
+    pose, piece = graph.pose.rows, graph.pieces(log)
     whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
     for frame in sure.tolist():
         older = pose[: frame - guard]
         apart = ((older[:, :2] - pose[frame, :2]) ** 2).sum(axis=1) / (NEAR * graph.cell) ** 2
         turned = np.abs(wrap(older[:, 2] - pose[frame, 2]))
         turned = (np.minimum(turned, np.pi - turned) if whiskers else turned) / FACING
-        far = np.where(kept[: frame - guard] & (turned <= 1), apart, np.inf)
+        joined = kept[: frame - guard] & (piece[: frame - guard] == piece[frame])
+        far = np.where(joined & (turned <= 1), apart, np.inf)
         found = np.flatnonzero(far <= 1)
         if len(found):
             best = int(found[np.argmin(far[found] + turned[found] ** 2)])
@@ -78,19 +80,20 @@ def find_merge(graph: KeyframeGraph, log: ClosureLog) -> Merge | None:
 def _confirmed_ground(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     """[N] bool: keyframes between confirmed ones, whose odometry is not strained."""
     held = _confirmed_keyframes(graph, log)
-    where, way = np.flatnonzero(held), np.cumsum(graph.length.rows)
+    reach = REACH * graph.cell
+    # No way leads from one piece to the next.
+    where, way = np.flatnonzero(held), np.cumsum(np.where(graph.begins.rows, 2 * reach, graph.length.rows))
     if not len(where):
         return held
     before = np.searchsorted(where, np.arange(len(held)), side="right") - 1
     after = np.searchsorted(where, np.arange(len(held)))
     between_two = (before >= 0) & (after < len(where))
-    reach = REACH * graph.cell
     since = way - way[where[np.maximum(before, 0)]]
     until = way[where[np.minimum(after, len(where) - 1)]] - way
     sure = between_two & (since <= reach) & (until <= reach)
-    cut = graph.cut.rows >= 0
-    sure &= ~cut
-    sure[:-1] &= ~cut[1:]
+    broken = graph.is_broken(graph.cut)
+    sure &= ~broken
+    sure[:-1] &= ~broken[1:]
     tense = _strained(graph)
     sure[1:] &= ~tense
     sure[:-1] &= ~tense

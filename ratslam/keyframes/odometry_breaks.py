@@ -37,7 +37,8 @@ def find_break(
 def _find_first_carried(graph: KeyframeGraph, log: ClosureLog, carried: np.ndarray, first: int) -> int:
     """The first keyframe whose views fit better at the poses moved by `carried` [3]."""
     anchored = log.table()[log.accepted_rows(), 0]
-    since = int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap
+    began = int(np.flatnonzero(graph.begins.rows[: first + 1]).max(initial=0))
+    since = max(int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap, began)
     frames = np.arange(max(since, first - SEARCH, 1), first + 1)
     return _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
 

@@ -1,4 +1,4 @@
-"""Pieces of a map: keyframes that odometry (not across a cut) and accepted loop closures connect."""
+"""Pieces of a map: keyframes that odometry (not across a break) and accepted loop closures connect."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 
-def number_pieces(cut: np.ndarray, closures: np.ndarray) -> np.ndarray:
+def number_pieces(broken: np.ndarray, closures: np.ndarray) -> np.ndarray:
     """[N] the piece of each keyframe, numbered from 0 in the order of their first keyframes.
 
     Args:
-        cut: [N] bool, the odometry is cut before the keyframe. closures: [M, 2] keyframes joined by accepted
-            closures.
+        broken: [N] bool, no odometry leads to the keyframe: it is cut before it, or a piece begins there.
+            closures: [M, 2] keyframes joined by accepted closures.
     """
-    if not len(cut):
+    if not len(broken):
         return np.zeros(0, int)
-    stretch = np.cumsum(cut)  # a stretch is a run of keyframes without a cut
+    stretch = np.cumsum(broken)
+    stretch = stretch - stretch[0]  # a stretch is a run of keyframes without a break
     later, earlier = stretch[closures].T
     count = int(stretch[-1]) + 1
     joined = coo_array((np.ones(len(closures), bool), (later, earlier)), shape=(count, count))

@@ -67,10 +67,10 @@ class SelectedMap(Checkpointed):
         graph.heading_noise = self.noise
         moved = compose(self.poses[-1], inverse(graph.pose.rows[size - 1]))
         poses = np.concatenate([self.poses, compose(moved, graph.pose.rows[size:])])
-        start = MapFit(poses, bias, np.zeros(0), turn_error)
+        start = MapFit(graph.placement(log).place(poses), bias, np.zeros(0), turn_error)
         fit = solve(start, graph.problem(log, graph.cut), STEPS, FINE)
         log.weigh(fit.weights)
-        graph.move_to(fit)
+        graph.move_to(fit, log)
 
     def judge(self, log: ClosureLog) -> None:
         """Takes over the verdicts on sequences whose verdict has not changed since the selection began."""

@@ -25,7 +25,8 @@ class MapFeedback(NamedTuple):
             the last closure, m. angle: turn per sector shift, rad, 0 while unknown; whiskers: half a turn.
             scale: view error below which different places seldom come; whiskers: log-odds that stand for an
             image never seen before; 0 while unknown. likeness: [G, L, L] see `log_odds_table`, or of signed
-            images, see `signed_likelihood.pack`; empty except for whiskers.
+            images, see `signed_likelihood.pack`; empty except for whiskers. start: [3] pose of the
+            next keyframe if a piece of the map begins with it; None: it follows the newest one.
     """
 
     poses: np.ndarray
@@ -35,6 +36,7 @@ class MapFeedback(NamedTuple):
     angle: float
     scale: float
     likeness: np.ndarray = NO_LIKENESS
+    start: np.ndarray | None = None
 
 
 class MergedRows(NamedTuple):
@@ -128,12 +130,6 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
     learned = (groups, LEVELS, LEVELS) if levels else packed_shape(size) if touch else (0, 0, 0)
     shape = len(sector_shifts(config)), capacity if touch else 0
 
-    def no_modes() -> Modes:
-        return Modes(
-            jnp.zeros(config.modes, jnp.int32), zeros(config.modes, 3), zeros(config.modes),
-            zeros(*shape), zeros(*shape),
-        )  # fmt: skip
-
     return Memory(
         view=jnp.zeros((size, capacity), jnp.int32) if levels else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
@@ -154,9 +150,27 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         angle=zeros(),
         scale=zeros(),
         likeness=zeros(*learned),
-        **no_modes()._asdict(),
-        control=no_modes(),
+        **_no_modes(config.modes, shape, dtype)._asdict(),
+        control=_no_modes(config.modes, shape, dtype),
     )
+
+
+def _no_modes(count: int, shape: tuple[int, int], dtype: np.dtype) -> Modes:
+    """A posterior all of which is novelty; in buffers of its own, because the session donates them."""
+    anchor, offset, mass = jnp.zeros(count, jnp.int32), jnp.zeros((count, 3), dtype), jnp.zeros(count, dtype)
+    return Modes(anchor, offset, mass, jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
+
+
+def begin_piece(memory: Memory) -> Memory:
+    """The memory of a robot that may be anywhere: the posterior is novelty, no odometry leads to the next
+    keyframe, and the next view seen becomes one."""
+    count, shape, dtype = len(memory.mass), memory.rest.shape, memory.x.dtype
+    zero, due = jnp.zeros((), dtype), jnp.asarray(np.inf, dtype)
+    return memory._replace(
+        **_no_modes(count, shape, dtype)._asdict(),
+        control=_no_modes(count, shape, dtype),
+        motion=jnp.zeros(3, dtype), length=zero, turn=due,
+    )  # fmt: skip
 
 
 def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
@@ -164,6 +178,7 @@ def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     dtype, count = memory.x.dtype, len(feedback.poses)
     if not count:
         return memory
+    newest = feedback.poses[-1] if feedback.start is None else feedback.start
     full = np.zeros((4, memory.x.shape[0]))
     x, y, heading = feedback.poses.T
     full[:, :count] = x, y, np.cos(heading), np.sin(heading)
@@ -173,7 +188,7 @@ def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     if feedback.likeness.size:
         memory = memory._replace(likeness=jnp.asarray(feedback.likeness, dtype))
     return memory._replace(
-        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(feedback.poses[-1], dtype),
+        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(newest, dtype),
         bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale,
     )  # fmt: skip
 

@@ -15,6 +15,7 @@ from ratslam.backends.registry import Sensors
 from ratslam.core.path_map import PathMap
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.examples import dead_reckoning
+from tactile.base.errors import InputError
 from tactile.base.types import Odometry, observation
 
 BACKEND = dead_reckoning.ENTRY.build(dead_reckoning.Config(), Sensors((3, 6, 1)), np.dtype(np.float64))
@@ -43,6 +44,14 @@ def test_a_restarted_session_repeats_itself_without_compiling_again():
     assert len(session.map.trajectory()) == 0
     assert np.array_equal(first, [step.pose for step in session.replay(walk)])
     assert session.compilations() == 1
+
+
+def test_a_map_of_one_piece_refuses_another_and_goes_on():
+    session = Session(BACKEND)
+    session.step(observation(Odometry(0.1, 0.0, 0.1, 0.1)))
+    with pytest.raises(InputError, match="one piece"):
+        session.begin_piece()
+    assert session.step(observation(Odometry(0.1, 0.0, 0.1, 0.1))).pose[2] == pytest.approx(0.2)
 
 
 class Restored(NamedTuple):

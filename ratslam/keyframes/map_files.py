@@ -1,0 +1,31 @@
+"""The files of a keyframe map in a run directory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ratslam.keyframes.calibration import write_calibration
+from ratslam.keyframes.loop_closures import write_closures
+from ratslam.pose_graph.io import write_g2o, write_json
+
+if TYPE_CHECKING:
+    from ratslam.keyframes.map import KeyframeMap
+
+
+def map_files(map: KeyframeMap, *, calibrated: bool) -> dict[str, Callable[[Path], None]]:
+    """Experiences as node-link JSON, keyframes as a g2o graph, the closures with their evidence, and, where
+    `calibrated`, the calibration of the odometry: functions that write them, by name."""
+    calibration = {"calibration.yaml": lambda path: _write_calibration(path, map)} if calibrated else {}
+    return calibration | {
+        "map.json": lambda path: write_json(path, map.graph()),
+        "map.g2o": lambda path: write_g2o(path, map.kept_solution().fit.poses, map.edges()),
+        "closures.csv": lambda path: write_closures(path, map.candidates(), map.keyframe_steps()),
+    }
+
+
+def _write_calibration(path: Path, map: KeyframeMap) -> None:
+    graph = map.kept_keyframes()
+    noise = graph.heading_noise if map.config.select_every else None
+    write_calibration(path, graph.calibration(*map.kept_solution()), noise)

@@ -1,0 +1,85 @@
+"""Pieces of a map driven by hand: which sequences join them, and what undoes it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ratslam.keyframes.acceptance import AcceptByEvidence
+from ratslam.keyframes.closure_odds import AcceptByOdds
+from ratslam.keyframes.map_health import DOUBTED
+from ratslam.keyframes.piece_placement import APART
+from tests.ratslam.keyframes.map_cases import CELL, LAP, drive, new_map, sequence
+
+BEGIN = LAP
+RULES = pytest.mark.parametrize(
+    "rule", [lambda graph: AcceptByEvidence(), AcceptByOdds], ids=["evidence", "odds"]
+)
+
+
+def driven(rule, *sequences, last=LAP + 60):
+    """A lap and a part of the next one, which begins a piece."""
+    map = drive(new_map(rule), {}, last=BEGIN)
+    map.begin_piece()
+    return drive(map, {key: value for one in sequences for key, value in one.items()}, first=BEGIN, last=last)
+
+
+@RULES
+def test_strong_evidence_joins_two_pieces(rule):
+    map = driven(rule, sequence(LAP + 2, 2, 12, 4.0))
+    assert map.final_doubt() < DOUBTED
+    assert not map.pieces().any()
+    pose = map.solution().fit.poses
+    assert np.hypot(*(pose[LAP + 8] - pose[8])[:2]) < CELL
+    assert np.hypot(*(pose[LAP + 50] - pose[50])[:2]) < 2 * CELL
+
+
+@RULES
+def test_evidence_that_suffices_within_a_piece_does_not_join_two(rule):
+    weak = sequence(LAP + 2, 2, 12, 2.0)
+    assert len(drive(new_map(rule), weak).closures()) == 12
+    map = driven(rule, weak)
+    assert len(map.closures()) == 0
+    assert np.array_equal(map.pieces(), np.arange(LAP + 60) >= BEGIN)
+    pose = map.solution().fit.poses
+    assert np.hypot(*(pose[LAP + 8] - pose[8])[:2]) > APART / 2 * CELL
+
+
+@RULES
+def test_sequences_that_contradict_each_other_join_nothing(rule):
+    map = driven(rule, sequence(LAP + 2, 2, 5, 5.0), sequence(LAP + 9, 80, 6, 5.6))
+    assert map.pieces().max() == 1
+
+
+@RULES
+def test_pieces_come_apart_when_their_tie_is_undone(rule):
+    map = driven(rule, sequence(LAP + 2, 2, 12, 4.0))
+    map.undo(0)
+    assert np.array_equal(map.pieces(), np.arange(LAP + 60) >= BEGIN)
+    pose = map.solution().fit.poses
+    assert np.hypot(*(pose[LAP + 8] - pose[8])[:2]) > APART / 2 * CELL
+
+
+@RULES
+def test_odometry_of_a_piece_does_not_count_before_it(rule):
+    map = driven(rule)
+    reckoned = map.keyframes().dead_reckoned()
+    assert np.allclose(reckoned[BEGIN], (APART * CELL, 0.0, 0.0))
+    assert np.allclose(map.trajectory(), reckoned)
+    assert map.covariance()[0, 0] < CELL**2 * 100  # of the newest keyframe from the first of its piece
+
+
+def test_a_map_without_keyframes_begins_with_its_first_one():
+    map = new_map()
+    map.begin_piece()
+    assert not drive(map, {}, last=30).pieces().any()
+    assert map.feedback().start is None
+
+
+def test_the_kernel_is_told_where_the_next_piece_starts():
+    map = drive(new_map(), {}, last=30)
+    map.begin_piece()
+    assert np.array_equal(map.feedback().start, (APART * CELL, 0.0, 0.0))
+    drive(map, {}, first=30, last=31)
+    assert map.feedback().start is None
+    assert np.array_equal(map.feedback().poses[-1], (APART * CELL, 0.0, 0.0))

@@ -1,0 +1,126 @@
+"""A session that begins a new piece of its map where the robot was carried, and knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from evaluation.metrics.map_pieces import energy_within_pieces
+from ratslam.core.session import Session, Step
+from ratslam.keyframes.piece_placement import APART
+from tactile.base.types import Observation
+from tests.ratslam.pipeline.touch_walks import (
+    WIDE,
+    Walk,
+    empty_merging_session,
+    empty_session,
+    follow,
+    kidnap,
+    metric,
+    simulate_walk,
+    true_share,
+)
+
+CARRIED = 240
+"""Step before which the robot is carried: not the start of a chunk of the session, nor of a keyframe's."""
+
+
+@cache
+def carried(seed: int = 4) -> Walk:
+    return kidnap(simulate_walk(seed, maze=WIDE), CARRIED, 45)
+
+
+def replay(session: Session, readings: Sequence[Observation], begin: int = CARRIED) -> list[Step]:
+    steps = list(session.replay(readings[:begin]))
+    session.begin_piece()
+    return [*steps, *session.replay(readings[begin:])]
+
+
+@cache
+def replayed() -> tuple[list[Step], dict[str, np.ndarray]]:
+    session = empty_session()
+    steps = replay(session, carried().readings)
+    return steps, session.arrays()
+
+
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    assert one.keys() == other.keys()
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
+
+
+def test_a_new_piece_lies_apart_until_closures_join_it() -> None:
+    walk, session = carried(), empty_session()
+    replay(session, walk.readings[: CARRIED + 12])
+    begun = session.map.pieces()
+    assert begun.tolist() == [0] * CARRIED + [1] * 12
+    path = session.map.trajectory()
+    apart = np.hypot(*(path[:CARRIED, None, :2] - path[None, CARRIED:, :2]).transpose(2, 0, 1))
+    assert apart.min() > APART / 2 * session.map.cell
+    assert not any(piece[0] != piece[1] for piece in begun[session.map.closures()])
+    follow(session, walk.readings[CARRIED + 12 :])
+    assert not session.map.pieces().any()
+    assert metric(session.map.trajectory(), walk.truth) < 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_pieces_are_right_within(seed: int) -> None:
+    walk, session = carried(seed), empty_session()
+    replay(session, walk.readings)
+    found = follow(session, [])
+    assert true_share(found, walk.truth) > 0.95
+    assert energy_within_pieces(found.path, walk.truth, session.map.pieces()).total < 0.1
+
+
+def test_the_robot_is_unknown_where_a_piece_begins() -> None:
+    steps, _ = replayed()
+    first = next(step for step in steps[CARRIED:] if int(step.evidence.keyframe) >= 0)
+    assert first is steps[CARRIED]  # the next view becomes a keyframe
+    assert float(first.evidence.novelty) > 0.5
+    assert int(first.estimate.previous) == -1
+
+
+def test_live_gives_the_bits_of_a_replay() -> None:
+    expected, whole = replayed()
+    walk, session = carried(), empty_session()
+    for k, reading in enumerate(walk.readings):
+        if k == CARRIED:
+            session.begin_piece()
+        assert np.array_equal(session.step(reading).pose, expected[k].pose), k
+    assert same(session.arrays(), whole)
+
+
+@pytest.mark.parametrize("stop", [CARRIED, CARRIED + 5, CARRIED + 60])
+def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
+    _, whole = replayed()
+    walk, session = carried(), empty_session()
+    replay(session, walk.readings[:stop])
+    saved = session.arrays()
+    session = empty_session()
+    session.restore(saved)
+    list(session.replay(walk.readings[stop:]))
+    assert same(session.arrays(), whole)
+
+
+def test_no_link_leads_from_one_piece_to_the_next() -> None:
+    walk, session = carried(), empty_session()
+    steps = replay(session, walk.readings[: CARRIED + 12])
+    graph = session.map.graph()
+    before = {int(step.estimate.place) for step in steps[:CARRIED]}
+    after = {int(step.estimate.place) for step in steps[CARRIED:]}
+    assert before.isdisjoint(after)
+    assert not [edge for edge in graph.edges if (edge[0] in before) != (edge[1] in before)]
+    edges, first = session.map.edges(), int(session.map.arrays()["graph/begins"].argmax())
+    assert not ((edges.i < first) != (edges.j < first)).any()
+
+
+def test_a_piece_of_a_map_that_merges_keyframes_is_joined_and_merged() -> None:
+    walk, session = carried(), empty_merging_session(2)
+    replay(session, walk.readings)
+    arrays = session.arrays()
+    assert arrays["map/graph/begins"].sum() == 1
+    assert len(arrays["map/graph/taken"]) < len(arrays["map/archive/graph/taken"])
+    assert not session.map.pieces().any()
+    assert metric(session.map.trajectory(), walk.truth) < 0.1
