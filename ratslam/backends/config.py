@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.classic.experience_map import ExperienceConfig
@@ -45,6 +46,22 @@ class RecallBackendConfig(PoseCellBackendConfig):
     """The keyframe map."""
     min_fit_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     """Share of fitting revisits below which the robot is reported lost (see `RecallEvidence.health`)."""
+
+
+class LocaliseConfig(Settings):
+    """Localisation in a finished map."""
+
+    map: Path | None = None
+    """The map: a file map.npz; `python -m ratslam localise` sets it."""
+    log_odds: PositiveFloat = 15.0
+    """Log-odds at which a pose is found, beyond the logarithm of the number of places in the map."""
+
+
+class LocaliseBackendConfig(RecallBackendConfig):
+    """Sections of `backend: localise`: those that the map was made with, and its file."""
+
+    localise: LocaliseConfig = LocaliseConfig()
+    """Localisation in a finished map."""
 
 
 class GridBackendConfig(Settings):

@@ -28,7 +28,7 @@ from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.signed_appearance import SignedAppearance
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
-from ratslam.recall.config import fan_width, sector_shifts
+from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
@@ -120,10 +120,9 @@ class RecallBackend(Backend):
     def init(self, key: Array, capacity: int) -> RecallState:
         """One packet in the middle of the torus, and no keyframes. `key` is not used: nothing is random."""
         del key
-        groups = 0 if self.pixels is None else int(self.pixels.group.max()) + 1
         return RecallState(
             pose_cells.start(self.config.pose_cells, self.dtype),
-            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, groups),
+            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
             jnp.ones((), self.dtype),
         )
 
@@ -152,12 +151,11 @@ class RecallBackend(Backend):
     ) -> tuple[RecallState, Estimate, RecallEvidence]:
         """Recalls the view, injects activity by its posterior, moves the packet and stores the view."""
         odometry, view, visible, clean = finite_values(self.dtype, observation)
-        view = view_templates.normalise(self.config.templates, view)
-        seen = view_templates.is_seen(self.config.templates, observation, visible)
+        seen, view = self.prepare(observation, view, visible)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
         memory = recall_memory.accumulate_motion(state.memory, moved)
         is_keyframe = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
-        features = self._features(view, observation)
+        features = self.features(view, observation)
 
         memory, result, control = lax.cond(
             is_keyframe,
@@ -234,7 +232,21 @@ class RecallBackend(Backend):
             return shaped
         return np.asarray(view_templates.normalise(config, jnp.asarray(shaped)))
 
-    def _features(self, view: Array, observation: Observation) -> Array:
+    def prepare(self, observation: Observation, view: Array, visible: Array) -> tuple[Array, Array]:
+        """Whether a view can be compared, and the view normalised.
+
+        Args:
+            view, visible: see `finite_values`.
+        """
+        normalised = view_templates.normalise(self.config.templates, view)
+        return view_templates.is_seen(self.config.templates, observation, visible), normalised
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of whisker pixels, 0 without whiskers."""
+        return 0 if self.pixels is None else int(self.pixels.group.max()) + 1
+
+    def features(self, view: Array, observation: Observation) -> Array:
         """The stored and compared form of a view: its values, the levels of its whisker pixels, or
         their signed roots."""
         flat = view.reshape(-1)[: self.size]
@@ -253,7 +265,7 @@ class RecallBackend(Backend):
 
         def look(_: None, one: mirror.Look) -> tuple[None, tuple[Modes, RecallResult]]:
             seen = memory._replace(**one.modes._asdict(), motion=one.motion, bias=one.bias)
-            seen, likelihood = self._likelihood(seen, one.view, one.label)
+            seen, likelihood = self.likelihood(self.recall, seen, one.view, one.label)
             after, result = filter.recognise(self.recall, self.cell, seen, likelihood, one.local)
             return None, (mirror.modes_of(after), result)
 
@@ -263,14 +275,18 @@ class RecallBackend(Backend):
         result, false = (jax.tree.map(lambda x, k=k: x[k], results) for k in (0, 1))
         return memory._replace(**own._asdict(), control=control), result, _candidate(false)
 
-    def _likelihood(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, ObservationLikelihood]:
+    def likelihood(
+        self, config: RecallConfig, memory: Memory, view: Array, label: Array
+    ) -> tuple[Memory, ObservationLikelihood]:
+        """Likelihood of a view's features, or of an id, at every keyframe of a memory; and the memory with what
+        the next view needs."""
         if self.labels:
-            return memory, label_likelihood(self.recall, memory, label)
+            return memory, label_likelihood(config, memory, label)
         if self.signed:
-            return signed_likelihood(self.recall, memory, view)
+            return signed_likelihood(config, memory, view)
         if self.pixels is not None:
-            return touch_likelihood(self.recall, memory, view, self.pixels)
-        return memory, view_likelihood(self.recall, self.cell, memory, view)
+            return touch_likelihood(config, memory, view, self.pixels)
+        return memory, view_likelihood(config, self.cell, memory, view)
 
     def _mirrored(self, view: Array, angle: Array) -> Array:
         if self.pixels is not None:

@@ -9,15 +9,17 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 
 from ratslam.attractor import pose_cells
-from ratslam.backends import grid
+from ratslam.backends import grid, localise
 from ratslam.backends.classic import ClassicBackend, ClassicEvidence
 from ratslam.backends.config import (
     ClassicBackendConfig,
     GridBackendConfig,
+    LocaliseBackendConfig,
     RecallBackendConfig,
     select_settings,
 )
 from ratslam.backends.grid import GridEvidence
+from ratslam.backends.localise import LocaliseEvidence, LocaliseOutcome
 from ratslam.backends.recall import RecallBackend, RecallEvidence
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
@@ -80,6 +82,12 @@ BACKENDS = Registry(
             pose_cells.Outcome,
             lambda config, sensors, dtype: ClassicBackend(config, sensors.view_shape, dtype),
         ),
+        "localise": BackendEntry(
+            LocaliseBackendConfig,
+            LocaliseEvidence,
+            LocaliseOutcome,
+            lambda config, sensors, dtype: localise.build(config, sensors.view_shape, dtype),
+        ),
         "grid": BackendEntry(
             GridBackendConfig,
             GridEvidence,
@@ -105,7 +113,7 @@ def build(
             its maps have too many cells.
     """
     settings, dtype = backend_settings(name, config), np.dtype(dtype)
-    if isinstance(settings, RecallBackendConfig):
+    if type(settings) is RecallBackendConfig:
         return RecallBackend(settings, sensors.view_shape, dtype, ablation)
     return BACKENDS.get(name, "backend").build(settings, sensors, dtype)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, RecallBackendConfig
+from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.config.includes import merge_includes
 from ratslam.config.packaged import find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin
@@ -81,7 +81,7 @@ class SourceConfig(Settings):
         return live
 
 
-class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
+class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
     """A run: `python -m ratslam run config.yaml`. `ratslam.backends.config` has the methods' sections."""
 
     renamed_keys = RENAMED
@@ -114,6 +114,8 @@ class RunConfig(RecallBackendConfig, ClassicBackendConfig, GridBackendConfig, So
         frontend = frontend and resolved_plugin(frontend, TOUCH, folder)
         touch = {"reports": self.touch.reports.resolved(folder), "frontend": frontend}
         parts["touch"] = self.touch.model_copy(update=touch)
+        file = self.localise.map
+        parts["localise"] = self.localise.model_copy(update={"map": file and folder / file})
         parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
         return self.model_copy(update=parts)
 

@@ -213,7 +213,7 @@ class KeyframeGraph(Checkpointed):
     def variances(self, cut: GrowableArray) -> np.ndarray:
         """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`, where a piece
         begins, and at seams."""
-        variance = self._odometry_variance(self.length.rows, self.turn.rows)
+        variance = self.odometry_variance(self.length.rows, self.turn.rows)
         loose = self.is_broken(cut) | self.seam.rows
         return np.where(loose[:, None], self._loose_variance(), variance)
 
@@ -223,7 +223,7 @@ class KeyframeGraph(Checkpointed):
 
     def own_variances(self) -> np.ndarray:
         """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
-        return self._odometry_variance(self.length.rows, self.turn.rows) / [
+        return self.odometry_variance(self.length.rows, self.turn.rows) / [
             1.0,
             1.0,
             self.heading_noise.factor,
@@ -240,7 +240,7 @@ class KeyframeGraph(Checkpointed):
         """[3] variance of the odometry into the newest keyframe."""
         if self.begins.rows[-1]:
             return self._loose_variance()
-        return self._odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
+        return self.odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
 
     def closure_variance(self) -> np.ndarray:
         """[3] variance of a closure, m^2, m^2, rad^2."""
@@ -327,8 +327,8 @@ class KeyframeGraph(Checkpointed):
     def _loose_variance(self) -> np.ndarray:
         return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
 
-    def _odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """[n, 3] variances of odometry over these distances [n] and sums of absolute turns [n]."""
+    def odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """[n, 3] variances of odometry over these distances [n], m, and sums of absolute turns [n], rad."""
         noise, cell = self.config.noise, self.cell
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
         least = noise.least_heading**2 * self.heading_noise.factor

@@ -260,8 +260,13 @@ def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
 
 def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
     """bool: the present view becomes a keyframe, because the robot has moved far enough."""
-    moved = (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
+    moved = is_motion_due(config, cell, memory)
     return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
+
+
+def is_motion_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
+    """bool: the robot has moved so far since the newest keyframe that a view is compared again."""
+    return (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
 
 
 def current_pose(memory: Memory) -> Array:

@@ -1,0 +1,1 @@
+"""Saved maps used again: localisation, joining, routes and change."""

@@ -1,0 +1,69 @@
+"""The keyframes of a finished map as ground on which a session is placed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.recall.config import RecallConfig, sector_shifts
+from tactile.base.se2 import wrap
+
+REACH = 1.2
+"""Distance from a keyframe within which the robot is at it, cells."""
+REACH_HEADING = 0.3
+"""Difference in heading within which a view is compared with a keyframe's, rad; at least 0.6 of the turn
+between two sector shifts."""
+
+
+class Ground(NamedTuple):
+    """N keyframes, each with S headings at which a robot there may be compared with it.
+
+    Attributes:
+        poses: [N, 3] m, m, rad. turns: [S] heading of the robot less that of the keyframe at each sector
+            shift, rad. reach, reach_heading: m and rad. variance: [3] of a pose found by comparing views, m²,
+            m², rad².
+    """
+
+    poses: np.ndarray
+    turns: np.ndarray
+    reach: float
+    reach_heading: float
+    variance: np.ndarray
+
+    def near(self, pose: np.ndarray, reach: float, reach_heading: float) -> tuple[np.ndarray, np.ndarray]:
+        """The sector shifts [n] and keyframes [n] at which a robot at `pose` [3] is compared.
+
+        Args:
+            reach, reach_heading: m, rad.
+        """
+        apart = (self.poses[:, 0] - pose[0]) ** 2 + (self.poses[:, 1] - pose[1]) ** 2
+        close = np.flatnonzero(apart < reach**2)
+        turned = np.abs(wrap(self.poses[close, 2] + self.turns[:, None] - pose[2]))
+        shift, row = np.nonzero(turned < reach_heading)
+        return shift, close[row]
+
+    def claims(self, shift: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        """[n, 3] poses of a robot whose view is that of keyframes [n] at sector shifts [n]."""
+        claimed = self.poses[frame].copy()
+        claimed[:, 2] = wrap(claimed[:, 2] + self.turns[shift])
+        return claimed
+
+    def places(self) -> float:
+        """Number of poses that can be told apart: keyframes within reach of each other count as one."""
+        density = [len(self.near(pose, self.reach, self.reach_heading)[0]) for pose in self.poses]
+        return float((len(self.turns) / np.maximum(density, 1)).sum())
+
+
+def ground_of(graph: KeyframeGraph, poses: np.ndarray, recall: RecallConfig) -> Ground:
+    """Keyframes at these poses [N, 3] as ground; the rest is that of the graph."""
+    turns = -sector_shifts(recall) * graph.sector_angle
+    least = 0.6 * abs(graph.sector_angle) if len(turns) > 2 else 0.0
+    return Ground(
+        poses,
+        turns,
+        REACH * graph.cell,
+        max(REACH_HEADING, least),
+        graph.closure_variance(),
+    )

@@ -1,0 +1,177 @@
+"""Supposed poses of a session in a map, each with the log-odds of the whole session since its start.
+
+Recall proposes poses. A proposed pose is followed back to the start of the session, and from then on with
+it: it has to explain all views, not only those that proposed it. The rule is ours; localisation with an
+unknown start by hypotheses is Fox et al. 1999."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.atlas.following import Motion, Supposed, advance
+from ratslam.atlas.gain_odds import LEAVING, GainOdds
+from ratslam.atlas.ground import Ground
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
+from tactile.base.se2 import wrap
+
+SPAN = 400
+"""Largest number of keyframes of the session that a proposed pose is followed back."""
+HOPELESS = -25.0
+"""Log-odds below which a supposed pose is dropped."""
+SAME_HEADING = 0.5
+"""Difference in heading within which two supposed poses are the same, rad; in position: the ground's reach."""
+
+
+class Path(NamedTuple):
+    """A supposed pose followed through n keyframes: poses [n, 3], covariances [n, 3, 3], and log-odds [n] of
+    each keyframe."""
+
+    poses: np.ndarray
+    covariances: np.ndarray
+    odds: np.ndarray
+
+
+class SessionViews(Checkpointed):
+    """The newest keyframes of a session: odometry into each, and the gains of their views on the ground.
+
+    Args:
+        shifts, count: S and N of the ground.
+    """
+
+    def __init__(self, shifts: int, count: int) -> None:
+        self.gain = GrowableArray((shifts, count), np.float32)
+        self.shows = GrowableArray((), np.bool_)
+        self.motion = GrowableArray((3,), np.float64)
+        self.variance = GrowableArray((3,), np.float64)
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes."""
+        return len(self.shows.rows)
+
+    def append(self, moved: Motion, gain: np.ndarray | None) -> None:
+        """Adds a keyframe; the oldest ones are forgotten."""
+        if self.count >= 2 * SPAN:
+            self.forget(SPAN)
+        empty = np.zeros(self.gain.rows.shape[1:], np.float32)
+        self.gain.append(empty if gain is None else gain)
+        self.shows.append(gain is not None)
+        self.motion.append(moved.motion)
+        self.variance.append(moved.variance)
+
+    def forget(self, keep: int) -> None:
+        """Forgets all but the newest keyframes."""
+        for array in (self.gain, self.shows, self.motion, self.variance):
+            array.replace(array.rows[max(len(array.rows) - keep, 0) :].copy())
+
+    def moved(self, k: int) -> Motion:
+        """The odometry into keyframe k."""
+        return Motion(self.motion.rows[k], self.variance.rows[k])
+
+    def gains(self, k: int) -> np.ndarray | None:
+        """[S, N] gains of the view of keyframe k, None if it shows nothing."""
+        return self.gain.rows[k] if self.shows.rows[k] else None
+
+    def follow_back(self, ground: Ground, odds: GainOdds, at: Supposed, least: float = -np.inf) -> Path:
+        """The path to a supposed pose of the newest keyframe, from the newest to the oldest keyframe; ends
+        early once its log-odds are below `least`."""
+        poses, covariances, gained = [at.pose], [at.covariance], [0.0]
+        total, inside = 0.0, True
+        for k in range(self.count - 2, max(self.count - 1 - SPAN, -1), -1):
+            at, gain = advance(ground, at, self.moved(k + 1).reversed(), self.gains(k))
+            log_odds, inside = _log_odds(odds, gain, inside, bool(self.shows.rows[k]))
+            poses.append(at.pose)
+            covariances.append(at.covariance)
+            gained.append(log_odds)
+            total += log_odds
+            if total < least:
+                break
+        return Path(np.array(poses), np.array(covariances), np.array(gained))
+
+
+class Hypotheses(Checkpointed):
+    """Attributes:
+    pose: [h, 3], covariance: [h, 3, 3] of each supposed pose now. log_odds: [h] of the session so far.
+    best: [h] largest log-odds so far. inside: [h] bool, on mapped ground.
+    """
+
+    def __init__(self) -> None:
+        self.pose = GrowableArray((3,), np.float64)
+        self.covariance = GrowableArray((3, 3), np.float64)
+        self.log_odds = GrowableArray((), np.float64)
+        self.best = GrowableArray((), np.float64)
+        self.inside = GrowableArray((), np.bool_)
+
+    @property
+    def count(self) -> int:
+        """Number of supposed poses."""
+        return len(self.log_odds.rows)
+
+    def at(self, k: int) -> Supposed:
+        """A supposed pose."""
+        return Supposed(self.pose.rows[k], self.covariance.rows[k])
+
+    def advance(self, ground: Ground, odds: GainOdds, moved: Motion, gain: np.ndarray | None) -> None:
+        """Moves all supposed poses to the newest keyframe; drops hopeless ones, and the weaker of two that have
+        become one."""
+        for k in range(self.count):
+            at, gained = advance(ground, self.at(k), moved, gain)
+            log_odds, inside = _log_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
+            self.pose.rows[k], self.covariance.rows[k] = at
+            self.log_odds.rows[k] += log_odds
+            self.inside.rows[k] = inside
+        self.best.rows[:] = np.maximum(self.best.rows, self.log_odds.rows)
+        self._drop(ground)
+
+    def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
+        """Adds a supposed pose [3] of the newest keyframe unless there is one like it."""
+        if _same(ground, self.pose.rows, pose).any():
+            return
+        path = views.follow_back(ground, odds, Supposed(pose, np.diag(ground.variance)), HOPELESS)
+        total = float(path.odds.sum())
+        if total < HOPELESS:
+            return
+        self.pose.append(pose)
+        self.covariance.append(np.diag(ground.variance))
+        self.log_odds.append(total)
+        self.best.append(total)
+        self.inside.append(True)
+
+    def clear(self) -> None:
+        """Drops all."""
+        self._keep(np.zeros(self.count, bool))
+
+    def ranked(self) -> np.ndarray:
+        """[h] the supposed poses by descending log-odds."""
+        return np.argsort(-self.log_odds.rows, kind="stable")
+
+    def _drop(self, ground: Ground) -> None:
+        kept: list[int] = []
+        for k in self.ranked().tolist():
+            hopeless = self.log_odds.rows[k] < HOPELESS
+            if not hopeless and not _same(ground, self.pose.rows[kept], self.pose.rows[k]).any():
+                kept.append(k)
+        if len(kept) < self.count:
+            self._keep(np.isin(np.arange(self.count), kept))
+
+    def _keep(self, rows: np.ndarray) -> None:
+        for array in (self.pose, self.covariance, self.log_odds, self.best, self.inside):
+            array.replace(array.rows[rows].copy())
+
+
+def _log_odds(odds: GainOdds, gain: float, inside: bool, shows: bool) -> tuple[float, bool]:
+    """Log-odds of one keyframe, and whether it is on mapped ground."""
+    if not shows:
+        return 0.0, inside
+    if np.isnan(gain):
+        return (LEAVING if inside else 0.0), False
+    return odds.of(gain), True
+
+
+def _same(ground: Ground, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """[n] bool: poses [n, 3] that are the same place and heading as `pose` [3]."""
+    apart = np.hypot(*(poses - pose)[:, :2].T)
+    return (apart < ground.reach) & (np.abs(wrap(poses[:, 2] - pose[2])) < SAME_HEADING)

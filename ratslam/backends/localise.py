@@ -1,0 +1,228 @@
+"""Localisation in a finished map: recall without adding keyframes, and supposed poses that explain the whole
+session."""
+
+from __future__ import annotations
+
+import zipfile
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam.atlas.gain_odds import GainOdds
+from ratslam.atlas.ground import ground_of
+from ratslam.atlas.localiser import Localiser, Place
+from ratslam.atlas.self_comparison import compare_with_itself
+from ratslam.backends.config import LocaliseBackendConfig
+from ratslam.backends.recall import RecallBackend
+from ratslam.core.backend import Backend
+from ratslam.core.checkpoint import with_prefix
+from ratslam.core.finite_values import finite_values
+from ratslam.core.session import capacity_at
+from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.recall import filter
+from ratslam.recall import memory as recall_memory
+from ratslam.recall.config import sector_shifts
+from ratslam.recall.frozen import first_keyframes, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory
+from ratslam.recall.observation_model import ObservationLikelihood
+from tactile.base.errors import InputError
+from tactile.base.types import Array, Observation
+
+
+class LocaliseOutcome(IntEnum):
+    """Outcome of a step."""
+
+    OK = 0
+    """Odometry and view were used."""
+    NOT_FINITE = 1
+    """Odometry or view had values that are not finite, and was not used."""
+
+
+class LocaliseEvidence(NamedTuple):
+    """Evidence of one step.
+
+    Attributes:
+        keyframe: number of the view among those compared, -1 for none. match: the keyframe of the map that is
+            recalled, -1 for none. shift_row: its sector shift, a row of `recall.config.sector_shifts`.
+            posterior, log_ratio, novelty: see `RecallResult`. shows: whether the view can be compared.
+            gain: [S, C] log-likelihood of the view at each keyframe less that at a new place. outcome: a
+            `LocaliseOutcome`.
+    """
+
+    keyframe: Scalar
+    match: Scalar
+    shift_row: Scalar
+    posterior: Scalar
+    log_ratio: Scalar
+    novelty: Scalar
+    shows: Array
+    gain: Array
+    outcome: Scalar
+
+
+class LocaliseState(NamedTuple):
+    """Attributes:
+    memory: the keyframes of the map and the posterior over them. seen: number of views compared so far.
+    """
+
+    memory: Memory
+    seen: Array
+
+
+class LocaliseBackend(Backend):
+    """Localisation in a finished keyframe map.
+
+    Args:
+        recall: the backend that made the map. map: the finished map. log_odds: see `LocaliseConfig`.
+    """
+
+    def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float) -> None:
+        self._recall, self._log_odds = recall, log_odds
+        # No keyframe of the map is too new to be recalled.
+        self._config = recall.recall.model_copy(update={"guard": 0})
+        poses = map.solution().fit.poses  # those of trajectory.tum and map.json
+        kept = map.kept_keyframes()
+        self._memory = self._freeze(map, poses, kept.taken.rows)
+        ground = ground_of(kept, poses[kept.taken.rows], self._config)
+        self._place = Place(map, ground, self._learn(map, poses))
+
+    def init(self, key: Array, capacity: int) -> LocaliseState:
+        """The map, and no idea where in it. `key` and `capacity` are not used."""
+        del key, capacity
+        return LocaliseState(jax.tree.map(jnp.array, self._memory), jnp.int32(0))
+
+    def kernel(
+        self, state: LocaliseState, observation: Observation
+    ) -> tuple[LocaliseState, Estimate, LocaliseEvidence]:
+        """Compares the view of a keyframe with the map."""
+        recall = self._recall
+        odometry, view, visible, clean = finite_values(recall.dtype, observation)
+        seen, view = recall.prepare(observation, view, visible)
+        memory = recall_memory.accumulate_motion(
+            state.memory, jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
+        )
+        due = recall_memory.is_motion_due(self._config, recall.cell, memory) | (state.seen == 0)
+        is_keyframe = seen & due
+        features = recall.features(view, observation)
+
+        memory, result, gain, shows = lax.cond(
+            is_keyframe,
+            lambda: self._look(memory, features, observation.label),
+            lambda: (memory, filter.empty_result(memory), self._no_gain(), jnp.bool_(False)),
+        )
+        shifts = jnp.asarray(sector_shifts(self._config))
+        place = jnp.int32(-1)
+        estimate = Estimate(
+            pose=jnp.zeros(3, recall.dtype), spread=jnp.zeros(3, recall.dtype), place=place, previous=place,
+            action=jnp.int32(Action.NONE), lost=jnp.bool_(True),
+        )  # fmt: skip
+        evidence = LocaliseEvidence(
+            keyframe=jnp.where(is_keyframe, state.seen, -1),
+            match=result.match,
+            shift_row=jnp.argmax(shifts == result.shift).astype(jnp.int32),
+            posterior=result.posterior,
+            log_ratio=result.log_ratio,
+            novelty=result.novelty,
+            shows=shows,
+            gain=gain,
+            outcome=jnp.where(clean, LocaliseOutcome.OK, LocaliseOutcome.NOT_FINITE).astype(jnp.int32),
+        )
+        return LocaliseState(memory, state.seen + is_keyframe.astype(jnp.int32)), estimate, evidence
+
+    def new_map(self) -> Localiser:
+        """A session of which nothing is known."""
+        return Localiser(self._place, self._log_odds)
+
+    def _look(
+        self, memory: Memory, view: Array, label: Array
+    ) -> tuple[Memory, filter.RecallResult, Array, Array]:
+        memory, likelihood = self._recall.likelihood(self._config, memory, view, label)
+        memory, result = filter.recognise(self._config, self._recall.cell, memory, likelihood, 0.0)
+        zero = jnp.zeros_like(memory.length)
+        memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
+        return memory, result, self._gain(likelihood), likelihood.certain & likelihood.informative
+
+    def _gain(self, likelihood: ObservationLikelihood) -> Array:
+        tiny = jnp.finfo(likelihood.novelty.dtype).tiny
+        gain = jnp.log(jnp.maximum(likelihood.likelihood, tiny)) - jnp.log(
+            jnp.maximum(likelihood.novelty, tiny)
+        )
+        return jnp.broadcast_to(gain.astype(jnp.float32), self._gain_shape())
+
+    def _no_gain(self) -> Array:
+        return jnp.zeros(self._gain_shape(), jnp.float32)
+
+    def _gain_shape(self) -> tuple[int, int]:
+        return len(sector_shifts(self._config)), self._memory.label.shape[0]
+
+    def _freeze(self, map: KeyframeMap, poses: np.ndarray, frames: np.ndarray) -> Memory:
+        """The memory of the keyframes `frames` [N] of a map, with poses [E, 3] of all."""
+        recall, graph, metric = self._recall, map.kept_keyframes(), map.appearance.metric()
+        feedback = MapFeedback(poses[frames], graph.bias, graph.turn_error, 0.0, *metric)
+        views, labels = map.appearance.stored(frames)
+        capacity = capacity_at(len(labels))
+        return frozen_memory(self._config, feedback, views, labels, capacity, recall.dtype, recall.groups)
+
+    def _learn(self, map: KeyframeMap, poses: np.ndarray) -> GainOdds:
+        """The log-odds of gains, by comparing the map with itself, merged keyframes included."""
+        whole = self._freeze(map, poses, np.arange(len(poses)))
+        ground = ground_of(map.kept_keyframes(), poses, self._config)
+        look = jax.jit(self._look_at)
+
+        def gains(begin: int, count: int) -> np.ndarray:
+            earlier = first_keyframes(whole, begin - self._recall.recall.guard)
+            rows = look(earlier, jnp.arange(begin, begin + count, dtype=jnp.int32), whole.label)
+            return np.asarray(rows)
+
+        return compare_with_itself(ground, self._recall.recall.guard, gains)
+
+    def _look_at(self, memory: Memory, frames: Array, label: Array) -> Array:
+        """Gains [n, S, C] of stored views `frames` [n]; label: [C] of all keyframes."""
+
+        def look(memory: Memory, frame: Array) -> tuple[Memory, Array]:
+            view = memory.view[:, frame]
+            memory, likelihood = self._recall.likelihood(self._config, memory, view, label[frame])
+            tiny = jnp.finfo(likelihood.novelty.dtype).tiny
+            gain = jnp.log(jnp.maximum(likelihood.likelihood, tiny)) - jnp.log(likelihood.novelty)
+            shape = len(sector_shifts(self._config)), memory.label.shape[0]
+            return memory, jnp.broadcast_to(gain.astype(jnp.float32), shape)
+
+        return lax.scan(look, memory, frames)[1]
+
+
+def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype: Any) -> LocaliseBackend:
+    """The backend of a configuration.
+
+    Raises:
+        InputError: the map cannot be read, or was not made with these settings.
+    """
+    settings = config.localise
+    if settings.map is None:
+        raise InputError("localise.map", "missing", "a map: a run directory or its map.npz")
+    recall = RecallBackend(config, view_shape, dtype)
+    return LocaliseBackend(recall, read_keyframe_map(recall, settings.map), settings.log_odds)
+
+
+def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
+    """The keyframe map in a map file that was made with these settings.
+
+    Raises:
+        InputError: it cannot be read, or was made with others.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}
+        map = recall.new_map()
+        map.restore(with_prefix(arrays, "map/"))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        expected = "a map made by `backend: recall` with the same settings"
+        raise InputError(str(path), str(error) or type(error).__name__, expected) from None
+    if not map.kept_keyframes().count:
+        raise InputError(str(path), "a map without keyframes", "a map in which a session can be found")
+    return map
