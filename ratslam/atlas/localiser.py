@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ratslam.atlas.following import Motion
-from ratslam.atlas.gain_odds import GainOdds
-from ratslam.atlas.ground import Ground
-from ratslam.atlas.hypotheses import Hypotheses, SessionViews
+from ratslam.alignment.following import Motion
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.ground import Ground
+from ratslam.alignment.hypotheses import Hypotheses, SessionViews
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -22,6 +22,9 @@ from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.travel import HALT
 from tactile.base.se2 import between, compose
 from tactile.base.types import Observation
+
+if TYPE_CHECKING:
+    import networkx
 
 CONFIRMING = 3
 """Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
@@ -79,7 +82,7 @@ class Localiser(Checkpointed, Map):
             places is subtracted.
     """
 
-    VALUES = ("_travel", "_state", "_recalled", "_since", "_anchor", "_last")
+    VALUES = ("_travel", "_state", "_recalled", "_anchor", "_last")
     PARTS = ("_views", "_hypotheses")
 
     def __init__(self, place: Place, log_odds: float) -> None:
@@ -90,8 +93,9 @@ class Localiser(Checkpointed, Map):
         self._views, self._hypotheses = SessionViews(shifts, count), Hypotheses()
         self._travel = HALT
         self._state = int(Localisation.SEARCHING)
-        self._recalled = np.full(5, np.nan)  # keyframe and pose of the newest recalled pose, keyframes agreeing
-        self._since = 0  # keyframe of the session at which the search began
+        self._recalled = np.full(
+            5, np.nan
+        )  # keyframe and pose of the newest recalled pose, keyframes agreeing
         self._anchor = np.zeros(3)  # pose of the newest keyframe
         self._last = np.zeros(11)  # its covariance, mass and log-odds
         self._pose = GrowableArray((3,), np.float64)
@@ -127,7 +131,7 @@ class Localiser(Checkpointed, Map):
         begins = np.diff(found.astype(int), prepend=1) < 0
         return np.where(found, 0, np.cumsum(begins))
 
-    def graph(self):  # type: ignore[no-untyped-def]
+    def graph(self) -> networkx.DiGraph:
         """The graph of the finished map."""
         return self.place.map.graph()
 
@@ -173,7 +177,10 @@ class Localiser(Checkpointed, Map):
         return graph.correct(motion, length), variance
 
     def _propose(self, evidence: Evidence, moved: Motion) -> None:
-        """Proposes the recalled pose once it agrees with odometry for some keyframes."""
+        """Proposes the recalled pose once it agrees with odometry for some keyframes.
+
+        `_recalled` holds the keyframe of the newest one, its pose, and how many in a row agree.
+        """
         if int(evidence.match) < 0 or float(evidence.posterior) <= 0.5:
             self._recalled[1:4] = compose(self._recalled[1:4], moved.motion)
             return
@@ -233,7 +240,11 @@ class Localiser(Checkpointed, Map):
 
     def _write(self, path: Path) -> None:
         lines = ["step,state,mass,log_odds,sd"]
-        for step, (state, record) in enumerate(zip(self._known.rows, self._record.rows.tolist(), strict=True)):
+        for step, (state, record) in enumerate(
+            zip(self._known.rows, self._record.rows.tolist(), strict=True)
+        ):
             mass, log_odds, deviation = record
-            lines.append(f"{step},{Localisation(int(state)).name.lower()},{mass!r},{log_odds!r},{deviation!r}")
+            lines.append(
+                f"{step},{Localisation(int(state)).name.lower()},{mass!r},{log_odds!r},{deviation!r}"
+            )
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

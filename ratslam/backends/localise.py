@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.atlas.gain_odds import GainOdds
-from ratslam.atlas.ground import ground_of
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.ground import Ground, ground_of
+from ratslam.alignment.self_comparison import compare_with_itself
 from ratslam.atlas.localiser import Localiser, Place
-from ratslam.atlas.self_comparison import compare_with_itself
 from ratslam.backends.config import LocaliseBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.backend import Backend
@@ -89,7 +89,7 @@ class LocaliseBackend(Backend):
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
         kept = map.kept_keyframes()
         self._memory = self._freeze(map, poses, kept.taken.rows)
-        ground = ground_of(kept, poses[kept.taken.rows], self._config)
+        ground = self._ground(map, poses[kept.taken.rows])
         self._place = Place(map, ground, self._learn(map, poses))
 
     def init(self, key: Array, capacity: int) -> LocaliseState:
@@ -169,10 +169,14 @@ class LocaliseBackend(Backend):
         capacity = capacity_at(len(labels))
         return frozen_memory(self._config, feedback, views, labels, capacity, recall.dtype, recall.groups)
 
+    def _ground(self, map: KeyframeMap, poses: np.ndarray) -> Ground:
+        graph = map.kept_keyframes()
+        return ground_of(poses, self._config, self._recall.cell, graph.sector_angle, graph.closure_variance())
+
     def _learn(self, map: KeyframeMap, poses: np.ndarray) -> GainOdds:
         """The log-odds of gains, by comparing the map with itself, merged keyframes included."""
         whole = self._freeze(map, poses, np.arange(len(poses)))
-        ground = ground_of(map.kept_keyframes(), poses, self._config)
+        ground = self._ground(map, poses)
         look = jax.jit(self._look_at)
 
         def gains(begin: int, count: int) -> np.ndarray:

@@ -278,8 +278,8 @@ class RecallBackend(Backend):
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
     ) -> tuple[Memory, ObservationLikelihood]:
-        """Likelihood of a view's features, or of an id, at every keyframe of a memory; and the memory with what
-        the next view needs."""
+        """Likelihood of a view's features, or of an id, at every keyframe of a memory; and the memory with
+        what the next view needs."""
         if self.labels:
             return memory, label_likelihood(config, memory, label)
         if self.signed:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.recall.config import RecallConfig, sector_shifts
 from tactile.base.se2 import wrap
 
@@ -56,14 +55,14 @@ class Ground(NamedTuple):
         return float((len(self.turns) / np.maximum(density, 1)).sum())
 
 
-def ground_of(graph: KeyframeGraph, poses: np.ndarray, recall: RecallConfig) -> Ground:
-    """Keyframes at these poses [N, 3] as ground; the rest is that of the graph."""
-    turns = -sector_shifts(recall) * graph.sector_angle
-    least = 0.6 * abs(graph.sector_angle) if len(turns) > 2 else 0.0
-    return Ground(
-        poses,
-        turns,
-        REACH * graph.cell,
-        max(REACH_HEADING, least),
-        graph.closure_variance(),
-    )
+def ground_of(
+    poses: np.ndarray, recall: RecallConfig, cell: float, sector_angle: float, variance: np.ndarray
+) -> Ground:
+    """Keyframes at these poses [N, 3] as ground.
+
+    Args:
+        cell: size of a pose cell, m. sector_angle: turn per sector shift, rad. variance: see `Ground`.
+    """
+    turns = -sector_shifts(recall) * sector_angle
+    least = 0.6 * abs(sector_angle) if len(turns) > 2 else 0.0
+    return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance)

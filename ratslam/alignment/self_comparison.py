@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.atlas.following import STILL, Motion, Supposed, advance
-from ratslam.atlas.gain_odds import GainOdds, learn_gain_odds
-from ratslam.atlas.ground import Ground
+from ratslam.alignment.following import STILL, Motion, Supposed, advance
+from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
+from ratslam.alignment.ground import Ground
 from tactile.base.se2 import between, wrap
 
 STRETCHES = 24
@@ -32,7 +32,8 @@ Arguments: the keyframe, n."""
 
 
 class Stretch(NamedTuple):
-    """Consecutive keyframes: ground before them, their gains [n, S, M] on it, and the motions between them."""
+    """Consecutive keyframes: ground before them, their gains [n, S, M] on it, the motions between them, and
+    the pose [3] of the first."""
 
     ground: Ground
     gains: np.ndarray

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.atlas.ground import Ground
+from ratslam.alignment.ground import Ground
 from tactile.base.se2 import compose, inverse, wrap
 
 MOST_REACH, MOST_REACH_HEADING = 3.0, 2.0
@@ -35,9 +35,7 @@ class Motion(NamedTuple):
 STILL = Motion(np.zeros(3), np.zeros(3))
 
 
-def advance(
-    ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
-) -> tuple[Supposed, float]:
+def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None) -> tuple[Supposed, float]:
     """Moves a supposed pose, and corrects it by the views that it is compared with.
 
     Args:
@@ -60,9 +58,10 @@ def advance(
     best = float(gains.max())
     if best <= 0:
         return at, best
-    weight = np.exp(gains - best)
     error = ground.claims(shift, frame) - at.pose
     error[:, 2] = wrap(error[:, 2])
+    apart = (error**2 / (np.diag(at.covariance) + ground.variance)).sum(axis=1)
+    weight = np.exp(gains - best - apart / 2)
     return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
 
 

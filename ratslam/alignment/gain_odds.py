@@ -42,7 +42,8 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray) -> GainOdds:
     """Log-odds of gains from those counted at true poses [n] and at false ones [m]."""
     prior_true, prior_false = (_quantiles(*prior) for prior in (PRIOR_TRUE, PRIOR_FALSE))
     pooled = np.concatenate([true, false, prior_true, prior_false])
-    edges = np.linspace(*np.quantile(pooled, [0.005, 0.995]), BINS - 1)
+    low, high = np.quantile(pooled, [0.005, 0.995]).tolist()
+    edges = np.linspace(low, high, BINS - 1)
     same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
     mixed = (1 - OUTLIERS) * same + OUTLIERS * other
     odds = np.log(mixed / ((1 - OUTLIERS) * other + OUTLIERS * same))

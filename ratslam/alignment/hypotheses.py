@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.atlas.following import Motion, Supposed, advance
-from ratslam.atlas.gain_odds import LEAVING, GainOdds
-from ratslam.atlas.ground import Ground
+from ratslam.alignment.following import Motion, Supposed, advance
+from ratslam.alignment.gain_odds import LEAVING, GainOdds
+from ratslam.alignment.ground import Ground
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from tactile.base.se2 import wrap
@@ -22,7 +22,8 @@ SPAN = 400
 HOPELESS = -25.0
 """Log-odds below which a supposed pose is dropped."""
 SAME_HEADING = 0.5
-"""Difference in heading within which two supposed poses are the same, rad; in position: the ground's reach."""
+"""Difference in heading within which two supposed poses are the same, rad; in position it is the ground's
+reach."""
 
 
 class Path(NamedTuple):
@@ -115,8 +116,8 @@ class Hypotheses(Checkpointed):
         return Supposed(self.pose.rows[k], self.covariance.rows[k])
 
     def advance(self, ground: Ground, odds: GainOdds, moved: Motion, gain: np.ndarray | None) -> None:
-        """Moves all supposed poses to the newest keyframe; drops hopeless ones, and the weaker of two that have
-        become one."""
+        """Moves all supposed poses to the newest keyframe; drops hopeless ones, and the weaker of two that
+        have become one."""
         for k in range(self.count):
             at, gained = advance(ground, self.at(k), moved, gain)
             log_odds, inside = _log_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
