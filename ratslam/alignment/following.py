@@ -58,10 +58,9 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     best = float(gains.max())
     if best <= 0:
         return at, best
+    weight = np.exp(gains - best)
     error = ground.claims(shift, frame) - at.pose
     error[:, 2] = wrap(error[:, 2])
-    apart = (error**2 / (np.diag(at.covariance) + ground.variance)).sum(axis=1)
-    weight = np.exp(gains - best - apart / 2)
     return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
 
 
