@@ -33,6 +33,9 @@ def add_commands(commands: Commands) -> None:
         "--head", metavar="ADDRESS",
         help="of the whiskers: usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulator",
     )  # fmt: skip
+    live.add_argument(
+        "--localise", type=Path, metavar="MAP", help="localise in this map instead of making one"
+    )
     add_rerun(live)
 
     emulate = commands.add(
@@ -57,6 +60,11 @@ def _live(arguments: argparse.Namespace) -> int:
     from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
+    if arguments.localise is not None:
+        from ratslam.pipeline.localise import localising
+        from ratslam.pipeline.saved_map import read_map
+
+        config = localising(config, read_map(arguments.localise))
     directory, target = run_directory(arguments), open_target(arguments)
     with monitor() as start_monitor:
         ended, card = run_live_session(config, directory, _print, armed=start_monitor, view=target)

@@ -43,7 +43,7 @@ def run(
         OSError: the disk is full.
     """
     with (
-        open_observations(config, _print) as (completed, source),
+        open_observations(config, print_status) as (completed, source),
         open_runner(completed, source, directory, resume, observers=observers) as runner,
     ):
         interrupted = process_source(runner, source)
@@ -81,7 +81,7 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     """
     if config.simulation is None and config.create_simulation is None:
         raise InputError("simulation", "missing", "a simulation", "`simulation: {}` is a complete session")
-    source = open_source(config, _print)
+    source = open_source(config, print_status)
     raw = config.simulation is None or config.simulation.raw
     frontend = None if raw else Frontend(config.touch, source.info.calibration)
     recorder = open_recorder(path, source)
@@ -139,5 +139,6 @@ def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _print(sentence: str) -> None:
+def print_status(sentence: str) -> None:
+    """Prints one sentence about the progress."""
     print(f"ratslam: {sentence}", file=sys.stderr)

@@ -205,6 +205,9 @@ def open_runner(
     if config.score.relations:
         read_relations(config.score.relations)  # fails before the directory is created
     build_metrics(config.score.metrics)
+    if config.localise.map is not None:
+        saved = read_map(config.localise.map)
+        check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     session = session or build_session(config, source)
     skip, estimate = _resume(session, resume, config, source) if resume else (0, START)
     if source.length is not None and source.length <= skip:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Map
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
+from ratslam.pipeline.localise import localising
 from ratslam.pipeline.saved_map import describe_readings, read_map, write_map
 from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
 from robot.sources.description import SourceDescription
@@ -118,18 +119,25 @@ class Slam:
         write_map(file, self.session, self.config, self.source, estimate=self.estimate, frontend=frontend)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Slam:
-        """Continues from a map to the same bits; the first step compiles.
+    def load(cls, path: str | os.PathLike[str], mode: Literal["continue", "localise"] = "continue") -> Slam:
+        """Continues from a map to the same bits, or localises in it; the first step compiles.
 
         Args:
             path: of a map written by `save`, or of a run directory or its map.npz; the touch front end of a
                 run starts anew.
+            mode: `localise`: the map stays as it is, and the robot may stand anywhere in it or elsewhere;
+                `slam.map.localisation()` tells whether and where it was found
+                (`ratslam.atlas.localiser.LocalisedPose`), `estimate.lost` whether it was not.
 
         Raises:
             InputError: there is no map, or it cannot be used (`read_map`).
         """
         saved = read_map(Path(path), warnings.warn)
         slam = cls.__new__(cls)
+        if mode == "localise":
+            slam._build(localising(saved.config, saved), saved.source)
+            slam.session.warm(slam._blank)
+            return slam
         slam._build(saved.config, saved.source)
         saved.restore(slam.session)
         slam.estimate = saved.estimate

@@ -1,0 +1,92 @@
+"""Localisation of a recording in a saved map: the run of a configuration with `backend: localise`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.scorecard import Scorecard
+from ratslam.atlas.localiser import Localisation
+from ratslam.backends.config import LocaliseConfig
+from ratslam.config.run_config import RunConfig, SourceConfig
+from ratslam.pipeline.progress import Observer
+from ratslam.pipeline.run import print_status, process_source
+from ratslam.pipeline.runner import open_runner
+from ratslam.pipeline.saved_map import SavedMap, read_map
+from ratslam.pipeline.source import open_observations
+from tactile.base.errors import InputError
+
+
+class LocalisationSummary(NamedTuple):
+    """The course of a localisation.
+
+    Attributes:
+        states: [T] a `Localisation` after each step. mass: probability of the last pose.
+    """
+
+    states: np.ndarray
+    mass: float
+
+    def describe(self) -> str:
+        """The summary in one sentence."""
+        found = np.flatnonzero(self.states == Localisation.FOUND)
+        last = Localisation(int(self.states[-1])) if len(self.states) else Localisation.SEARCHING
+        if not len(found):
+            return f"not found in {len(self.states)} steps: {describe_state(last)}"
+        lost = int((np.diff((self.states == Localisation.FOUND).astype(int)) < 0).sum())
+        again = f", lost {lost} times" if lost else ""
+        return (
+            f"found after {found[0] + 1} of {len(self.states)} steps, known in {len(found)} of them{again}; "
+            f"at the end: {describe_state(last)}, probability {self.mass:.3f}"
+        )
+
+
+def describe_state(state: Localisation) -> str:
+    """A state in plain words."""
+    return state.name.lower().replace("_", " ")
+
+
+def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
+    """The configuration of a session that is localised in a saved map: source and touch of `config`, the rest as
+    the map was made.
+
+    Raises:
+        InputError: the map was made by a method in whose maps nothing can be localised.
+    """
+    if saved.config.backend != "recall":
+        expected = "a map of a method that can localise: recall"
+        raise InputError(str(saved.path), f"a map made by `backend: {saved.config.backend}`", expected)
+    own = {name: getattr(config, name) for name in SourceConfig.model_fields}
+    update = own | {"backend": "localise", "localise": LocaliseConfig(map=saved.path.resolve())}
+    if config.localise.model_fields_set - {"map"}:
+        update["localise"] = config.localise.model_copy(update={"map": saved.path.resolve()})
+    return saved.config.model_copy(update=update | {"score": config.score})
+
+
+def localise(
+    map: Path, config: RunConfig, directory: Path, observers: Sequence[Observer] = ()
+) -> tuple[Scorecard, LocalisationSummary, bool]:
+    """Localises the source of a configuration in a saved map, which stays as it is.
+
+    Args:
+        map: a run directory or its map file. config: with absolute paths; its source and touch are used.
+        directory: the new run directory. observers: are told of the progress.
+
+    Returns:
+        the scorecard, the course of the localisation, and whether Ctrl-C ended it early.
+
+    Raises:
+        InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
+            map.
+    """
+    saved = read_map(map, print_status)
+    with open_observations(localising(config, saved), print_status) as (completed, source):
+        with open_runner(completed, source, directory, observers=observers) as runner:
+            interrupted = process_source(runner, source)
+            card = runner.finish(interrupted)
+            made = runner.session.map
+            summary = LocalisationSummary(made.states(), made.localisation().mass)  # type: ignore[attr-defined]
+    return card, summary, interrupted
