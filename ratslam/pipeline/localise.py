@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.atlas.localiser import Localisation
+from ratslam.atlas.localiser import Localisation, Localiser
 from ratslam.backends.config import LocaliseConfig
 from ratslam.config.run_config import RunConfig, SourceConfig
 from ratslam.pipeline.progress import Observer
@@ -50,8 +50,8 @@ def describe_state(state: Localisation) -> str:
 
 
 def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
-    """The configuration of a session that is localised in a saved map: source and touch of `config`, the rest as
-    the map was made.
+    """The configuration of a session that is localised in a saved map: source and touch of `config`, the rest
+    as the map was made.
 
     Raises:
         InputError: the map was made by a method in whose maps nothing can be localised.
@@ -83,10 +83,13 @@ def localise(
             map.
     """
     saved = read_map(map, print_status)
-    with open_observations(localising(config, saved), print_status) as (completed, source):
-        with open_runner(completed, source, directory, observers=observers) as runner:
-            interrupted = process_source(runner, source)
-            card = runner.finish(interrupted)
-            made = runner.session.map
-            summary = LocalisationSummary(made.states(), made.localisation().mass)  # type: ignore[attr-defined]
+    with (
+        open_observations(localising(config, saved), print_status) as (completed, source),
+        open_runner(completed, source, directory, observers=observers) as runner,
+    ):
+        interrupted = process_source(runner, source)
+        card = runner.finish(interrupted)
+        made = runner.session.map
+        assert isinstance(made, Localiser)
+        summary = LocalisationSummary(made.states(), made.localisation().mass)
     return card, summary, interrupted
