@@ -1,1 +1,1 @@
-"""Saved maps used again: localisation, joining, routes and change."""
+"""Saved maps used again and cared for: localisation, joining, routes, change, crop, differences."""

@@ -30,7 +30,7 @@ from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
+from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -145,6 +145,10 @@ class RecallBackend(Backend):
     def begin_piece(self, state: RecallState) -> RecallState:
         """The filter knows no place; its health is that of the start."""
         return state._replace(memory=recall_memory.begin_piece(state.memory), health=jnp.ones((), self.dtype))
+
+    def crop_rows(self, state: RecallState, cropped: CroppedRows) -> RecallState:
+        """The memory of a cropped map."""
+        return state._replace(memory=recall_memory.crop_rows(state.memory, cropped))
 
     def kernel(
         self, state: RecallState, observation: Observation

@@ -8,7 +8,7 @@ are merged or restored, and it takes over the map's feedback.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.backend import Backend, Evidence, Map
+from ratslam.core.backend import Backend, Evidence, Map, State
 from ratslam.core.checkpoint import with_prefix
 from ratslam.core.packing import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.precision import Precision, check_precision
@@ -138,18 +138,30 @@ class Session:
         self.map.restore(with_prefix(arrays, "map/"))
         self.steps, self.reserve, self._capacity = steps, reserve, capacity
 
+    def change_rows(self, rows: int, steps: int, change: Callable[[State], State]) -> None:
+        """Follows a map that was changed as a whole.
+
+        Args:
+            rows: of the memory thereafter. steps: in the map. change: makes the new state of one with
+                capacity for these rows.
+        """
+        self._hold(rows)
+        self.state, self.steps = change(self.state), steps
+
     def compilations(self) -> int:
         """Number of compilations of the chunk function: one per capacity."""
         return self._run_chunk._cache_size()  # type: ignore[attr-defined]
 
+    def _hold(self, rows: int) -> None:
+        """Grows the capacity to these rows and those of one more chunk; each step adds at most one."""
+        capacity = capacity_at(rows + CHUNK - 1, self.reserve)
+        if capacity > self._capacity:
+            self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
+
     def _advance(self, observations: list[Observation]) -> list[Step]:
         if self.steps % CHUNK == 0:
             merged = self.map.merge()
-            rows = self.backend.rows(self.state) if merged is None else merged.rows
-            # Each step adds at most one row.
-            capacity = capacity_at(rows + CHUNK - 1, self.reserve)
-            if capacity > self._capacity:
-                self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
+            self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
             if merged is not None:
                 self.state = self.backend.merge_rows(self.state, merged)
             self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())

@@ -96,6 +96,10 @@ class Appearance(Checkpointed, ABC):
         return NO_ESTIMATE
 
     @abstractmethod
+    def take(self, frames: np.ndarray) -> None:
+        """Reduces the views to those of keyframes [n]; what was learned of the sensor stays."""
+
+    @abstractmethod
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The views [n, D] and ids [n] of keyframes [n], as recall stores them."""
 
@@ -121,6 +125,9 @@ class LabelAppearance(Appearance):
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
+
+    def take(self, frames: np.ndarray) -> None:
+        self._label.replace(self._label.rows[frames])
 
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((len(frames), 0)), self._label.rows[frames]
@@ -163,6 +170,9 @@ class ViewAppearance(Appearance):
         self._view.append(np.asarray(view, float).reshape(-1)[:size])
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
+
+    def take(self, frames: np.ndarray) -> None:
+        self._view.replace(self._view.rows[frames])
 
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._view.rows[frames], np.full(len(frames), -1)
@@ -233,6 +243,9 @@ class WhiskerAppearance(Appearance):
         self._level.append(
             pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
         )
+
+    def take(self, frames: np.ndarray) -> None:
+        self._level.replace(self._level.rows[frames])
 
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._level.rows[frames], np.full(len(frames), -1)

@@ -85,6 +85,29 @@ class Experiences(Checkpointed):
         frame[:] = onto[frame]
         self._place.replace(self._place.rows[source])
 
+    def take(self, row: np.ndarray, own: np.ndarray, number: np.ndarray, poses: np.ndarray) -> None:
+        """Reduces the experiences to those with keyframes that remain, and the links to those between them.
+
+        Args:
+            row: [E] keyframe of the map that each keyframe ever taken is or is merged with; none is merged
+                thereafter. own: [N] number of each keyframe of the map among all ever taken. number: [E] new
+                number of each of these, -1 if it does not remain. poses: [E, 3] of all.
+        """
+        place, taken = self._place.rows[row], np.flatnonzero(number >= 0)
+        places, first = np.unique(place[taken], return_index=True)
+        before = own[self._frame.rows]  # the keyframe that holds each experience
+        held = compose(poses[before], self._offset.rows)[places]
+        holder = np.where(number[before[places]] >= 0, before[places], taken[first])
+        self._offset.replace(between(poses[holder], held))
+        self._frame.replace(number[holder])
+        self._place.replace(np.searchsorted(places, place[taken]))
+        again = np.full(len(before), -1)
+        again[places] = np.arange(len(places))
+        links = np.column_stack([again[self._link.rows[:, :2]], self._link.rows[:, 2]])
+        self._link.replace(links[(links[:, :2] >= 0).all(axis=1)])
+        self._link_of = {(a, b): k for k, (a, b, _) in enumerate(self._link.rows.tolist())}
+        self._current = int(again[self._current]) if self._current >= 0 else -1
+
     def graph(self, poses: np.ndarray, taken: np.ndarray) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), keyframe; links with dx, dy, dtheta and traversals.
 
@@ -114,7 +137,7 @@ class Experiences(Checkpointed):
         apart = self._poses(poses) - poses[frame]
         turned = wrap(apart[:, 2])
         far = np.hypot(np.hypot(apart[:, 0], apart[:, 1]) / self.radius, turned / self.heading)
-        if far[self._current] <= 1:
+        if self._current >= 0 and far[self._current] <= 1:
             return self._current
         best = int(np.argmin(far))
         return best if reliable and far[best] <= 1 else -1

@@ -30,6 +30,8 @@ from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion
 
 LOOSE = 1e4
 """Standard deviation of odometry across a break, cells and rad."""
+INTERRUPTED = int(np.iinfo(np.int64).max)
+"""Value of `cut` where keyframes before were taken out of the map: no sequence shows the break."""
 NO_ROBUST_SCALE = 1e12
 """Robust scale at which no closure sequence loses weight."""
 
@@ -44,8 +46,8 @@ class KeyframeGraph(Checkpointed):
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
-            that shows a break of the odometry before the keyframe, -1 for none. begins: [N] a piece of the
-            map begins with the keyframe, to which no odometry leads (`begin_piece`).
+            that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`. begins: [N] a
+            piece of the map begins with the keyframe, to which no odometry leads (`begin_piece`).
             seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
             in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
@@ -141,6 +143,11 @@ class KeyframeGraph(Checkpointed):
         self.pose.replace(poses)
         self.cut.replace(cut)
         self.links = NO_LINKS
+
+    def take(self, rows: np.ndarray) -> None:
+        """Reduces all arrays to the keyframes `rows` [n]; links are not touched."""
+        for array in self._growable_arrays().values():
+            array.replace(array.rows[rows])
 
     def pose_after(self, motion: np.ndarray, length: float) -> np.ndarray:
         """[3] the pose after a motion [3] over a distance since the newest keyframe."""

@@ -167,6 +167,29 @@ class ClosureLog(Checkpointed):
         self._evidence.replace(evidence[~lost].copy())
         self._lines = None
 
+    def take(self, number: np.ndarray) -> np.ndarray:
+        """Reduces the log to candidates of keyframes that remain, and to sequences that have some.
+
+        Args:
+            number: [N] new number of each keyframe, -1 if it does not remain.
+
+        Returns:
+            [r] the former numbers of the sequences.
+        """
+        rows = self._candidate.rows
+        ends = number[rows[:, :2]]
+        left = (ends >= 0).all(axis=1)
+        sequence = rows[left, 3]
+        sequences = np.unique(sequence[sequence >= 0])
+        renumbered = np.where(sequence >= 0, np.searchsorted(sequences, sequence), -1)
+        self._candidate.replace(np.column_stack([ends[left], rows[left, 2], renumbered]))
+        self._evidence.replace(self._evidence.rows[left])
+        for array in self._growable_arrays().values():
+            if array is not self._candidate and array is not self._evidence:
+                array.replace(array.rows[sequences])
+        self._lines = None
+        return sequences
+
     def take_verdicts(self, other: ClosureLog, sequences: np.ndarray) -> None:
         """Takes over the verdicts and weights of sequences [n] from a log of the same candidates."""
         self._verdict.rows[sequences] = other._verdict.rows[sequences]

@@ -16,7 +16,19 @@ ATTACHED = 0.1
 def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     """Removes the merged keyframes from the graph: their odometry joins the keyframes that remain, and
     odometry over a row of merged ones is composed (a seam), where it no longer counts."""
-    links, rows = _links(graph, merge), merge.kept
+    links = _links(graph, merge)
+    skipped = take_keyframes(graph, merge.kept)
+    graph.seam.rows[skipped] = True
+    graph.links = links
+
+
+def take_keyframes(graph: KeyframeGraph, rows: np.ndarray) -> np.ndarray:
+    """Reduces the graph to the keyframes `rows` [n], ascending, with odometry composed over those that are
+    left out; links are not touched.
+
+    Returns:
+        those of the n keyframes before which some were left out.
+    """
     motion, length, turn = graph.motion.rows.copy(), graph.length.rows.copy(), graph.turn.rows.copy()
     after = np.flatnonzero(np.diff(rows) > 1)
     earlier, later = rows[after], rows[after + 1]
@@ -25,15 +37,11 @@ def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     for values in (length, turn):
         sums = np.cumsum(values)
         values[later] = sums[later] - sums[earlier]
-    seam = graph.seam.rows.copy()
-    seam[later] = True
-    graph.motion.replace(motion[rows])
-    graph.length.replace(length[rows])
-    graph.turn.replace(turn[rows])
-    graph.seam.replace(seam[rows])
-    for array in (graph.pose, graph.cut, graph.begins, graph.taken):
-        array.replace(array.rows[rows])
-    graph.links = links
+    graph.motion.replace(motion)
+    graph.length.replace(length)
+    graph.turn.replace(turn)
+    graph.take(rows)
+    return after + 1
 
 
 def _links(graph: KeyframeGraph, merge: Merge) -> OdometryLinks:

@@ -47,6 +47,9 @@ class SignedAppearance(Appearance):
         view = np.asarray(observation.view, float).reshape(-1)
         self._image.append(stored_image(view, live_pixels(observation).reshape(-1)))
 
+    def take(self, frames: np.ndarray) -> None:
+        self._image.replace(self._image.rows[frames])
+
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._image.rows[frames], np.full(len(frames), -1)
 

@@ -23,6 +23,26 @@ class StepRecord(Checkpointed):
         self._frame.append(frame)
         self._motion.append([*travel.motion, travel.length])
 
+    def take(self, number: np.ndarray) -> np.ndarray:
+        """Reduces the record to the steps of keyframes that remain; steps before the first keyframe remain
+        with it.
+
+        Args:
+            number: [E] new number of each keyframe, -1 if it does not remain.
+
+        Returns:
+            [t] the former numbers of the steps.
+        """
+        frame = self._frame.rows
+        steps = np.flatnonzero(number[np.maximum(frame, 0)] >= 0)
+        self._frame.replace(np.where(frame >= 0, number[frame], -1)[steps])
+        self._motion.replace(self._motion.rows[steps])
+        return steps
+
+    def frames(self) -> np.ndarray:
+        """[T] the keyframe of each step."""
+        return self._frame.rows
+
     def first_steps(self, count: int) -> np.ndarray:
         """[count] the step at which each keyframe was taken."""
         return np.searchsorted(self._frame.rows, np.arange(count))

@@ -1,0 +1,161 @@
+"""Care of saved maps: what is in one, what differs between two, undoing a closure sequence, cropping."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.atlas.crop import crop_map
+from ratslam.atlas.difference import MapContent, difference, keyframe_content
+from ratslam.backends.recall import RecallBackend
+from ratslam.config.strict_yaml import dump
+from ratslam.core.backend import Map
+from ratslam.core.session import Session
+from ratslam.keyframes.loop_closures import Verdict
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.pipeline.saved_map import SavedMap, write_map
+from ratslam.pipeline.sensor import disagreement
+from tactile.base.errors import InputError
+
+Choose = Callable[[KeyframeMap], np.ndarray]
+"""Chooses the keyframes of a map that remain: [E] bool."""
+
+
+def map_info(saved: SavedMap) -> dict[str, Any]:
+    """What is in a map, as JSON; numbers that the method does not give are left out.
+
+    Raises:
+        InputError: the map cannot be restored.
+    """
+    made = saved.open_session().map
+    path = made.trajectory() if saved.steps else np.zeros((0, 3))
+    doubt = made.final_doubt() if saved.steps else np.nan
+    info: dict[str, Any] = {
+        "path": str(saved.path),
+        "format": saved.format,
+        "digest": saved.digest,
+        "backend": saved.config.backend,
+        "sensor": saved.sensor.describe(),
+        "source": saved.source.name,
+        "recording": saved.recording or None,
+        "settings_sha256": hashlib.sha256(dump(saved.config).encode()).hexdigest(),
+        "steps": saved.steps,
+        "experiences": len(made.graph()) if saved.steps else 0,
+        "pieces": len(np.unique(made.pieces())) if saved.steps else 0,
+        "closures": len(made.closures()) if saved.steps else 0,
+        "box_m": _box(path),
+        "doubt": float(doubt) if np.isfinite(doubt) else None,
+    }
+    return info | (_keyframe_info(made) if isinstance(made, KeyframeMap) and saved.steps else {})
+
+
+def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
+    kept, solution = made.kept_keyframes(), made.solution()
+    belief = made.keyframes().calibration(*solution)
+    verdicts = solution.log.verdicts()
+    return {
+        "keyframes": made.keyframes().count,
+        "keyframes_not_merged": kept.count,
+        "sequences": len(verdicts),
+        "sequences_accepted": int((verdicts == Verdict.ACCEPTED).sum()),
+        "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
+        "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
+        "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
+    }
+
+
+def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
+    """What differs between two maps, as JSON: places (keyframes; steps for other methods), closures, the
+    motion of common places in m and rad, settings, and the sensor.
+
+    Raises:
+        InputError: a map cannot be restored.
+    """
+    contents = [_content(saved) for saved in (first, second)]
+    found = difference(*contents)._asdict()
+    settings = [_flat(saved.config.model_dump(mode="json")) for saved in (first, second)]
+    keys = sorted(settings[0].keys() | settings[1].keys())
+    pairs = {key: [one.get(key) for one in settings] for key in keys}
+    changed = {key: pair for key, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
+    return {
+        "same": first.digest == second.digest,
+        "steps": [first.steps, second.steps],
+        **{key: value if np.isfinite(value) else None for key, value in found.items()},
+        "settings": changed,
+        "sensor": disagreement(first.sensor, second.sensor),
+    }
+
+
+def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> None:
+    """Removes the closures of a sequence from a map, solves it without them, and writes it.
+
+    Raises:
+        InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, or the map
+            has no closure sequences.
+    """
+    session, made = _keyframe_session(saved, "undo")
+    try:
+        made.undo(sequence)
+    except ValueError as error:
+        cure = "`ratslam export` and closures.csv of the run list the sequences"
+        raise InputError(str(saved.path), str(error), "an accepted sequence", cure) from None
+    write_map(
+        output, session, saved.config, saved.source,
+        recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
+    )  # fmt: skip
+
+
+def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
+    """Writes the part of a map with the chosen keyframes as a map; returns its number of steps.
+
+    Raises:
+        InputError: no keyframe remains, or the map has no keyframes.
+    """
+    session, made = _keyframe_session(saved, "crop")
+    backend = session.backend
+    assert isinstance(backend, RecallBackend)
+    try:
+        inside = choose(made)
+        cropped = crop_map(made, backend.new_map(), inside)
+    except ValueError as error:
+        cure = "`ratslam map info` says where the map lies and how many steps and pieces it has"
+        raise InputError(str(saved.path), str(error), "a part of the map", cure) from None
+    steps = len(made.pieces())
+    session.change_rows(cropped.rows.rows, steps, lambda state: backend.crop_rows(state, cropped))
+    estimate = saved.estimate._replace(place=-1)  # places are numbered anew
+    write_map(output, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
+    return steps
+
+
+def _keyframe_session(saved: SavedMap, what: str) -> tuple[Session, KeyframeMap]:
+    session = saved.open_session()
+    if not isinstance(session.map, KeyframeMap) or not isinstance(session.backend, RecallBackend):
+        found = f"a map of `backend: {saved.config.backend}`, which has no keyframes to {what}"
+        raise InputError(str(saved.path), found, "a map of `backend: recall`")
+    return session, session.map
+
+
+def _content(saved: SavedMap) -> MapContent:
+    made: Map = saved.open_session().map
+    if isinstance(made, KeyframeMap):
+        return keyframe_content(made)
+    names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
+    path = made.trajectory() if saved.steps else np.zeros((0, 3))
+    return MapContent(path, names, made.closures())
+
+
+def _box(path: np.ndarray) -> list[float]:
+    """Least x and y and largest x and y of poses [T, 3], m."""
+    return [*path[:, :2].min(axis=0).tolist(), *path[:, :2].max(axis=0).tolist()] if len(path) else []
+
+
+def _flat(settings: dict[str, Any], before: str = "") -> dict[str, Any]:
+    """Nested settings by dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat(value, f"{before}{name}.") if isinstance(value, dict) else {before + name: value}
+    return flat
