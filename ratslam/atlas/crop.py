@@ -9,7 +9,6 @@ from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import INTERRUPTED, KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_solution import MapSolution
 from ratslam.keyframes.merged_odometry import take_keyframes
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import Travel
@@ -97,14 +96,14 @@ def _rows(map: KeyframeMap) -> np.ndarray:
 
 
 def _unmerged(map: KeyframeMap) -> tuple[KeyframeGraph, ClosureLog]:
-    """Copies of all keyframes at their present poses, and of all candidates."""
-    graph, log = map.kept_keyframes(), map.log
-    if not map.archive.begun:
-        return graph.copy(), log.copy()
-    map.archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
-    whole = map.archive.graph.copy()
-    whole.reckoned = graph.reckoned
-    return whole, map.archive.log.copy()
+    """Copies of all keyframes and of all candidates, as the final map has them."""
+    fit, log, broken = map.solution()
+    graph = map.keyframes().copy()
+    graph.pose.replace(fit.poses)
+    graph.cut.replace(broken.rows)
+    graph.bias, graph.turn_error = fit.bias, fit.turn_error
+    graph.reckoned = map.kept_keyframes().reckoned
+    return graph, log.copy()
 
 
 def _since(graph: KeyframeGraph, last: int) -> Travel:

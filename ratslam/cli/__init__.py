@@ -7,14 +7,32 @@ import errno
 import sys
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
-from ratslam.cli import check, doctor, files, fit, live, localise, look, reproduce, run, studies
+from ratslam.cli import (
+    check,
+    doctor,
+    files,
+    fit,
+    live,
+    localise,
+    look,
+    maps,
+    reproduce,
+    run,
+    studies,
+    tools,
+)
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
 
 GROUPS = ("run", "live", "maps", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
-RETIRED = {"tune": "reproduce threshold", "train-templates": "reproduce templates", **studies.REPLACED}
+RETIRED = {
+    "tune": "reproduce threshold",
+    "train-templates": "reproduce templates",
+    **studies.REPLACED,
+    **tools.MOVED,
+}
 """Commands of earlier versions, and the replacement of each."""
 
 
@@ -68,6 +86,6 @@ def build_parser() -> Program:
     """The parser of the whole program."""
     parser = Program(prog="ratslam", description=DESCRIPTION)
     parser.commands = Commands(parser)
-    for module in (run, live, localise, look, doctor, fit, studies, reproduce, files, check):
+    for module in (run, live, localise, maps, look, doctor, fit, studies, reproduce, files, check, tools):
         module.add_commands(parser.commands)
     return parser

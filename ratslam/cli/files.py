@@ -1,26 +1,16 @@
-"""The commands around files and the program itself: recover, export, schema, version, completion."""
+"""The command export."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import sys
 from pathlib import Path
 
 from ratslam.cli.common import Commands
-from tactile.base.atomic_write import write_text_atomically
 
 
 def add_commands(commands: Commands) -> None:
-    """Registers the commands of this module."""
-    recover = commands.add(
-        "recover", _recover, "repair a recording that was cut off",
-        "recover runs/maze/session.mcap -o runs/whole.mcap", "files",
-    )  # fmt: skip
-    recover.add_argument("recording", type=Path, metavar="MCAP", help="the damaged recording")
-    recover.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
-
+    """Registers the command of this module."""
     export = commands.add(
         "export", _export, "write a run as a standard file",
         "export runs/square -o runs/square.mcap", "files",
@@ -32,39 +22,6 @@ def add_commands(commands: Commands) -> None:
         "experiences, .yaml nav2 map; a name without a suffix becomes a ROS 2 bag folder",
     )  # fmt: skip
 
-    convert = commands.add(
-        "convert", _convert, "turn an OpenRatSLAM parameter file into a configuration",
-        "convert config_irat.txt --recording irat_red.bag -o irat.yaml", "files",
-    )  # fmt: skip
-    convert.add_argument("parameters", type=Path, metavar="INI", help="the parameter file")
-    convert.add_argument(
-        "--recording", type=Path, metavar="FILE", help="the bag or video to map (default ROOT.bag)"
-    )
-    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help="write to a file instead")
-
-    schema = commands.add(
-        "schema", _schema, "print the JSON schema of configurations, for editors",
-        "schema -o runs/schema.json", "files",
-    )  # fmt: skip
-    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help="write to a file instead")
-
-    commands.add("version", _version, "print the versions of ratslam, Python and JAX", "version", "files")
-
-    completion = commands.add(
-        "completion", _completion, "print a script that completes commands in a shell",
-        "completion bash > ~/.local/share/bash-completion/completions/ratslam", "files",
-    )  # fmt: skip
-    completion.add_argument("shell", choices=("bash", "zsh", "fish"), help="your shell")
-
-
-def _recover(arguments: argparse.Namespace) -> int:
-    from robot.recordings.mcap_reader import recover
-
-    report = recover(arguments.recording, arguments.output)
-    lost = f"; the rest is lost: {report.reason}" if report.reason else ""
-    print(f"{arguments.output}: {report.samples} samples{lost}")
-    return 0
-
 
 def _export(arguments: argparse.Namespace) -> int:
     from ratslam.export.formats import export_run
@@ -73,53 +30,4 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.run, arguments.output, lambda text: print(f"ratslam: warning: {text}", file=sys.stderr)
     )
     print(f"{arguments.output}: written")
-    return 0
-
-
-def _convert(arguments: argparse.Namespace) -> int:
-    from ratslam.config.openratslam import convert_parameters
-    from ratslam.config.strict_yaml import dump_data
-
-    output, recording = arguments.output, arguments.recording
-    if recording is not None and output is not None and not recording.is_absolute():
-        recording = Path(os.path.relpath(recording, output.parent))  # paths in a file start at its folder
-    converted = convert_parameters(arguments.parameters, recording)
-    for note in converted.notes:
-        print(f"note: {note}", file=sys.stderr)
-    text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(converted.settings)
-    if output:
-        write_text_atomically(output, text)
-    else:
-        print(text, end="")
-    return 0
-
-
-def _schema(arguments: argparse.Namespace) -> int:
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import schema
-
-    text = json.dumps(schema(RunConfig), indent=2) + "\n"
-    if arguments.output:
-        write_text_atomically(arguments.output, text)
-    else:
-        print(text, end="")
-    return 0
-
-
-def _version(arguments: argparse.Namespace) -> int:
-    import platform
-    from importlib.metadata import version
-
-    print(f"ratslam {version('ratslam')}")
-    print(f"Python {platform.python_version()}, jax {version('jax')}, jaxlib {version('jaxlib')}")
-    print(platform.platform())
-    return 0
-
-
-def _completion(arguments: argparse.Namespace) -> int:
-    import shtab
-
-    from ratslam.cli import build_parser
-
-    print(shtab.complete(build_parser(), arguments.shell))
     return 0

@@ -33,7 +33,11 @@ class Checkpointed:
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
+        """Replaces the whole state by that of `arrays`.
+
+        Raises:
+            KeyError, ValueError, TypeError: arrays are missing or of another kind.
+        """
         for name, array in self._growable_arrays().items():
             array.replace(arrays[name])
         for name in self.VALUES:
@@ -66,4 +70,9 @@ def _as_tuple(value: Any) -> tuple[Any, ...]:
 
 
 def _convert(value: np.ndarray, like: Any) -> Any:
-    return np.array(value) if isinstance(like, np.ndarray) else type(like)(value)
+    if not isinstance(like, np.ndarray):
+        return type(like)(value)
+    if value.ndim != like.ndim or value.dtype != like.dtype:
+        found = f"{value.dtype} with {value.ndim} dimensions"
+        raise ValueError(f"an array of {found} instead of {like.dtype} with {like.ndim}")
+    return np.array(value)

@@ -85,8 +85,10 @@ def read_estimate(arrays: Mapping[str, np.ndarray]) -> PoseEstimate:
     """
     if not arrays:
         return START
-    pose, covariance = np.array(arrays["pose"], float), np.array(arrays["covariance"], float)
-    if pose.shape != (3,) or covariance.shape != (3, 3):
-        raise ValueError(f"an estimate of shapes {pose.shape} and {covariance.shape}")
+    for name, like in estimate_arrays(START).items():
+        found = arrays[name]
+        if found.shape != like.shape or found.dtype.kind != like.dtype.kind:
+            raise ValueError(f"{name} of the estimate: {found.dtype} of shape {found.shape}")
+    pose, covariance = np.array(arrays["pose"]), np.array(arrays["covariance"])
     place, outcome, doubt = int(arrays["place"]), str(arrays["outcome"]), float(arrays["doubt"])
     return PoseEstimate(pose, covariance, place, outcome, Health(doubt), bool(arrays["lost"]))

@@ -61,11 +61,28 @@ def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
         "keyframes": made.keyframes().count,
         "keyframes_not_merged": kept.count,
         "sequences": len(verdicts),
-        "sequences_accepted": int((verdicts == Verdict.ACCEPTED).sum()),
+        "accepted_sequences": _accepted(made),
         "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
         "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
         "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
     }
+
+
+def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
+    """The accepted closure sequences: number, first and last step, the steps matched, evidence."""
+    log, step = made.solution().log, made.keyframe_steps()
+    found = []
+    for number in np.flatnonzero(log.verdicts() == Verdict.ACCEPTED).tolist():
+        members = log.members(number)
+        found.append(
+            {
+                "sequence": number,
+                "steps": step[members[[0, -1], 0]].tolist(),
+                "match_steps": step[members[[0, -1], 1]].tolist(),
+                "evidence": round(log.score(number), 2),
+            }
+        )
+    return found
 
 
 def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
@@ -101,7 +118,7 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> None:
     try:
         made.undo(sequence)
     except ValueError as error:
-        cure = "`ratslam export` and closures.csv of the run list the sequences"
+        cure = f"`ratslam map info {saved.path} --json` lists them"
         raise InputError(str(saved.path), str(error), "an accepted sequence", cure) from None
     write_map(
         output, session, saved.config, saved.source,

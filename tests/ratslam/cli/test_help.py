@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ratslam.cli import GROUPS, build_parser, main
+from ratslam.cli import GROUPS, RETIRED, build_parser, main
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = build_parser()
@@ -54,8 +54,17 @@ def test_an_unknown_command_is_refused(capsys: pytest.CaptureFixture[str]) -> No
     assert "invalid choice: 'runn'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("name", "now"), RETIRED.items())
+def test_a_command_that_moved_answers_with_its_place(
+    name: str, now: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([name]) == 2
+    assert capsys.readouterr().err == f"ratslam: error: `{name}` is now `ratslam {now}`\n"
+    assert now.split()[0] in COMMANDS
+
+
 def test_the_version_names_python_and_jax(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["version"]) == 0
+    assert main(["tools", "version"]) == 0
     first, second, _ = capsys.readouterr().out.splitlines()
     assert first == f"ratslam {version('ratslam')}"
     assert f"jax {version('jax')}" in second
@@ -63,13 +72,13 @@ def test_the_version_names_python_and_jax(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_completion_script_knows_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", shell]) == 0
+    assert main(["tools", "completion", shell]) == 0
     script = capsys.readouterr().out
     assert all(name in script for name in COMMANDS)
 
 
 def test_bash_completes_commands_options_choices_and_files(tmp_path: Path, capsys) -> None:
-    assert main(["completion", "bash"]) == 0
+    assert main(["tools", "completion", "bash"]) == 0
     (tmp_path / "script").write_text(capsys.readouterr().out)
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "maze.yaml").touch()
@@ -84,7 +93,8 @@ def test_bash_completes_commands_options_choices_and_files(tmp_path: Path, capsy
         )
         return set(done.stdout.split())
 
-    assert completions("ratslam", "vers") == {"version"}
+    assert completions("ratslam", "expo") == {"export"}
+    assert completions("ratslam", "tools", "vers") == {"version"}
     assert completions("ratslam", "run", "--cont") == {"--continue"}
-    assert completions("ratslam", "completion", "") == {"bash", "zsh", "fish"}
+    assert completions("ratslam", "tools", "completion", "") == {"bash", "zsh", "fish"}
     assert completions("ratslam", "run", "ma") == {"maze.yaml"}

@@ -329,17 +329,17 @@ def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
         record_source(source, tmp_path / "whole.mcap")
     content = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 6 // 10])
-    assert main(["recover", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "good.mcap")]) == 0
+    assert main(["tools", "recover", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "good.mcap")]) == 0
     file = f"recording.file={tmp_path / 'good.mcap'}"
     assert main(["run", SQUARE, "-o", str(tmp_path / "run"), "--set", file]) == 0
     steps = (tmp_path / "run" / "steps.csv").read_text().count("\n") - 1
     assert 50 < steps < 349
-    refuses(capsys, ["recover", ROOT / "LICENSE", "-o", tmp_path / "x.mcap"], "LICENSE")
+    refuses(capsys, ["tools", "recover", ROOT / "LICENSE", "-o", tmp_path / "x.mcap"], "LICENSE")
 
 
 def test_the_schema_names_every_part(capsys):
     capsys.readouterr()
-    assert main(["schema"]) == 0
+    assert main(["tools", "schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
     assert {"recording", "pose_cells", "templates", "places", "experience"} <= set(schema["properties"])
 

@@ -75,7 +75,7 @@ def write(tmp_path: Path):
 
 def test_the_irat_becomes_a_configuration(write, tmp_path: Path, capsys) -> None:
     output = tmp_path / "irat.yaml"
-    assert main(["convert", str(write(IRAT)), "-o", str(output)]) == 0
+    assert main(["tools", "convert", str(write(IRAT)), "-o", str(output)]) == 0
     notes = capsys.readouterr().err.splitlines()
     assert notes == ["note: exp_initial_em_deg has no counterpart: maps start at heading 0"]
     assert load_config(output).backend == "classic"
@@ -104,7 +104,7 @@ def test_a_video_and_visual_odometry_load(write, tmp_path: Path, capsys) -> None
     output = tmp_path / "there" / "lucia.yaml"
     output.parent.mkdir()
     video = str(tmp_path / "lucia.avi")
-    assert main(["convert", str(write(ST_LUCIA)), "--recording", video, "-o", str(output)]) == 0
+    assert main(["tools", "convert", str(write(ST_LUCIA)), "--recording", video, "-o", str(output)]) == 0
     assert "calibrate recording.visual_odometry.scaling" in capsys.readouterr().err
     config = load_config(output)
     assert config.recording is not None
@@ -124,7 +124,7 @@ def test_a_relative_recording_is_found_from_the_folder_of_the_output(write, tmp_
     write(ST_LUCIA)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
-    assert main(["convert", "config_irat.txt", "--recording", "a.avi", "-o", "out/lucia.yaml"]) == 0
+    assert main(["tools", "convert", "config_irat.txt", "--recording", "a.avi", "-o", "out/lucia.yaml"]) == 0
     recording = load_config("out/lucia.yaml").recording
     assert recording is not None
     assert recording.file.resolve() == tmp_path / "a.avi"

@@ -106,7 +106,7 @@ def test_files_of_earlier_versions_are_converted(run: ratslam.Result, tmp_path: 
         ({"config": "recall: {guard: many}\n"}, "config:1:"),
         ({"source": "{}"}, "not a description of a source"),
         ({"steps": -4}, "-4 steps"),
-        ({"estimate__pose": np.zeros(2)}, "an estimate of shapes"),
+        ({"estimate__pose": np.zeros(2)}, "pose of the estimate: float64 of shape"),
         ({"recording": 7}, "'recording' is not a text"),
         ({"drop": ("config",)}, "a file without 'config'"),
         ({"drop": ("steps",)}, "an archive of other arrays"),
