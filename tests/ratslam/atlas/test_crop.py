@@ -1,0 +1,156 @@
+"""Cropped maps: what remains, where odometry is interrupted, and that the session goes on."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ratslam.atlas.crop import crop_map, keyframes_in_box, keyframes_of_piece, keyframes_of_steps
+from ratslam.atlas.difference import difference, keyframe_content
+from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.recall.config import RecallConfig
+from ratslam.recall.memory import crop_rows
+from tactile.base.se2 import compose
+from tests.ratslam.keyframes.map_cases import LAP, STEP, drive, new_map
+from tests.ratslam.recall.test_merged_rows import CAPACITY, COUNT, random_memory
+
+END = LAP + 60
+TRUE = {k: (k - LAP, 4.0) for k in range(LAP, END)}
+"""Recall of the first keyframes in the second lap."""
+
+
+@cache
+def driven(recalled: bool) -> dict[str, np.ndarray]:
+    return drive(new_map(), TRUE if recalled else {}).arrays()
+
+
+def restored(recalled: bool):
+    map = new_map()
+    map.restore(driven(recalled))
+    return map
+
+
+@pytest.fixture
+def made():
+    """A lap and 60 keyframes of the next one, joined by one sequence."""
+    return restored(True)
+
+
+def cropped(made, inside):
+    before = made.trajectory()
+    return crop_map(made, new_map(), inside), before
+
+
+def test_a_crop_of_everything_changes_nothing(made) -> None:
+    before, arrays = keyframe_content(made), made.arrays()
+    rows, path = cropped(made, np.ones(END, bool))
+    found = difference(before, keyframe_content(made))
+    assert (found.common, found.removed, found.added) == (END, 0, 0)
+    assert (found.closures_removed, found.closures_added) == (0, 0)
+    assert found.closures_common == len(made.closures()) > 40
+    assert np.abs(made.trajectory() - path).max() < 1e-9
+    assert made.arrays().keys() == arrays.keys()
+    assert rows.left.all()
+    np.testing.assert_array_equal(rows.rows.source, np.arange(END))
+    assert (rows.length, rows.turn, *rows.motion) == (0, 0, 0, 0, 0)
+
+
+def test_steps_keep_their_keyframes_closures_and_experiences(made) -> None:
+    graph, steps = made.graph(), made.keyframe_steps()
+    rows, path = cropped(made, keyframes_of_steps(made, 30, END))
+    count = END - 30
+    assert rows.rows.rows == count == made.kept_keyframes().count
+    np.testing.assert_array_equal(made.keyframe_steps(), steps[:count])
+    closures = made.closures()
+    assert 0 < len(closures) <= 30
+    assert closures.min() >= 0
+    assert closures.max() < count
+    np.testing.assert_array_equal(closures[:, 0] - closures[:, 1], LAP)
+    assert len(np.unique(made.pieces())) == 1
+    moved = np.hypot(*(made.trajectory() - path[30:])[:, :2].T)
+    assert moved.max() < 0.1 * np.ptp(path[:, 0]), "solved without the first closures"
+    after = made.graph()
+    assert len(after) == len(graph), "the second lap saw the places of the keyframes that are gone"
+    places = np.array([[node["x"], node["y"]] for node in after.nodes.values()])
+    apart = np.hypot(*(places[:, None] - made.trajectory()[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
+    assert apart.max() < 0.05 * STEP, "every experience lies on the way"
+    assert all(data["traversals"] > 0 for *_, data in after.edges(data=True))
+
+
+def test_where_keyframes_are_left_out_only_closures_join(made) -> None:
+    unjoined = restored(False)
+    for map, pieces in ((made, 1), (unjoined, 2)):
+        ends, places = keyframes_of_steps(map, 0, 60) | keyframes_of_steps(map, LAP, END), len(map.graph())
+        cropped(map, ends)
+        assert 0 < len(map.graph()) < places
+        assert len(map.trajectory()) == 120
+        assert len(np.unique(map.pieces())) == pieces
+    crop_map(unjoined, new_map(), keyframes_of_piece(unjoined, 1))
+    assert len(unjoined.trajectory()) == 60
+    assert len(np.unique(unjoined.pieces())) == 1
+
+
+def test_a_box_keeps_what_lies_in_it(made) -> None:
+    path = made.trajectory()
+    middle = float(np.median(path[:, 0]))
+    inside = keyframes_in_box(
+        made, (path[:, 0].min() - 1, path[:, 1].min() - 1, middle, path[:, 1].max() + 1)
+    )
+    np.testing.assert_array_equal(inside, path[:, 0] <= middle)
+    cropped(made, inside)
+    assert len(made.trajectory()) == inside.sum()
+
+
+def test_the_robot_stays_where_it_was_and_drives_on(made) -> None:
+    # Without noise and closures, odometry says where the robot is.
+    alone = restored(False)
+    pose = alone.pose(None)
+    rows, _ = cropped(alone, keyframes_of_steps(alone, 0, 100))
+    np.testing.assert_allclose(alone.pose(None), pose, atol=1e-9)
+    newest = alone.trajectory()[-1]
+    np.testing.assert_allclose(compose(newest, rows.motion), pose, atol=1e-9)
+    assert rows.length == pytest.approx((END - 100) * STEP)
+    cropped(made, keyframes_of_steps(made, 30, END))
+    drive(made, {k: (k - LAP, 4.0) for k in range(END - 30, END)}, first=END - 30, last=END)
+    assert len(made.trajectory()) == END
+    assert len(made.closures()) > 30
+
+
+def test_an_empty_part_is_refused(made) -> None:
+    with pytest.raises(ValueError, match="no keyframe remains"):
+        cropped(made, keyframes_of_steps(made, END, END + 5))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_posterior_of_rows_that_are_gone_is_novelty(seed: int) -> None:
+    stream = np.random.default_rng(seed)
+    config = RecallConfig(sector_fov="whiskers", modes=4)
+    memory = random_memory(stream, config)
+    map = drive(new_map(), {}, last=COUNT)
+    inside = np.arange(COUNT) % 3 > 0
+    rows = crop_map(map, new_map(), inside)
+    views = np.asarray(memory.view).T[:COUNT][inside]
+    rows = rows._replace(rows=rows.rows._replace(view=views))
+    after = crop_rows(memory, rows)
+    left = np.zeros(CAPACITY, bool)
+    left[:COUNT] = inside
+    for old, new in ((memory, after), (memory.control, after.control)):
+        held = left[np.asarray(old.anchor)]
+        np.testing.assert_allclose(np.asarray(new.mass), np.where(held, old.mass, 0))
+        count = int(inside.sum())
+        np.testing.assert_allclose(np.asarray(new.rest)[:, :count], np.asarray(old.rest)[:, left])
+        assert not np.asarray(new.rest)[:, count:].any()
+        kept = np.flatnonzero(left)
+        np.testing.assert_array_equal(kept[np.asarray(new.anchor)[held]], np.asarray(old.anchor)[held])
+    assert int(after.count) == inside.sum()
+    assert int(after.distinct) == inside.sum(), "each keyframe has a label of its own"
+    np.testing.assert_array_equal(np.asarray(after.view)[:, : inside.sum()].T, views)
+
+
+def test_settings_of_the_map_stay() -> None:
+    map = new_map(place_radius=2.0)
+    drive(map, {}, last=50)
+    crop_map(map, new_map(place_radius=2.0), np.arange(50) < 20)
+    assert map.config == KeyframeMapConfig(place_radius=2.0)
