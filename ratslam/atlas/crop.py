@@ -67,10 +67,7 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     steps.restore(with_prefix(own, "steps/"))
     steps.take(number)
     sequences = log.take(number)
-    _take_graph(graph, taken, sequences)
-    start = graph.start
-    back = inverse(correct_heading(since.motion, since.length, start.bias, start.turn_error))
-    graph.reckoned = compose(graph.reckoned, back)
+    _take_graph(graph, taken, sequences, since)
     if map.archive.begun:
         arrays["merger/merge_due/0"] = np.array(map.config.merge_stood > 0)
     views = map.appearance.stored(taken)
@@ -123,9 +120,12 @@ def _onwards(since: Travel, own: Arrays) -> Arrays:
     }
 
 
-def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray) -> None:
+def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, since: Travel) -> None:
     """Reduces a graph to keyframes; odometry is interrupted where some are left out, and stays cut where the
     sequence that showed a break is gone."""
+    start = graph.start
+    back = inverse(correct_heading(since.motion, since.length, start.bias, start.turn_error))
+    graph.reckoned = compose(graph.reckoned, back)
     skipped = take_keyframes(graph, taken)
     cut = graph.cut.rows
     known = np.isin(cut, sequences)

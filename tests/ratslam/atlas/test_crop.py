@@ -13,10 +13,14 @@ from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.memory import crop_rows
 from tactile.base.se2 import compose
-from tests.ratslam.keyframes.map_cases import LAP, STEP, drive, new_map
+from tests.ratslam.keyframes.map_cases import CELL, LAP, STEP, drive, new_map
+from tests.ratslam.keyframes.merging_cases import Drive, circles
 from tests.ratslam.recall.test_merged_rows import CAPACITY, COUNT, random_memory
 
 END = LAP + 60
+ROUND, LAPS = 80, 4
+"""Keyframes of a lap, and laps, of the merged map."""
+MERGED = {"select_every": 30, "merge_stood": 2, "merge_newest": 60}
 TRUE = {k: (k - LAP, 4.0) for k in range(LAP, END)}
 """Recall of the first keyframes in the second lap."""
 
@@ -154,3 +158,23 @@ def test_settings_of_the_map_stay() -> None:
     drive(map, {}, last=50)
     crop_map(map, new_map(place_radius=2.0), np.arange(50) < 20)
     assert map.config == KeyframeMapConfig(place_radius=2.0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_merged_keyframes_are_restored_and_merged_anew(share: float) -> None:
+    route, count = circles(LAPS, size=ROUND), LAPS * ROUND
+    whole, taken = Drive(route, **MERGED).go(count).map, int(share * count)
+    assert whole.kept_keyframes().count < count
+    row, own = whole.archive.row.rows.copy(), whole.kept_keyframes().taken.rows.copy()
+    rows = crop_map(whole, Drive(route, **MERGED).map, np.arange(count) < taken)
+    assert whole.kept_keyframes().count == rows.rows.rows == taken == len(whole.trajectory())
+    np.testing.assert_array_equal(rows.rows.label, np.arange(taken))
+    np.testing.assert_array_equal(rows.rows.source, row[:taken])
+    np.testing.assert_array_equal(rows.left, own < taken)
+    np.testing.assert_array_equal(rows.rows.onto[rows.left], own[own < taken])
+    ended = Drive(route, **MERGED).go(taken).map.trajectory()
+    apart = np.hypot(*(whole.trajectory() - ended)[:, :2].T)
+    assert apart.max() < CELL / 2, "the map is that of a session that ended there"
+    merged = whole.merge()
+    assert merged is not None
+    assert merged.rows < taken

@@ -44,10 +44,7 @@ def test_info_says_what_is_in_a_map(capsys) -> None:
     assert found["steps"] == 360
     assert found["format"] == "ratslam-map-1"
     assert 300 < found["keyframes"] <= 360
-    assert (
-        found["closures"] == sum(one["steps"][1] > one["steps"][0] for one in found["accepted_sequences"])
-        or found["closures"] > 0
-    )
+    assert found["closures"] >= len(found["accepted_sequences"]) > 0
     for words in (
         f"ratslam-map-1, sha256 {found['digest'][:12]}", "whisker head, 18 whiskers; views of 3 x 6 x 1",
         f"steps       360; experiences {found['experiences']}; pieces 1", "heading bias", "doubt       0.",
@@ -88,13 +85,11 @@ def test_a_cropped_map_is_a_map(capsys, tmp_path: Path) -> None:
     slam = ratslam.Slam.load(part)
     with open_recording(RecordingConfig(file=READINGS)) as recording:
         readings = [sample.reading for sample in recording]
-    online = slam.estimate.pose
     for reading in readings[360:460]:
         slam.step(reading)
     assert slam.steps == 360
     assert len(slam.map.closures()) > after["closures"], "the newer steps are recognised in the part"
     assert np.isfinite(slam.trajectory()).all()
-    assert np.isfinite(online).all()
 
 
 def test_boxes_and_pieces(capsys, tmp_path: Path) -> None:
