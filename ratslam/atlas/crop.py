@@ -11,8 +11,9 @@ from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.merged_odometry import take_keyframes
 from ratslam.keyframes.step_record import StepRecord
-from ratslam.keyframes.travel import Travel
-from ratslam.recall.memory import CroppedRows, MergedRows
+from ratslam.keyframes.travel import HALT, Travel
+from ratslam.recall.cropped_rows import CroppedRows
+from ratslam.recall.memory import MergedRows
 from tactile.base.se2 import between, compose, correct_heading, inverse
 
 Arrays = dict[str, np.ndarray]
@@ -56,7 +57,8 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     number = np.where(inside, np.cumsum(inside) - 1, -1)
     before, row = map.kept_keyframes().taken.rows.copy(), _rows(map)
     graph, log = _unmerged(map)
-    since = _since(graph, int(taken[-1]))
+    elsewhere = bool(graph.begins.rows[taken[-1] + 1 :].any())
+    since = HALT if elsewhere else _since(graph, int(taken[-1]))
     own = map.arrays()
     arrays = {name: value for name, value in own.items() if not name.startswith(AFRESH)}
     arrays |= {name: value for name, value in blank.arrays().items() if name.startswith(AFRESH)}
@@ -84,7 +86,7 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     arrays |= _acceptance(own, number, sequences)
     map.restore(arrays)
     merged = MergedRows(row[taken], *views, np.maximum(number[before], 0), np.zeros((len(before), 3)))
-    return CroppedRows(merged, inside[before], *since)
+    return CroppedRows(merged, inside[before], *since, elsewhere)
 
 
 def _rows(map: KeyframeMap) -> np.ndarray:
@@ -126,14 +128,16 @@ def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, 
     start = graph.start
     back = inverse(correct_heading(since.motion, since.length, start.bias, start.turn_error))
     graph.reckoned = compose(graph.reckoned, back)
+    number = np.cumsum(graph.begins.rows)[taken]
     skipped = take_keyframes(graph, taken)
+    graph.begins.rows[1:] = np.diff(number) > 0  # also where the first keyframe of a piece is left out
     cut = graph.cut.rows
     known = np.isin(cut, sequences)
     lost = (cut >= 0) & ~known
     cut[known] = np.searchsorted(sequences, cut[known])
     cut[lost] = INTERRUPTED
-    cut[skipped] = INTERRUPTED
-    cut[0] = -1
+    cut[skipped] = np.where(graph.begins.rows[skipped], -1, INTERRUPTED)
+    cut[0], graph.begins.rows[0] = -1, False
     graph.taken.replace(np.arange(len(taken)))
 
 

@@ -29,8 +29,9 @@ from ratslam.keyframes.signed_appearance import SignedAppearance
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
+from ratslam.recall.cropped_rows import CroppedRows, crop_rows
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, Modes
+from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -148,7 +149,7 @@ class RecallBackend(Backend):
 
     def crop_rows(self, state: RecallState, cropped: CroppedRows) -> RecallState:
         """The memory of a cropped map."""
-        return state._replace(memory=recall_memory.crop_rows(state.memory, cropped))
+        return state._replace(memory=crop_rows(state.memory, cropped))
 
     def kernel(
         self, state: RecallState, observation: Observation

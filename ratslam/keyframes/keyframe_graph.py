@@ -46,8 +46,8 @@ class KeyframeGraph(Checkpointed):
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
             travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
-            that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`. begins: [N] a
-            piece of the map begins with the keyframe, to which no odometry leads (`begin_piece`).
+            that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`. begins: [N]
+            a piece of the map begins with the keyframe, to which no odometry leads (`begin_piece`).
             seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
             in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
             odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.

@@ -143,6 +143,8 @@ def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
         raise InputError(str(saved.path), str(error), "a part of the map", cure) from None
     steps = len(made.pieces())
     session.change_rows(cropped.rows.rows, steps, lambda state: backend.crop_rows(state, cropped))
+    if cropped.elsewhere:
+        session.begin_piece()
     estimate = saved.estimate._replace(place=-1)  # places are numbered anew
     write_map(output, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
     return steps

@@ -11,7 +11,7 @@ from ratslam.atlas.crop import crop_map, keyframes_in_box, keyframes_of_piece, k
 from ratslam.atlas.difference import difference, keyframe_content
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.recall.config import RecallConfig
-from ratslam.recall.memory import crop_rows
+from ratslam.recall.cropped_rows import crop_rows
 from tactile.base.se2 import compose
 from tests.ratslam.keyframes.map_cases import CELL, LAP, STEP, drive, new_map
 from tests.ratslam.keyframes.merging_cases import Drive, circles
@@ -178,3 +178,23 @@ def test_merged_keyframes_are_restored_and_merged_anew(share: float) -> None:
     merged = whole.merge()
     assert merged is not None
     assert merged.rows < taken
+
+
+def test_pieces_stay_pieces_and_a_robot_in_one_that_is_gone_begins_another() -> None:
+    map = drive(new_map(), {}, last=60)
+    map.begin_piece()
+    drive(map, {}, first=60, last=100)
+    pieces = map.pieces()
+    assert pieces.tolist() == [0] * 60 + [1] * 40
+    both, other = new_map(), new_map()
+    for copy in (both, other):
+        copy.restore(map.arrays())
+    rows = crop_map(both, new_map(), (np.arange(100) % 60 > 4))
+    assert not rows.elsewhere
+    assert both.pieces().tolist() == [0] * 55 + [1] * 35, "without the first keyframe of either"
+    rows = crop_map(other, new_map(), keyframes_of_piece(other, 0))
+    assert rows.elsewhere
+    assert (rows.length, rows.turn) == (0, 0)
+    other.begin_piece()
+    drive(other, {}, first=60, last=70)
+    assert other.pieces().tolist() == [0] * 60 + [1] * 10
