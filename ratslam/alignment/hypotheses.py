@@ -6,13 +6,12 @@ unknown start by hypotheses is Fox et al. 1999."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ratslam.alignment.following import Motion, Supposed, advance
-from ratslam.alignment.gain_odds import LEAVING, GainOdds
+from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
+from ratslam.alignment.paths import Path, follow, keyframe_odds
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from tactile.base.se2 import wrap
@@ -24,15 +23,6 @@ HOPELESS = -25.0
 SAME_HEADING = 0.5
 """Difference in heading within which two supposed poses are the same, rad; in position it is the ground's
 reach."""
-
-
-class Path(NamedTuple):
-    """A supposed pose followed through n keyframes: poses [n, 3], covariances [n, 3, 3], and log-odds [n] of
-    each keyframe."""
-
-    poses: np.ndarray
-    covariances: np.ndarray
-    odds: np.ndarray
 
 
 class SessionViews(Checkpointed):
@@ -79,18 +69,9 @@ class SessionViews(Checkpointed):
     def follow_back(self, ground: Ground, odds: GainOdds, at: Supposed, least: float = -np.inf) -> Path:
         """The path to a supposed pose of the newest keyframe, from the newest to the oldest keyframe; ends
         early once its log-odds are below `least`."""
-        poses, covariances, gained = [at.pose], [at.covariance], [0.0]
-        total, inside = 0.0, True
-        for k in range(self.count - 2, max(self.count - 1 - SPAN, -1), -1):
-            at, gain = advance(ground, at, self.moved(k + 1).reversed(), self.gains(k))
-            log_odds, inside = _log_odds(odds, gain, inside, bool(self.shows.rows[k]))
-            poses.append(at.pose)
-            covariances.append(at.covariance)
-            gained.append(log_odds)
-            total += log_odds
-            if total < least:
-                break
-        return Path(np.array(poses), np.array(covariances), np.array(gained))
+        keyframes = range(self.count - 2, max(self.count - 1 - SPAN, -1), -1)
+        back = ((self.moved(k + 1).reversed(), self.gains(k)) for k in keyframes)
+        return follow(ground, odds, at, back, least)
 
 
 class Hypotheses(Checkpointed):
@@ -120,7 +101,7 @@ class Hypotheses(Checkpointed):
         have become one."""
         for k in range(self.count):
             at, gained = advance(ground, self.at(k), moved, gain)
-            log_odds, inside = _log_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
+            log_odds, inside = keyframe_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
             self.pose.rows[k], self.covariance.rows[k] = at
             self.log_odds.rows[k] += log_odds
             self.inside.rows[k] = inside
@@ -129,7 +110,7 @@ class Hypotheses(Checkpointed):
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
         """Adds a supposed pose [3] of the newest keyframe unless there is one like it."""
-        if _same(ground, self.pose.rows, pose).any():
+        if same_pose(ground, self.pose.rows, pose).any():
             return
         path = views.follow_back(ground, odds, Supposed(pose, np.diag(ground.variance)), HOPELESS)
         total = float(path.odds.sum())
@@ -153,7 +134,7 @@ class Hypotheses(Checkpointed):
         kept: list[int] = []
         for k in self.ranked().tolist():
             hopeless = self.log_odds.rows[k] < HOPELESS
-            if not hopeless and not _same(ground, self.pose.rows[kept], self.pose.rows[k]).any():
+            if not hopeless and not same_pose(ground, self.pose.rows[kept], self.pose.rows[k]).any():
                 kept.append(k)
         if len(kept) < self.count:
             self._keep(np.isin(np.arange(self.count), kept))
@@ -163,16 +144,7 @@ class Hypotheses(Checkpointed):
             array.replace(array.rows[rows].copy())
 
 
-def _log_odds(odds: GainOdds, gain: float, inside: bool, shows: bool) -> tuple[float, bool]:
-    """Log-odds of one keyframe, and whether it is on mapped ground."""
-    if not shows:
-        return 0.0, inside
-    if np.isnan(gain):
-        return (LEAVING if inside else 0.0), False
-    return odds.of(gain), True
-
-
-def _same(ground: Ground, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def same_pose(ground: Ground, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """[n] bool: poses [n, 3] that are the same place and heading as `pose` [3]."""
     apart = np.hypot(*(poses - pose)[:, :2].T)
     return (apart < ground.reach) & (np.abs(wrap(poses[:, 2] - pose[2])) < SAME_HEADING)

@@ -13,24 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.alignment.gain_odds import GainOdds
-from ratslam.alignment.ground import Ground, ground_of
-from ratslam.alignment.self_comparison import compare_with_itself
 from ratslam.atlas.localiser import Localiser, Place
 from ratslam.backends.config import LocaliseBackendConfig
+from ratslam.backends.map_views import MapViews
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.backend import Backend
 from ratslam.core.checkpoint import with_prefix
 from ratslam.core.finite_values import finite_values
-from ratslam.core.session import capacity_at
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.recall import filter
 from ratslam.recall import memory as recall_memory
-from ratslam.recall.config import sector_shifts
-from ratslam.recall.frozen import first_keyframes, frozen_memory
-from ratslam.recall.memory import MapFeedback, Memory
-from ratslam.recall.observation_model import ObservationLikelihood
+from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
@@ -84,13 +77,12 @@ class LocaliseBackend(Backend):
 
     def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float) -> None:
         self._recall, self._log_odds = recall, log_odds
-        # No keyframe of the map is too new to be recalled.
-        self._config = recall.recall.model_copy(update={"guard": 0})
+        self._views = views = MapViews(recall, map)
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
-        kept = map.kept_keyframes()
-        self._memory = self._freeze(map, poses, kept.taken.rows)
-        ground = self._ground(map, poses[kept.taken.rows])
-        self._place = Place(map, ground, self._learn(map, poses))
+        kept = map.kept_keyframes().taken.rows
+        self._memory = views.freeze(kept, poses[kept])
+        odds = views.odds(np.arange(len(poses)), poses)
+        self._place = Place(map, views.ground(poses[kept]), odds)
 
     def init(self, key: Array, capacity: int) -> LocaliseState:
         """The map, and no idea where in it. `key` and `capacity` are not used."""
@@ -107,16 +99,16 @@ class LocaliseBackend(Backend):
         memory = recall_memory.accumulate_motion(
             state.memory, jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
         )
-        due = recall_memory.is_motion_due(self._config, recall.cell, memory) | (state.seen == 0)
+        due = recall_memory.is_motion_due(self._views.config, recall.cell, memory) | (state.seen == 0)
         is_keyframe = seen & due
         features = recall.features(view, observation)
 
-        memory, result, gain, shows = lax.cond(
+        memory, (result, gain, shows) = lax.cond(
             is_keyframe,
-            lambda: self._look(memory, features, observation.label),
-            lambda: (memory, filter.empty_result(memory), self._no_gain(), jnp.bool_(False)),
+            lambda: self._views.look(memory, features, observation.label),
+            lambda: (memory, self._views.no_look(memory)),
         )
-        shifts = jnp.asarray(sector_shifts(self._config))
+        shifts = jnp.asarray(self._views.shifts)
         place = jnp.int32(-1)
         estimate = Estimate(
             pose=jnp.zeros(3, recall.dtype), spread=jnp.zeros(3, recall.dtype), place=place, previous=place,
@@ -138,66 +130,6 @@ class LocaliseBackend(Backend):
     def new_map(self) -> Localiser:
         """A session of which nothing is known."""
         return Localiser(self._place, self._log_odds)
-
-    def _look(
-        self, memory: Memory, view: Array, label: Array
-    ) -> tuple[Memory, filter.RecallResult, Array, Array]:
-        memory, likelihood = self._recall.likelihood(self._config, memory, view, label)
-        memory, result = filter.recognise(self._config, self._recall.cell, memory, likelihood, 0.0)
-        zero = jnp.zeros_like(memory.length)
-        memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
-        return memory, result, self._gain(likelihood), likelihood.certain & likelihood.informative
-
-    def _gain(self, likelihood: ObservationLikelihood) -> Array:
-        tiny = jnp.finfo(likelihood.novelty.dtype).tiny
-        gain = jnp.log(jnp.maximum(likelihood.likelihood, tiny)) - jnp.log(
-            jnp.maximum(likelihood.novelty, tiny)
-        )
-        return jnp.broadcast_to(gain.astype(jnp.float32), self._gain_shape())
-
-    def _no_gain(self) -> Array:
-        return jnp.zeros(self._gain_shape(), jnp.float32)
-
-    def _gain_shape(self) -> tuple[int, int]:
-        return len(sector_shifts(self._config)), self._memory.label.shape[0]
-
-    def _freeze(self, map: KeyframeMap, poses: np.ndarray, frames: np.ndarray) -> Memory:
-        """The memory of the keyframes `frames` [N] of a map, with poses [E, 3] of all."""
-        recall, graph, metric = self._recall, map.kept_keyframes(), map.appearance.metric()
-        feedback = MapFeedback(poses[frames], graph.bias, graph.turn_error, 0.0, *metric)
-        views, labels = map.appearance.stored(frames)
-        capacity = capacity_at(len(labels))
-        return frozen_memory(self._config, feedback, views, labels, capacity, recall.dtype, recall.groups)
-
-    def _ground(self, map: KeyframeMap, poses: np.ndarray) -> Ground:
-        graph = map.kept_keyframes()
-        return ground_of(poses, self._config, self._recall.cell, graph.sector_angle, graph.closure_variance())
-
-    def _learn(self, map: KeyframeMap, poses: np.ndarray) -> GainOdds:
-        """The log-odds of gains, by comparing the map with itself, merged keyframes included."""
-        whole = self._freeze(map, poses, np.arange(len(poses)))
-        ground = self._ground(map, poses)
-        look = jax.jit(self._look_at)
-
-        def gains(begin: int, count: int) -> np.ndarray:
-            earlier = first_keyframes(whole, begin - self._recall.recall.guard)
-            rows = look(earlier, jnp.arange(begin, begin + count, dtype=jnp.int32), whole.label)
-            return np.asarray(rows)
-
-        return compare_with_itself(ground, self._recall.recall.guard, gains)
-
-    def _look_at(self, memory: Memory, frames: Array, label: Array) -> Array:
-        """Gains [n, S, C] of stored views `frames` [n]; label: [C] of all keyframes."""
-
-        def look(memory: Memory, frame: Array) -> tuple[Memory, Array]:
-            view = memory.view[:, frame]
-            memory, likelihood = self._recall.likelihood(self._config, memory, view, label[frame])
-            tiny = jnp.finfo(likelihood.novelty.dtype).tiny
-            gain = jnp.log(jnp.maximum(likelihood.likelihood, tiny)) - jnp.log(likelihood.novelty)
-            shape = len(sector_shifts(self._config)), memory.label.shape[0]
-            return memory, jnp.broadcast_to(gain.astype(jnp.float32), shape)
-
-        return lax.scan(look, memory, frames)[1]
 
 
 def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype: Any) -> LocaliseBackend:

@@ -1,0 +1,82 @@
+"""Where a session is in a finished map: placements that recall proposes, and their evidence.
+
+A placement is followed through the whole session, to its start and to its end: it has to explain all views,
+not only those that proposed it. The rule is ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.alignment.comparison import Comparison
+from ratslam.alignment.following import Motion, Supposed
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.ground import Ground
+from ratslam.alignment.hypotheses import HOPELESS, same_pose
+from ratslam.alignment.paths import Path, follow
+from tactile.base.se2 import between, compose
+
+CONFIRMING = 3
+"""Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
+
+
+class Traverse(NamedTuple):
+    """A session of n keyframes over a ground.
+
+    Attributes:
+        views: compared with the ground. motions: [n] into each keyframe, the first one's not used.
+    """
+
+    views: Comparison
+    motions: list[Motion]
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Path | None:
+        """The path over all n keyframes on which keyframe k is at `pose` [3]; None if it is hopeless."""
+        at, count = Supposed(pose, np.diag(ground.variance)), len(self.motions)
+        views, motions = self.views, self.motions
+        back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))
+        before = follow(ground, odds, at, back, HOPELESS)
+        onwards = ((motions[i], views.gains(i)) for i in range(k + 1, count))
+        after = follow(ground, odds, at, onwards, HOPELESS)
+        if len(before.poses) + len(after.poses) <= count:
+            return None
+        parts = zip(before, after, strict=True)
+        return Path(*(np.concatenate([one[:0:-1], other]) for one, other in parts))
+
+
+def motions_between(poses: np.ndarray, variance: np.ndarray) -> list[Motion]:
+    """[n] the motion into each keyframe of a solved map.
+
+    Args:
+        poses: [n, 3]. variance: [n, 3] of the motion into each.
+    """
+    steps = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
+    return [Motion(*one) for one in zip(steps, variance, strict=True)]
+
+
+def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[Path]:
+    """The different placements of a session that recall proposes, those with the largest log-odds first."""
+    found: list[Path] = []
+    for k, pose in _proposals(ground, session):
+        if not any(same_pose(ground, path.poses[k : k + 1], pose)[0] for path in found):
+            path = session.follow(ground, odds, k, pose)
+            if path is not None:
+                found.append(path)
+    return sorted(found, key=lambda path: -path.odds.sum())
+
+
+def _proposals(ground: Ground, session: Traverse) -> Iterator[tuple[int, np.ndarray]]:
+    """Keyframes and their recalled poses [3] that agree with odometry for `CONFIRMING` of them."""
+    views, newest, agreeing = session.views, np.full(3, np.nan), 0
+    for k, moved in enumerate(session.motions):
+        newest = compose(newest, moved.motion)
+        if views.match[k] < 0 or views.posterior[k] <= 0.5:
+            continue
+        pose = ground.claims(views.shift[k : k + 1], views.match[k : k + 1])[0]
+        error = between(newest, pose)
+        agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
+        newest, agreeing = pose, agreeing + 1 if agrees else 1
+        if agreeing >= CONFIRMING:
+            yield k, pose

@@ -1,0 +1,160 @@
+"""Views compared with the keyframes of a finished map, which does not change."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam.alignment.comparison import Comparison
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.ground import Ground, ground_of
+from ratslam.alignment.self_comparison import compare_with_itself
+from ratslam.backends.recall import RecallBackend
+from ratslam.core.session import capacity_at
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.recall import filter
+from ratslam.recall.config import sector_shifts
+from ratslam.recall.frozen import first_keyframes, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory
+from ratslam.recall.observation_model import ObservationLikelihood
+from tactile.base.types import Array
+
+TOGETHER = 64
+"""Number of views compared in one compiled call."""
+
+
+class Look(NamedTuple):
+    """One view compared with a memory.
+
+    Attributes:
+        result: of recall. gain: [S, C] log-likelihood at each sector shift and keyframe less that at a new
+            place. shows: bool, whether the view can be compared.
+    """
+
+    result: filter.RecallResult
+    gain: Array
+    shows: Array
+
+
+class MapViews:
+    """The views of a finished map, compared with each other or with those of a session.
+
+    Args:
+        recall: the backend that made the map.
+    """
+
+    def __init__(self, recall: RecallBackend, map: KeyframeMap) -> None:
+        self.recall, self.map = recall, map
+        # No keyframe of a finished map is too new to be recalled.
+        self.config = recall.recall.model_copy(update={"guard": 0})
+        self.shifts = sector_shifts(self.config)
+        self._compare = jax.jit(self._look_at_many)
+        self._gains = jax.jit(self._gains_of_many)
+
+    def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
+        """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3]."""
+        recall, graph = self.recall, self.map.kept_keyframes()
+        feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *self.map.appearance.metric())
+        views, labels = self.map.appearance.stored(frames)
+        capacity = capacity_at(len(labels))
+        return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
+
+    def ground(self, poses: np.ndarray) -> Ground:
+        """Keyframes at `poses` [N, 3] as ground."""
+        graph = self.map.kept_keyframes()
+        return ground_of(poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance())
+
+    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
+        """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
+        with each other."""
+        whole, guard = self.freeze(frames, poses), self.recall.recall.guard
+
+        def gains(begin: int, count: int) -> np.ndarray:
+            earlier = first_keyframes(whole, begin - guard)
+            rows = jnp.arange(begin, begin + count, dtype=jnp.int32)
+            return np.asarray(self._gains(earlier, whole.view[:, rows], whole.label[rows]))
+
+        return compare_with_itself(self.ground(poses), guard, gains)
+
+    def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
+        """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.
+
+        Args:
+            motion: [n, 3] into each of them, without systematic errors, m, m, rad.
+        """
+        views, labels = self.map.appearance.stored(frames)
+        count, parts = int(memory.count), []
+        dtype, memory = memory.view.dtype, memory._replace(bias=jnp.zeros_like(memory.bias))
+        memory = memory._replace(turn_error=jnp.zeros_like(memory.turn_error))
+        for begin in range(0, len(frames), TOGETHER):
+            rows = slice(begin, begin + TOGETHER)
+            size = len(labels[rows])
+            filled = [
+                jnp.asarray(np.pad(values, [(0, TOGETHER - size)] + [(0, 0)] * (values.ndim - 1)))
+                for values in (
+                    views[rows].astype(dtype), labels[rows].astype(np.int32),
+                    motion[rows].astype(memory.x.dtype), np.ones(size, bool),
+                )
+            ]  # fmt: skip
+            memory, looks = self._compare(memory, *filled)
+            parts.append(jax.tree.map(lambda values, size=size: np.asarray(values)[:size], looks))
+        match = np.concatenate([part.result.match for part in parts])
+        shift = np.concatenate([part.result.shift for part in parts])
+        return Comparison(
+            gain=np.concatenate([part.gain[:, :, :count] for part in parts]),
+            shows=np.concatenate([part.shows for part in parts]),
+            match=match,
+            shift=np.argmax(self.shifts == shift[:, None], axis=1),
+            posterior=np.concatenate([part.result.posterior for part in parts]),
+        )
+
+    def look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Look]:
+        """Recalls one view in its stored form, and compares it with all keyframes."""
+        memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
+        memory, result = filter.recognise(self.config, self.recall.cell, memory, likelihood, 0.0)
+        zero = jnp.zeros_like(memory.length)
+        memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
+        shows = likelihood.certain & likelihood.informative
+        return memory, Look(result, self._gain(memory, likelihood), shows)
+
+    def no_look(self, memory: Memory) -> Look:
+        """The result of a step without a comparison."""
+        gain = jnp.zeros((len(self.shifts), memory.label.shape[0]), jnp.float32)
+        return Look(filter.empty_result(memory), gain, jnp.bool_(False))
+
+    def _gain(self, memory: Memory, likelihood: ObservationLikelihood) -> Array:
+        tiny = jnp.finfo(likelihood.novelty.dtype).tiny
+        here, new = (jnp.maximum(values, tiny) for values in (likelihood.likelihood, likelihood.novelty))
+        gain = (jnp.log(here) - jnp.log(new)).astype(jnp.float32)
+        return jnp.broadcast_to(gain, (len(self.shifts), memory.label.shape[0]))
+
+    def _look_at_many(
+        self, memory: Memory, views: Array, labels: Array, motions: Array, real: Array
+    ) -> tuple[Memory, Look]:
+        """Looks at views [n, D] in turn; those that are not `real` [n] are left out."""
+
+        def look(memory: Memory, one: tuple[Array, ...]) -> tuple[Memory, Look]:
+            view, label, motion, real = one
+            moved = memory._replace(
+                motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
+            )
+            return lax.cond(
+                real,
+                lambda: self.look(moved, view, label),
+                lambda: (memory, self.no_look(memory)),
+            )
+
+        return lax.scan(look, memory, (views, labels, motions, real))
+
+    def _gains_of_many(self, memory: Memory, views: Array, labels: Array) -> Array:
+        """[n, S, C] gains of stored views [D, n]."""
+
+        def look(memory: Memory, one: tuple[Array, Array]) -> tuple[Memory, Array]:
+            memory, likelihood = self.recall.likelihood(self.config, memory, *one)
+            return memory, self._gain(memory, likelihood)
+
+        return lax.scan(look, memory, (views.T, labels))[1]
