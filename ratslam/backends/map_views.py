@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ from ratslam.alignment.comparison import Comparison
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground, ground_of
 from ratslam.alignment.self_comparison import compare_with_itself
-from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import capacity_at
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.recall import filter
@@ -22,6 +21,9 @@ from ratslam.recall.frozen import first_keyframes, frozen_memory
 from ratslam.recall.memory import MapFeedback, Memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
+
+if TYPE_CHECKING:
+    from ratslam.backends.recall import RecallBackend
 
 TOGETHER = 64
 """Number of views compared in one compiled call."""

@@ -15,6 +15,7 @@ from ratslam.attractor.config import rings, units
 from ratslam.attractor.levels import activity_sums, window_levels
 from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.piece_ties import PieceTies
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
@@ -212,7 +213,7 @@ class RecallBackend(Backend):
             keyframes = keyframes.model_copy(update={"merge_stood": 0})
         return KeyframeMap(
             keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
-            closures=self.config.experience.closures, ablation=self.ablation,
+            closures=self.config.experience.closures, ablation=self.ablation, find_tie=PieceTies(self),
         )  # fmt: skip
 
     def _acceptance(self) -> Callable[[KeyframeGraph], Acceptance]:

@@ -11,7 +11,7 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, solved_map
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.optimizer import CalibrationPrior
-from ratslam.keyframes.piece_joining import join_pieces, joins_pieces
+from ratslam.keyframes.piece_joining import joins_pieces
 from ratslam.keyframes.verification import verify_sequence
 
 
@@ -54,7 +54,7 @@ class AcceptByEvidence(Acceptance):
         if log.verdict(sequence) != Verdict.OPEN:
             return False
         if joins_pieces(graph, log, candidate):
-            return join_pieces(graph, log, candidate)
+            return False
         test = verify_sequence(graph, log, sequence, candidate)
         if test is None:
             return False

@@ -22,7 +22,7 @@ from ratslam.keyframes.null_model import estimate_null, log_odds
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.odometry_scan import OdometryScan
 from ratslam.keyframes.optimizer import CalibrationPrior
-from ratslam.keyframes.piece_joining import join_pieces, joins_pieces, spans_beginnings, spans_pieces
+from ratslam.keyframes.piece_joining import spans_beginnings, spans_pieces
 from ratslam.keyframes.verification import continues_sequence, judge_by_map
 from ratslam.recall.mirror import MIRROR
 
@@ -88,7 +88,6 @@ class AcceptByOdds(Acceptance):
         length = len(log.members(sequence))
         if length < graph.config.min_length:
             return False
-        joined = joins_pieces(graph, log, candidate) and join_pieces(graph, log, candidate)
         if is_round(length) or length == graph.config.min_length:
             self._rate(log, sequence)
         ballot = self._vote(graph, log)
@@ -96,7 +95,7 @@ class AcceptByOdds(Acceptance):
         due = candidate.keyframe % REVIEW_EVERY == 0
         among = np.arange(log.sequences) if due else np.array([sequence])
         accepted = self._accept(graph, log, among, ballot)
-        return joined or accepted or self._break(graph, log, sequence)
+        return accepted or self._break(graph, log, sequence)
 
     def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
         return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))

@@ -9,7 +9,7 @@ rules are ours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,11 +28,12 @@ from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.keyframe_merger import KeyframeMerger
 from ratslam.keyframes.live_filter import LiveFilter
-from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candidate
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, recalled_candidate
 from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.keyframes.optimizer import MapFit
+from ratslam.keyframes.piece_joining import add_tie
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT
@@ -46,6 +47,10 @@ if TYPE_CHECKING:
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
+TIE_EVERY = 16
+"""Keyframes between two trials to tie the newest piece to another."""
+FindTie = Callable[["KeyframeMap"], Sequence[Candidate]]
+"""Finds closures that tie the newest piece of a map to another one."""
 
 
 class KeyframeMap(Checkpointed, Map):
@@ -76,6 +81,7 @@ class KeyframeMap(Checkpointed, Map):
         guard: int = 20,
         closures: bool = True,
         ablation: Ablation = FULL,
+        find_tie: FindTie = lambda map: [],
     ) -> None:
         self.config, self.cell, self.closes_loops = config, cell, closures
         self.appearance = appearance
@@ -85,7 +91,7 @@ class KeyframeMap(Checkpointed, Map):
         self.merger = KeyframeMerger(self.archive)
         self._live = LiveFilter()
         self.selection = SelectionWorker(config.select_every)
-        self._acceptance = acceptance(self._graph)
+        self._acceptance, self._find_tie = acceptance(self._graph), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._steps = StepRecord()
         self._travel = HALT
@@ -224,6 +230,7 @@ class KeyframeMap(Checkpointed, Map):
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()
+            self._tie()
             self._judge()
             change = self._arrive(matched)
         self._steps.append(self._graph.ever - 1, self._travel)
@@ -323,6 +330,13 @@ class KeyframeMap(Checkpointed, Map):
             self._forget_solution()
         self.selection.begin(self._graph, self.log)
         self.merger.select(self._graph, self.log)
+
+    def _tie(self) -> None:
+        """Every `TIE_EVERY` keyframes, tries to tie the newest piece of the map to another one."""
+        graph, log = self._graph, self.log
+        due = self.closes_loops and graph.ever % TIE_EVERY == 0 and bool(graph.pieces(log)[-1])
+        if due and add_tie(graph, log, self.archive, self._find_tie(self)):
+            self._optimise()
 
     def _judge(self) -> None:
         """Every `DOUBT_EVERY` keyframes, judges the present map."""

@@ -29,6 +29,7 @@ from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
+from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.artifacts import (
     WhiskerView,
     save_closure_views,
@@ -305,6 +306,8 @@ def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> 
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     saved.restore(session)
     same = bool(source.digest) and saved.recording == source.digest
+    if not same and isinstance(session.map, KeyframeMap):
+        session.begin_piece()  # the robot may have been carried since
     return session.steps if same else 0, saved.estimate
 
 

@@ -1,0 +1,105 @@
+"""Ties between pieces of a growing map: the newest piece is placed on another one like a session on a map.
+
+A sequence of closures between pieces strains no odometry, so a false one would be accepted as easily as a
+true one. A placement of the whole piece has to explain all its views."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ratslam.alignment.following import Motion
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.ground import Ground
+from ratslam.alignment.hypotheses import SPAN
+from ratslam.atlas.cross_closures import closures_along
+from ratslam.atlas.placement import Traverse, find_placements
+from ratslam.backends.map_views import MapViews
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import Candidate
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.recall.memory import Memory
+
+if TYPE_CHECKING:
+    from ratslam.backends.recall import RecallBackend
+
+FEWEST = 10
+"""Least number of keyframes of a piece that is placed on another or has another placed on it."""
+
+
+class PlacedOn(NamedTuple):
+    """A piece as ground: its keyframes [N], their frozen memory, and the log-odds of gains."""
+
+    frames: np.ndarray
+    ground: Ground
+    memory: Memory
+    odds: GainOdds
+
+
+class PieceTies:
+    """Finds where the newest piece of a map lies on an older one. What it keeps between two calls follows
+    from the map alone.
+
+    Args:
+        recall: the backend that makes the map.
+    """
+
+    def __init__(self, recall: RecallBackend) -> None:
+        self._recall = recall
+        self._views: MapViews | None = None
+        self._odds: dict[tuple[int, ...], GainOdds] = {}
+
+    def __call__(self, map: KeyframeMap) -> list[Candidate]:
+        """Closures that tie the newest piece to another one; none if its views do not decide."""
+        graph = map.kept_keyframes()
+        piece = graph.pieces(map.log)
+        own = np.flatnonzero(piece == piece[-1])[-SPAN:]
+        if len(own) < FEWEST:
+            return []
+        if self._views is None or self._views.map is not map:
+            self._views = MapViews(self._recall, map)
+        found: list[tuple[float, list[Candidate]]] = []
+        for other in np.unique(piece[piece != piece[-1]]).tolist():
+            frames = np.flatnonzero(piece == other)
+            if len(frames) >= FEWEST:
+                found += self._place(graph, own, self._ground(self._views, graph, frames), self._views)
+        found.sort(key=lambda one: -one[0])
+        needed = graph.config.tie_log_odds
+        if not found or found[0][0] < needed:
+            return []
+        rival = found[1][0] if len(found) > 1 else -np.inf
+        return found[0][1] if found[0][0] - rival >= needed / 2 else []
+
+    def _ground(self, views: MapViews, graph: KeyframeGraph, frames: np.ndarray) -> PlacedOn:
+        taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
+        key = (len(frames), int(taken[0]), int(taken[-1]))
+        if key not in self._odds:
+            self._odds[key] = views.odds(taken, poses)
+        return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), self._odds[key])
+
+    def _place(
+        self, graph: KeyframeGraph, own: np.ndarray, on: PlacedOn, views: MapViews
+    ) -> list[tuple[float, list[Candidate]]]:
+        """Log-odds beyond the logarithm of the number of places, and closures, of each placement."""
+        motions = _motions(graph, own)
+        compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
+        places = float(np.log(max(on.ground.places(), 1.0)))
+        session = Traverse(compared, motions)
+        return [
+            (
+                float(path.odds.sum()) - places,
+                [
+                    Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
+                    for k, frame, shift, gain in closures_along(on.ground, compared, path)
+                ],
+            )
+            for path in find_placements(on.ground, on.odds, session)
+        ]
+
+
+def _motions(graph: KeyframeGraph, own: np.ndarray) -> list[Motion]:
+    """Odometry into each keyframe of the piece without its systematic errors."""
+    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
+    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
+    return [Motion(*one) for one in zip(motion, variance, strict=True)]
