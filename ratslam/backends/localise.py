@@ -77,7 +77,7 @@ class LocaliseBackend(Backend):
 
     def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float) -> None:
         self._recall, self._log_odds = recall, log_odds
-        self._views = views = MapViews(recall, map)
+        self._views = views = MapViews(recall, map.kept_keyframes())
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
         kept = map.kept_keyframes().taken.rows
         self._memory = views.freeze(kept, poses[kept])

@@ -14,7 +14,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground, ground_of
 from ratslam.alignment.self_comparison import compare_with_itself
 from ratslam.core.session import capacity_at
-from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.recall import filter
 from ratslam.recall.config import sector_shifts
 from ratslam.recall.frozen import first_keyframes, frozen_memory
@@ -46,11 +46,11 @@ class MapViews:
     """The views of a finished map, compared with each other or with those of a session.
 
     Args:
-        recall: the backend that made the map.
+        recall: the backend that made the map. graph: its keyframes.
     """
 
-    def __init__(self, recall: RecallBackend, map: KeyframeMap) -> None:
-        self.recall, self.map = recall, map
+    def __init__(self, recall: RecallBackend, graph: KeyframeGraph) -> None:
+        self.recall, self.graph = recall, graph
         # No keyframe of a finished map is too new to be recalled.
         self.config = recall.recall.model_copy(update={"guard": 0})
         self.shifts = sector_shifts(self.config)
@@ -59,15 +59,15 @@ class MapViews:
 
     def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
         """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3]."""
-        recall, graph = self.recall, self.map.kept_keyframes()
-        feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *self.map.appearance.metric())
-        views, labels = self.map.appearance.stored(frames)
+        recall, graph = self.recall, self.graph
+        feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
+        views, labels = graph.appearance.stored(frames)
         capacity = capacity_at(len(labels))
         return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
 
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
-        graph = self.map.kept_keyframes()
+        graph = self.graph
         return ground_of(poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance())
 
     def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
@@ -88,7 +88,7 @@ class MapViews:
         Args:
             motion: [n, 3] into each of them, without systematic errors, m, m, rad.
         """
-        views, labels = self.map.appearance.stored(frames)
+        views, labels = self.graph.appearance.stored(frames)
         count, parts = int(memory.count), []
         dtype, memory = memory.view.dtype, memory._replace(bias=jnp.zeros_like(memory.bias))
         memory = memory._replace(turn_error=jnp.zeros_like(memory.turn_error))

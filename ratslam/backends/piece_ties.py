@@ -17,8 +17,7 @@ from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import Candidate
-from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog
 from ratslam.recall.memory import Memory
 
 if TYPE_CHECKING:
@@ -50,15 +49,14 @@ class PieceTies:
         self._views: MapViews | None = None
         self._odds: dict[tuple[int, ...], GainOdds] = {}
 
-    def __call__(self, map: KeyframeMap) -> list[Candidate]:
+    def __call__(self, graph: KeyframeGraph, log: ClosureLog) -> list[Candidate]:
         """Closures that tie the newest piece to another one; none if its views do not decide."""
-        graph = map.kept_keyframes()
-        piece = graph.pieces(map.log)
+        piece = graph.pieces(log)
         own = np.flatnonzero(piece == piece[-1])[-SPAN:]
         if len(own) < FEWEST:
             return []
-        if self._views is None or self._views.map is not map:
-            self._views = MapViews(self._recall, map)
+        if self._views is None or self._views.graph is not graph:
+            self._views = MapViews(self._recall, graph)
         found: list[tuple[float, list[Candidate]]] = []
         for other in np.unique(piece[piece != piece[-1]]).tolist():
             frames = np.flatnonzero(piece == other)

@@ -9,7 +9,7 @@ rules are ours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,12 +28,12 @@ from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.keyframe_merger import KeyframeMerger
 from ratslam.keyframes.live_filter import LiveFilter
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict, recalled_candidate
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candidate
 from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.keyframes.optimizer import MapFit
-from ratslam.keyframes.piece_joining import add_tie
+from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT
@@ -47,10 +47,6 @@ if TYPE_CHECKING:
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
-TIE_EVERY = 16
-"""Keyframes between two trials to tie the newest piece to another."""
-FindTie = Callable[["KeyframeMap"], Sequence[Candidate]]
-"""Finds closures that tie the newest piece of a map to another one."""
 
 
 class KeyframeMap(Checkpointed, Map):
@@ -59,7 +55,7 @@ class KeyframeMap(Checkpointed, Map):
     Args:
         cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: number of newest keyframes,
             never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
-            study. acceptance: makes the rule for closure sequences.
+            study. acceptance: makes the rule for closure sequences. find_tie: see `FindTie`.
 
     Attributes:
         log: of the keyframes that are not merged. archive, appearance: of all. merger, selection: at work.
@@ -81,7 +77,7 @@ class KeyframeMap(Checkpointed, Map):
         guard: int = 20,
         closures: bool = True,
         ablation: Ablation = FULL,
-        find_tie: FindTie = lambda map: [],
+        find_tie: FindTie = no_tie,
     ) -> None:
         self.config, self.cell, self.closes_loops = config, cell, closures
         self.appearance = appearance
@@ -102,8 +98,6 @@ class KeyframeMap(Checkpointed, Map):
         self._kept: MapSolution | None = None  # the same without merged keyframes
         self._worse: float | None = None  # of that solution
         self._doubt = 0.0  # of the map some keyframes ago
-
-    # Queries
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
@@ -205,8 +199,6 @@ class KeyframeMap(Checkpointed, Map):
         """[N] the step at which each keyframe was taken."""
         return self._steps.first_steps(self._graph.ever)
 
-    # Changes
-
     def begin_piece(self) -> None:
         """The next keyframe begins a piece; steps until then count to the keyframe before."""
         self._begins = self._graph.count > 0
@@ -230,7 +222,8 @@ class KeyframeMap(Checkpointed, Map):
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()
-            self._tie()
+            if self.closes_loops and tie_newest_piece(self._graph, self.log, self.archive, self._find_tie):
+                self._optimise()
             self._judge()
             change = self._arrive(matched)
         self._steps.append(self._graph.ever - 1, self._travel)
@@ -330,13 +323,6 @@ class KeyframeMap(Checkpointed, Map):
             self._forget_solution()
         self.selection.begin(self._graph, self.log)
         self.merger.select(self._graph, self.log)
-
-    def _tie(self) -> None:
-        """Every `TIE_EVERY` keyframes, tries to tie the newest piece of the map to another one."""
-        graph, log = self._graph, self.log
-        due = self.closes_loops and graph.ever % TIE_EVERY == 0 and bool(graph.pieces(log)[-1])
-        if due and add_tie(graph, log, self.archive, self._find_tie(self)):
-            self._optimise()
 
     def _judge(self) -> None:
         """Every `DOUBT_EVERY` keyframes, judges the present map."""

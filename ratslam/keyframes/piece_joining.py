@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog
 
 
 def spans_pieces(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
@@ -37,15 +34,3 @@ def joins_pieces(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) ->
         return False
     piece = graph.pieces(log)
     return bool(piece[candidate.keyframe] != piece[candidate.match])
-
-
-def add_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive, closures: Sequence[Candidate]) -> bool:
-    """Accepts closures between pieces as one sequence, and moves the pieces together; whether there were
-    any."""
-    for k, candidate in enumerate(closures):
-        sequence = log.add(candidate, k > 0)
-        archive.add(candidate, k > 0, graph)
-        log.judge(sequence, Verdict.ACCEPTED)
-    if closures:
-        graph.place_pieces(log)
-    return bool(closures)
