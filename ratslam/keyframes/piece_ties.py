@@ -20,7 +20,7 @@ def no_tie(graph: KeyframeGraph, log: ClosureLog) -> Sequence[Candidate]:
 
 
 def tie_newest_piece(graph: KeyframeGraph, log: ClosureLog, archive: Archive, find: FindTie) -> bool:
-    """If a trial is due, and there is a tie: accepts it as one closure sequence, and moves the pieces together.
+    """Accepts a tie, if a trial is due and finds one, as one closure sequence; moves the pieces together.
 
     Returns:
         whether there was one.
