@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import read_text_table
@@ -64,6 +65,7 @@ def read_run(path: Path) -> RunArrays:
         links=links,
         online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
         doubt=_doubt(path / "health.json"),
+        piece=read_pieces(path / NAME, steps),
     )
 
 

@@ -9,6 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.metrics.energy_metric import Energy, energy_all_pairs
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.trajectory import align, position_errors
+from tactile.base.se2 import compose
+
+GAP = 0.1
+"""Distance between two pieces in a picture, as a share of the width of the first one."""
 
 
 def energy_within_pieces(estimate: np.ndarray, truth: np.ndarray, piece: np.ndarray) -> Energy:
@@ -27,6 +33,33 @@ def energy_within_pieces(estimate: np.ndarray, truth: np.ndarray, piece: np.ndar
     trans2 = sum(part.trans2 * part.pairs for part in known) / pairs
     rot2 = sum(part.rot2 * part.pairs for part in known) / pairs
     return Energy(trans2, rot2, pairs)
+
+
+def ate_within_pieces(estimate: np.ndarray, truth: np.ndarray, piece: np.ndarray) -> float:
+    """Root mean square position error, m, after an alignment of each piece by itself; NaN without steps."""
+    if not len(piece):
+        return np.nan
+    errors = [position_errors(estimate[piece == one], truth[piece == one]) for one in np.unique(piece)]
+    return float(np.sqrt((np.concatenate(errors) ** 2).mean()))
+
+
+def arrange_pieces(run: RunArrays) -> RunArrays:
+    """The run with its pieces where a picture shows them: each aligned to the truth by itself or, where that
+    is unknown, beside the one before. Within a piece nothing changes; a run of one piece is left as it is."""
+    if not run.has_pieces:
+        return run
+    final, nodes, of_node = run.final.copy(), run.nodes.copy(), run.piece[run.created]
+    rows, right = truth_rows(run), 0.0
+    for one in np.unique(run.piece):
+        steps = run.piece == one
+        known = rows[steps[rows]]
+        moved = np.array([right, 0.0, 0.0]) - [*final[steps, :2].min(axis=0), 0.0]
+        if run.truth is not None and len(known):
+            moved = align(final[known], run.truth[known])
+        final[steps] = compose(moved, final[steps])
+        nodes[of_node == one] = compose(moved, nodes[of_node == one])
+        right = final[steps, 0].max() + GAP * np.ptp(final[:, 0][run.piece == run.piece[0]])
+    return run._replace(final=final, nodes=nodes)
 
 
 def unjoined_share(piece: np.ndarray) -> float:

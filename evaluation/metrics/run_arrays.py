@@ -23,6 +23,8 @@ class RunArrays(NamedTuple):
         links: [L, 2] linked experiences.
         doubt: probability, by the map itself, that its error is worse than odometry's; NaN if unknown.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
+        piece: [N] the piece of the map in which each step is, see `evaluation.metrics.map_pieces`; empty: all
+            steps are in one.
     """
 
     time: np.ndarray
@@ -36,6 +38,12 @@ class RunArrays(NamedTuple):
     links: np.ndarray
     online_error: np.ndarray = np.zeros(0)
     doubt: float = np.nan
+    piece: np.ndarray = np.zeros(0, int)
+
+    @property
+    def has_pieces(self) -> bool:
+        """Whether the map is in several pieces, whose poses cannot be compared."""
+        return len(np.unique(self.piece)) > 1
 
 
 def check_run(run: RunArrays) -> None:

@@ -17,6 +17,7 @@ from evaluation.metrics.energy_metric import (
 )
 from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
+from evaluation.metrics.map_pieces import ate_within_pieces, energy_within_pieces, unjoined_share
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import ate, online_errors, position_error, rpe, summarize_errors
@@ -49,6 +50,8 @@ _PAIRS = {
     "links": "linked experiences",
     "all": "all pairs of steps",
 }
+PIECES = "Pieces"
+"""Heading of the metrics of a map in several pieces."""
 _PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
     _metric("Extent", None, "steps", "steps"),
@@ -57,6 +60,10 @@ RUN_METRICS: tuple[Metric, ...] = (
     _metric("Extent", None, "experiences", "experiences"),
     _metric("Extent", None, "links", "links"),
     _metric("Health", None, "map_doubt", "map worse than odometry, probability"),
+    _metric(PIECES, None, "pieces", "pieces that nothing joins"),
+    _metric(PIECES, "low", "unjoined_share", "share of steps outside the largest piece"),
+    _metric(PIECES, "low", "energy_within_pieces", "Energy Metric within pieces", "m2+rad2"),
+    _metric(PIECES, "low", "ate_within_pieces", "ATE within pieces", "m"),
     _metric("Trajectory", "low", "ate_final", "ATE, final", "m"),
     _metric("Trajectory", "low", "ate_online", "ATE, online", "m"),
     _metric("Trajectory", "low", "anytime_median", "online error, median", "m"),
@@ -98,6 +105,8 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         "links": Finding(len(run.links)),
         "map_doubt": _doubt(run.doubt),
     }
+    if run.has_pieces:
+        findings |= piece_findings(run, rows)
     if relations is not None:
         findings |= _relations(run, relations)
     if truth is None or len(rows) == 0:
@@ -105,7 +114,8 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
     if len(rows) < len(run.time):
         findings["steps"] = Finding(len(run.time), note=f"{len(rows)} of them with a true pose")
     findings["path"] = Finding(path_length(truth[rows]), path_length(run.odometry[rows]))
-    findings |= _trajectories(run, truth, rows) | _energies(run, truth, rows, gap)
+    compared = _trajectories(run, truth, rows) | _energies(run, truth, rows, gap)
+    findings |= _undefined_across_pieces(compared) if run.has_pieces else compared
     base = None if exm.base is None else int(np.searchsorted(rows, exm.base))
     inside = exm.model_copy(update={"base": base})
     findings |= experience_findings(run.experience[rows], truth[rows], inside)
@@ -127,6 +137,35 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
         "anytime_jump": Finding(now.jump, raw_now.jump, note),
         "rpe_translation": Finding(step.translation, raw_rpe.translation),
         "rpe_rotation_deg": Finding(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
+    }
+
+
+def piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
+    """Findings on a map in several pieces; rows: [K] steps with a true pose."""
+    sizes = np.unique(run.piece, return_counts=True)[1]
+    found = {
+        "pieces": Finding(len(sizes), note=f"{', '.join(map(str, sorted(sizes.tolist())[::-1]))} steps"),
+        "unjoined_share": Finding(unjoined_share(run.piece)),
+    }
+    if run.truth is None or not len(rows):
+        return found
+    final, odometry, true, piece = (
+        values[rows] for values in (run.final, run.odometry, run.truth, run.piece)
+    )
+    ours, raw = (energy_within_pieces(poses, true, piece) for poses in (final, odometry))
+    error, raw_error = (ate_within_pieces(poses, true, piece) for poses in (final, odometry))
+    return found | {
+        "energy_within_pieces": Finding(ours.total, raw.total, f"{ours.pairs} pairs"),
+        "ate_within_pieces": Finding(error, raw_error, "each piece aligned by itself"),
+    }
+
+
+def _undefined_across_pieces(findings: dict[str, Finding]) -> dict[str, Finding]:
+    """The findings without those that compare poses of different pieces; links are within pieces."""
+    reason = "across pieces that nothing joins"
+    return {
+        name: found if name.startswith("energy_links") else Finding(np.nan, found.odometry, reason)
+        for name, found in findings.items()
     }
 
 

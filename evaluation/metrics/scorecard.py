@@ -13,7 +13,14 @@ from evaluation.metrics.experience_log import ExperienceLog
 from evaluation.metrics.experience_metric import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
-from evaluation.metrics.run_metrics import DOUBTED, RUN_METRICS, experience_findings, path_length, run_data
+from evaluation.metrics.run_metrics import (
+    DOUBTED,
+    PIECES,
+    RUN_METRICS,
+    experience_findings,
+    path_length,
+    run_data,
+)
 from tactile.base.config import Settings
 
 REGISTERED = "Registered metrics"
@@ -53,7 +60,8 @@ def score_run(
     data = run_data(run, exm, relations, gap)
     quantities = {}
     for metric in (*RUN_METRICS, *metrics):
-        if relations is not None or not metric.name.startswith("relations_"):
+        unused = metric.section == PIECES and not run.has_pieces
+        if not unused and (relations is not None or not metric.name.startswith("relations_")):
             quantities[metric.name] = metric.quantity(metric.compute(data) or MISSING_TRUTH)
     return Scorecard(name=name, exm=exm, quantities=quantities)
 

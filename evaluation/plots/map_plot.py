@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, YELLOW
+from evaluation.plots.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    YELLOW,
+)
 from tactile.base.se2 import between, compose
 
 _BOTTOM = 1.0  # inches below the axes
@@ -18,6 +29,10 @@ _FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
 _ROOM, _MARGIN = 0.2, 0.08  # shares of the map's size: for drifting odometry, and on all sides
 _JUMP = 5.0  # a step longer than this multiple of the usual one: the robot was moved by hand
 _PALE, _DARK = 0.86, 0.62  # greys of a wall of height 0 and of the tallest wall
+NAMED = 5
+"""Number of pieces of a map with a colour of their own."""
+PIECES = (BLUE, ORANGE, GREEN, PURPLE, SKY, INK)
+"""Colours of the largest pieces, and of all others."""
 NO_WALLS = np.zeros((0, 5))
 NO_CLOSURES = np.zeros((0, 2), int)
 
@@ -45,6 +60,7 @@ def draw_map(
         walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
         closures: [n, 2] steps joined by loop closures; drawn with walls.
     """
+    run = arrange_pieces(run)
     layers = align_layers(run)
     shown = walls if layers.truth is not None else NO_WALLS
     box = _frame(layers, shown)
@@ -66,10 +82,16 @@ def draw_map(
 
 def map_headline(card: Scorecard) -> str:
     """The main quantities in one line."""
+    within = card.quantities.get("ate_within_pieces")
     ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
     count = card.quantities["experiences"].value
     parts = [f"{count} experiences"] if count else []
-    if ate.value is None:
+    if "pieces" in card.quantities:
+        count, share = (card.quantities[name].value for name in ("pieces", "unjoined_share"))
+        parts.append(f"{count} pieces, {share:.0%} of the steps unjoined")
+    if within is not None and within.value is not None:
+        parts.append(f"ATE within pieces {within.value:.3g} m")
+    elif ate.value is None:
         parts.append("no ground truth")
     else:
         raw = f"{ate.odometry:.3g} m raw odometry"
@@ -144,7 +166,7 @@ def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
     if truth is not None:
         axes.plot(*truth.T, color=INK, lw=0.8, zorder=5, label="truth")
     axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="raw odometry")
-    axes.plot(*final.T, color=BLUE, lw=0.8, alpha=0.4, zorder=2, label="mapped path")
+    _paint_path(axes, run.piece, final, lw=0.8, alpha=0.4, zorder=2)
     if len(nodes):
         dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
         axes.scatter(*nodes.T, zorder=4, label="experience", **dot)
@@ -165,7 +187,7 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
     assert truth is not None
     line = split_at_jumps(truth, truth)
     axes.plot(*line.T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
-    axes.plot(*split_at_jumps(final, truth).T, color=BLUE, lw=0.7, zorder=3, label="mapped path")
+    _paint_path(axes, run.piece, final, truth, lw=0.7, zorder=3)
     axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
     joined, place = (pairs, final) if len(pairs) else (run.links[_older(run.links)], nodes)
     steps = joined if len(pairs) else run.created[joined]
@@ -178,6 +200,26 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
         if some.any():
             lines = place[joined[some]]
             axes.add_collection(LineCollection(lines, colors=color, lw=0.7, zorder=over, label=name))
+
+
+def _paint_path(
+    axes: style.Axes, piece: np.ndarray, path: np.ndarray, truth: np.ndarray | None = None, **line: Any
+) -> None:
+    """Draws the mapped path [N, 2], each piece of the map in a colour of its own, the largest in blue."""
+
+    def drawn(rows: np.ndarray) -> np.ndarray:
+        return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
+
+    numbers, sizes = np.unique(piece, return_counts=True)
+    if len(numbers) < 2:
+        axes.plot(*drawn(np.arange(len(path))).T, color=BLUE, label="mapped path", **line)
+        return
+    for rank, number in enumerate(numbers[np.argsort(-sizes, kind="stable")].tolist()):
+        rows = np.flatnonzero(piece == number)
+        name = f"piece {number + 1}, {len(rows)} steps"
+        if rank >= NAMED:
+            name = "_" if rank > NAMED else f"{len(numbers) - NAMED} smaller pieces"
+        axes.plot(*drawn(rows).T, color=PIECES[min(rank, NAMED)], label=name, **line)
 
 
 def _older(links: np.ndarray) -> np.ndarray:

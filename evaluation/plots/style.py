@@ -23,6 +23,8 @@ YELLOW = "#f0e442"
 GREEN = "#009e73"
 VERMILLION = "#d55e00"
 PURPLE = "#cc79a7"
+ORANGE = "#e69f00"
+SKY = "#56b4e9"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Width and margins of every plot, inches."""

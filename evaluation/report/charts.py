@@ -55,13 +55,27 @@ def map_chart(report: RunReport) -> Any:
     traces.append(_line(layers.odometry, "odometry", "odometry", width=1, opacity=0.6))
     if report.map_path is not None:
         traces.append(_line(report.map_path, "map, not believed", "doubted", dash="dot", width=1.2))
-    final = layers.final if layers.truth is None else split_at_jumps(layers.final, layers.truth)
-    traces.append(_line(final, "trajectory", "final", width=1.6))
+    traces += _path_traces(report)
     figure = _map_figure([*traces, *_place_traces(report), *_closure_traces(report)], _frame(report))
     figure.update_layout(shapes=[*_link_shapes(report), *_closure_shapes(report)])
     if report.grid is not None:  # no empty space beside the grid
         figure.update_xaxes(constrain="domain").update_yaxes(constrain="domain")
     return figure
+
+
+def _path_traces(report: RunReport) -> list[Any]:
+    """The final trajectory, each piece of the map by itself, the largest as the trajectory of one piece."""
+    final, truth, piece = report.layers.final, report.layers.truth, report.run.piece
+    if not report.run.has_pieces:
+        path = final if truth is None else split_at_jumps(final, truth)
+        return [_line(path, "trajectory", "final", width=1.6)]
+    traces, (numbers, sizes) = [], np.unique(piece, return_counts=True)
+    for rank, number in enumerate(numbers[np.argsort(-sizes, kind="stable")].tolist()):
+        rows = np.flatnonzero(piece == number)
+        path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])
+        name = f"piece {number + 1}, {len(rows):,} steps"
+        traces.append(_line(path, name, f"run{rank % RUN_ROLES}" if rank else "final", width=1.6))
+    return traces
 
 
 def overlay_chart(reports: Sequence[RunReport]) -> Any:
@@ -90,7 +104,7 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
             continue
         odometry = np.column_stack([time, position_errors(run.odometry[rows], run.truth[rows])])
         traces.append(_line(odometry, "odometry", "odometry", width=1))
-        if len(report.online_error.time):
+        if len(report.online_error.time) and not run.has_pieces:  # it compares poses of different pieces
             online = np.column_stack([report.online_error.time - start, report.online_error.value])
             traces.append(_line(online, "map, as known at the time", "online", dash="dot", width=1.6))
         traces.append(_line(final, "final trajectory", "final", width=2))

@@ -10,6 +10,8 @@ import numpy as np
 from evaluation.artifacts.manifest import RUNNING
 from evaluation.report.run_report import RunReport
 
+LISTED = 6
+"""Number of pieces of a map whose steps are listed."""
 _ENDS = {"complete": "finished", RUNNING: "not finished"}
 
 
@@ -30,7 +32,7 @@ class Comparison(NamedTuple):
 
 def key_figures(report: RunReport) -> list[KeyFigure]:
     """The figures of one run, the most important first."""
-    figures = [_error(report), *_grid(report)]
+    figures = [_error(report), *_pieces(report), *_grid(report)]
     if len(report.run.nodes):
         figures.append(
             KeyFigure("Experiences", f"{len(report.run.nodes):,}", f"{len(report.run.links):,} links")
@@ -73,11 +75,23 @@ def _row(report: RunReport) -> list[str]:
 
 
 def _error(report: RunReport) -> KeyFigure:
-    error = report.card.quantities["ate_final"]
+    quantities = report.card.quantities
+    error = quantities.get("ate_within_pieces", quantities["ate_final"])
     if error.value is None:
         return KeyFigure("Position error", "unknown", "no truth to compare with")
     note = "" if error.odometry is None else f"odometry {error.odometry:.3g} {error.unit}"
     return KeyFigure("Position error", f"{error.value:.3g} {error.unit}", note)
+
+
+def _pieces(report: RunReport) -> list[KeyFigure]:
+    """Of a map in several pieces: how many, the share of steps outside the largest, and the steps of each."""
+    if not report.run.has_pieces:
+        return []
+    sizes = np.sort(np.unique(report.run.piece, return_counts=True)[1])[::-1]
+    share = 1 - sizes[0] / sizes.sum()
+    listed = ", ".join(f"{size:,}" for size in sizes[:LISTED].tolist())
+    more = " ..." if len(sizes) > LISTED else ""
+    return [KeyFigure("Pieces", f"{len(sizes)}", f"{share:.0%} of the steps unjoined; {listed}{more} steps")]
 
 
 def _grid(report: RunReport) -> list[KeyFigure]:

@@ -12,6 +12,7 @@ FILES = {
     "gridscore.json": "the scores of the occupancy grid",
     "trajectory.tum": "final trajectory: that of the map, or odometry if the map is doubted",
     "map.tum": "final trajectory of the map, doubted or not",
+    "pieces.csv": "piece of the map in which each step is; poses of different pieces cannot be compared",
     "online.tum": "the pose at each step as it was known then",
     "odometry.tum": "dead reckoning of the raw odometry",
     "truth.tum": "true poses, where known",

@@ -21,6 +21,7 @@ from evaluation.artifacts.run_directory import (
     read_walls,
 )
 from evaluation.metrics.grid_score import GridScore
+from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -55,6 +56,7 @@ class RunReport(NamedTuple):
         doubt: [N] probability at each step that the map is worse than odometry, NaN: not judged.
         spread: [N] standard deviation of the position at each step, m.
         online_error: error of the current pose. cost: computing time a step, s, against the number of steps.
+        run: its arrays, pieces of the map as `arrange_pieces` draws them.
         layers: paths of the map in the frame of `walls` and `truth_lines`.
         map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
         truth_lines: [S, 4] true walls of a grid's arena, m. grid: in the frame of the layers.
@@ -90,7 +92,8 @@ def read_run_report(directory: Path) -> RunReport:
         InputError: the folder holds no run, a run without steps, or a malformed file.
     """
     check_run_directory(directory)
-    run, steps = read_run(directory), directory / "steps.csv"
+    measured, steps = read_run(directory), directory / "steps.csv"
+    run = arrange_pieces(measured)
     count = len(run.time)
     doubt = read_column(steps, "doubt", np.nan)[:count]
     verdict = judge_map(run.doubt)
@@ -108,7 +111,7 @@ def read_run_report(directory: Path) -> RunReport:
         manifest=read_manifest(directory),
         **_method(directory),
         run=run,
-        card=read_scorecard(directory) if scored else score_run(run, name),
+        card=read_scorecard(directory) if scored else score_run(measured, name),
         verdict=verdict,
         doubt=doubt,
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
@@ -175,7 +178,7 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     path = read_tum(file)[1][: len(run.time)]
     if len(path) < len(run.time) or np.array_equal(path, run.final):
         return None
-    return align_layers(run._replace(final=path)).final
+    return align_layers(arrange_pieces(run._replace(final=path))).final
 
 
 def _online_error(directory: Path) -> Series:

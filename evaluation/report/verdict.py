@@ -50,10 +50,12 @@ def judge_map(doubt: float) -> Verdict:
 
 def describe_score(card: Scorecard) -> str:
     """The position error in a sentence, or that the truth is unknown."""
-    error = card.quantities["ate_final"]
+    within = card.quantities.get("ate_within_pieces")
+    error = card.quantities["ate_final"] if within is None else within
     if error.value is None:
         return "The truth is unknown, so there is no score."
-    text = f"Against the truth, the root mean square position error is {error.value:.3g} {error.unit}"
+    of = "" if within is None else " within the pieces of the map"
+    text = f"Against the truth, the root mean square position error{of} is {error.value:.3g} {error.unit}"
     if error.odometry is None:
         return f"{text}."
     factor = _factor(error.value, error.odometry)

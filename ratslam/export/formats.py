@@ -11,13 +11,14 @@ from evaluation.artifacts.grid_npz import read_grid
 from evaluation.artifacts.nav2 import write_nav2
 from ratslam.export.ros_bag import write_bag, write_mcap
 from ratslam.export.ros_messages import RosMessages
-from ratslam.export.run_files import read_exported_run
+from ratslam.export.run_files import ExportedRun, read_exported_run
 from ratslam.pose_graph.io import read_json
 from robot.recordings.mcap_writer import existing_error
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 Warn = Callable[[str], None]
+PARTED = "the map is in several pieces, whose poses cannot be compared"
 FORMATS = ".mcap, .tum, .g2o, .json, .graphml or .yaml, or a folder without a suffix for a ROS 2 bag"
 
 
@@ -44,15 +45,22 @@ def export_run(directory: Path, output: Path, warn: Warn = lambda sentence: None
     write(directory, output, warn)
 
 
+def _read_run(directory: Path, warn: Warn) -> ExportedRun:
+    exported = read_exported_run(directory, warn)
+    if exported.run.has_pieces:
+        warn(f"{PARTED}; the file holds them in one frame, far apart")
+    return exported
+
+
 def _write_mcap(directory: Path, output: Path, warn: Warn) -> None:
     ros = RosMessages()
-    exported = read_exported_run(directory, warn)
+    exported = _read_run(directory, warn)
     write_atomically(output, lambda path: write_mcap(path, exported, ros))
 
 
 def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
     ros = RosMessages()
-    exported = read_exported_run(directory, warn)
+    exported = _read_run(directory, warn)
     parent = output.absolute().parent
     with tempfile.TemporaryDirectory(prefix=".", dir=parent) as folder:
         bag = Path(folder) / output.name
@@ -62,8 +70,15 @@ def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
 
 
 def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
-    """The final trajectory, of an interrupted run the online one."""
-    final = directory / "trajectory.tum"
+    """The final trajectory, of an interrupted run the online one; of a map in several pieces also which of
+    them each pose is in, beside it."""
+    final, pieces = directory / "trajectory.tum", directory / "pieces.csv"
+    if pieces.exists():
+        beside = output.with_suffix(".pieces.csv")
+        if beside.exists():
+            raise existing_error(beside)
+        warn(f"{PARTED}; {beside} says which of them each pose is in")
+        write_atomically(beside, lambda path: shutil.copyfile(pieces, path))
     _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
 
 

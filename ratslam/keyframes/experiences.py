@@ -108,11 +108,12 @@ class Experiences(Checkpointed):
         self._link_of = {(a, b): k for k, (a, b, _) in enumerate(self._link.rows.tolist())}
         self._current = int(again[self._current]) if self._current >= 0 else -1
 
-    def graph(self, poses: np.ndarray, taken: np.ndarray) -> networkx.DiGraph:
-        """Nodes with x, y (m), heading (rad), keyframe; links with dx, dy, dtheta and traversals.
+    def graph(self, poses: np.ndarray, taken: np.ndarray, piece: np.ndarray) -> networkx.DiGraph:
+        """Nodes with x, y (m), heading (rad), keyframe, piece; links within pieces with dx, dy, dtheta and
+        traversals.
 
         Args:
-            poses: [N, 3] of the keyframes. taken: [N] their numbers among all ever taken.
+            poses: [N, 3] of the keyframes. taken: [N] their numbers among all ever taken. piece: [N] of each.
         """
         import networkx  # slow to import
 
@@ -120,8 +121,11 @@ class Experiences(Checkpointed):
         places = self._poses(poses)
         for place, frame in enumerate(self._frame.rows.tolist()):
             x, y, heading = map(float, places[place])
-            graph.add_node(place, x=x, y=y, heading=heading, keyframe=int(taken[frame]))
+            keyframe = int(taken[frame])
+            graph.add_node(place, x=x, y=y, heading=heading, keyframe=keyframe, piece=int(piece[frame]))
         for a, b, traversals in self._link.rows.tolist():
+            if graph.nodes[a]["piece"] != graph.nodes[b]["piece"]:
+                continue
             dx, dy, dtheta = map(float, between(places[a], places[b]))
             graph.add_edge(a, b, dx=dx, dy=dy, dtheta=dtheta, traversals=traversals)
         return graph

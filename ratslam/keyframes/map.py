@@ -174,9 +174,9 @@ class KeyframeMap(Checkpointed, Map):
         return self._kept
 
     def graph(self) -> networkx.DiGraph:
-        """Experiences with x, y (m), heading (rad) and their first keyframe; links with their evidence."""
+        """See `Experiences.graph`."""
         taken = self._graph.taken.rows
-        return self._experiences.graph(self._best().poses[taken], taken)
+        return self._experiences.graph(self._best().poses[taken], taken, self.keyframe_pieces()[taken])
 
     def edges(self) -> Edges:
         """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with their

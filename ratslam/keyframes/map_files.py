@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ratslam.keyframes.calibration import write_calibration
 from ratslam.keyframes.loop_closures import write_closures
 from ratslam.pose_graph.io import write_g2o, write_json
@@ -20,9 +22,16 @@ def map_files(map: KeyframeMap, *, calibrated: bool) -> dict[str, Callable[[Path
     calibration = {"calibration.yaml": lambda path: _write_calibration(path, map)} if calibrated else {}
     return calibration | {
         "map.json": lambda path: write_json(path, map.graph()),
-        "map.g2o": lambda path: write_g2o(path, map.kept_solution().fit.poses, map.edges()),
+        "map.g2o": lambda path: _write_g2o(path, map),
         "closures.csv": lambda path: write_closures(path, map.candidates(), map.keyframe_steps()),
     }
+
+
+def _write_g2o(path: Path, map: KeyframeMap) -> None:
+    """Of several pieces, the first keyframe of each is fixed: nothing else determines where it lies."""
+    taken, fit = map.kept_keyframes().taken.rows, map.kept_solution().fit
+    pieces, first = np.unique(map.keyframe_pieces()[taken], return_index=True)
+    write_g2o(path, fit.poses, map.edges(), fixed=first.tolist() if len(pieces) > 1 else ())
 
 
 def _write_calibration(path: Path, map: KeyframeMap) -> None:

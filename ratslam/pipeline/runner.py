@@ -17,6 +17,7 @@ import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.closure_views import eight_bit
+from evaluation.artifacts.pieces_table import write_pieces
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
@@ -289,6 +290,11 @@ def _write_final_map(session: Session, directory: RunDirectory) -> None:
     own = session.map.map_trajectory()[session.steps - len(time) :]
     directory.file("trajectory.tum", lambda path: write_tum(path, time, final))
     directory.file("map.tum", lambda path: write_tum(path, time, own))
+    piece = session.map.pieces()
+    if piece.any():
+        directory.file(
+            "pieces.csv", lambda path: write_pieces(path, time, piece[session.steps - len(time) :])
+        )
     doubt = session.map.final_doubt()
     if np.isfinite(doubt):
         directory.text("health.json", json.dumps({"worse_than_odometry": doubt}) + "\n")

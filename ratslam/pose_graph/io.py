@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +18,11 @@ if TYPE_CHECKING:
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
 
-def write_g2o(path: Path, poses: np.ndarray, edges: Edges) -> None:
-    """Writes VERTEX_SE2 and EDGE_SE2 lines; floats are exact (repr), so equal graphs give equal bytes."""
+def write_g2o(path: Path, poses: np.ndarray, edges: Edges, fixed: Sequence[int] = ()) -> None:
+    """Writes VERTEX_SE2 and EDGE_SE2 lines, and FIX lines for the vertices `fixed`; floats are exact (repr),
+    so equal graphs give equal bytes."""
     lines = [f"VERTEX_SE2 {k} {_floats(pose)}" for k, pose in enumerate(poses)]
+    lines += [f"FIX {k}" for k in fixed]
     information = information_matrices(edges.information)
     for i, j, motion, weight in zip(edges.i, edges.j, edges.motion, information, strict=True):
         lines.append(f"EDGE_SE2 {int(i)} {int(j)} {_floats(motion)} {_floats(weight[k] for k in UPPER)}")

@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 
 from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.nav2 import read_nav2, write_nav2
+from evaluation.artifacts.pieces_table import write_pieces
 from evaluation.artifacts.run_directory import read_run
 from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.occupancy_grid import OccupancyGrid
@@ -324,3 +325,13 @@ def test_a_missing_library_is_named(square, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(InputError, match=r"pip install 'ratslam\[ros\]'"):
         export_run(square, tmp_path / "a.mcap")
+
+
+def test_a_trajectory_in_pieces_comes_with_the_piece_of_each_pose(copy, tmp_path):
+    time = read_run(copy).time
+    write_pieces(copy / "pieces.csv", time, (np.arange(len(time)) > 5).astype(int))
+    said = []
+    export_run(copy, tmp_path / "square.tum", said.append)
+    assert (tmp_path / "square.pieces.csv").read_bytes() == (copy / "pieces.csv").read_bytes()
+    assert len(said) == 1
+    assert "cannot be compared" in said[0]

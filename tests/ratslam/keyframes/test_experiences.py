@@ -122,7 +122,7 @@ def test_the_graph_follows_from_the_changes(steps, cut):
             ways[before, place] = ways.get((before, place), 0) + 1
         previous = place
     moved = poses + [1.0, 2.0, 0.0]  # the map is deformed after the frames were grouped
-    graph = world.graph(moved, np.arange(len(moved)))
+    graph = world.graph(moved, np.arange(len(moved)), np.zeros(len(moved), int))
     assert list(graph.nodes) == list(range(len(made)))
     assert [graph.nodes[place]["keyframe"] for place in graph] == made
     assert {(a, b): data["traversals"] for a, b, data in graph.edges(data=True)} == ways
@@ -144,11 +144,11 @@ def test_the_graph_follows_from_the_changes(steps, cut):
 def test_an_experience_keeps_its_pose_when_its_frame_is_merged_with_one_that_faces_back():
     world, _, poses = walk(at(0.0), at(5.0), at(5.02, 0.01, np.pi), at(0.0, 0.0, np.pi))
     poses = poses - [0.0, 0.0, 0.1]
-    before = world.graph(poses, np.arange(4))
+    before = world.graph(poses, np.arange(4), np.zeros(4, int))
     kept, onto = np.array([0, 1]), np.array([0, 1, 1, 0])
     offset = between(poses[kept[onto]], poses)
     world.merge(kept, onto, offset)
-    after = world.graph(poses[kept], kept)
+    after = world.graph(poses[kept], kept, np.zeros(len(kept), int))
     assert len(after) == len(before) == 4
     for place in before:
         for key in ("x", "y", "heading"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from evaluation.metrics.map_pieces import energy_within_pieces
 from ratslam.core.session import Session, Step
 from ratslam.keyframes.piece_placement import APART
+from ratslam.pose_graph.io import read_g2o, read_json
 from tactile.base.types import Observation
 from tests.ratslam.pipeline.touch_walks import (
     WIDE,
@@ -124,3 +126,20 @@ def test_a_piece_of_a_map_that_merges_keyframes_is_joined_and_merged() -> None:
     assert len(arrays["map/graph/taken"]) < len(arrays["map/archive/graph/taken"])
     assert not session.map.pieces().any()
     assert metric(session.map.trajectory(), walk.truth) < 0.1
+
+
+def test_files_of_the_map_know_its_pieces(tmp_path: Path) -> None:
+    walk, session = carried(), empty_session()
+    replay(session, walk.readings[: CARRIED + 12])
+    for name, write in session.map.files().items():
+        write(tmp_path / name)
+    nodes = read_json(tmp_path / "map.json").nodes
+    pieces = [nodes[k]["piece"] for k in range(len(nodes))]
+    assert sorted(set(pieces)) == [0, 1]
+    assert pieces == sorted(pieces)
+    first = int(session.arrays()["map/graph/begins"].argmax())
+    text = (tmp_path / "map.g2o").read_text()
+    assert [line for line in text.splitlines() if line.startswith("FIX")] == ["FIX 0", f"FIX {first}"]
+    _, edges = read_g2o(tmp_path / "map.g2o")
+    assert len(edges.i)
+    assert not ((edges.i < first) != (edges.j < first)).any()

@@ -1,0 +1,90 @@
+"""Runs of a map in pieces: scores and pictures compare poses within pieces only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evaluation.artifacts.pieces_table import read_pieces, write_pieces
+from evaluation.metrics.map_pieces import arrange_pieces, ate_within_pieces
+from evaluation.metrics.run_metrics import PIECES
+from evaluation.metrics.scorecard import score_run, scorecard_lines
+from evaluation.metrics.trajectory import ate
+from evaluation.plots.map_plot import draw_map, map_headline
+from evaluation.report.verdict import describe_score
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose
+
+AWAY = np.array([170.0, 30.0, 2.0])
+
+
+@pytest.fixture
+def parted(circle):
+    """The circle with its last third in another piece, which lies elsewhere."""
+    count = len(circle.time)
+    piece = (np.arange(count) >= 2 * count // 3).astype(int)
+    of_node = piece[circle.created] == 1
+    final, nodes = circle.final.copy(), circle.nodes.copy()
+    final[piece == 1] = compose(AWAY, final[piece == 1])
+    nodes[of_node] = compose(AWAY, nodes[of_node])
+    return circle._replace(final=final, nodes=nodes, piece=piece)
+
+
+def test_a_run_in_one_piece_is_scored_as_before(circle):
+    one = circle._replace(piece=np.zeros(len(circle.time), int))
+    assert score_run(one) == score_run(circle)
+    assert PIECES not in scorecard_lines(score_run(one))
+    assert arrange_pieces(one) is one
+
+
+def test_the_score_of_pieces_does_not_depend_on_where_they_lie(circle, parted):
+    card, near = score_run(parted).quantities, score_run(parted._replace(final=circle.final)).quantities
+    assert card["pieces"].value == 2
+    assert card["unjoined_share"].value == pytest.approx(1 / 3)
+    for name in ("energy_within_pieces", "ate_within_pieces"):
+        assert card[name].value == pytest.approx(near[name].value, abs=1e-9)
+    assert card["ate_final"].value is None
+    assert card["energy_all"].value is None
+    assert card["energy_all"].odometry == score_run(circle).quantities["energy_all"].odometry
+
+
+def test_each_piece_is_aligned_by_itself(circle, parted):
+    noise = np.random.default_rng(0).normal(0, 0.01, circle.final.shape)
+    final, piece = compose(parted.final, noise), parted.piece
+    parts = [
+        ate(final[piece == one], circle.truth[piece == one]) ** 2 * (piece == one).sum() for one in (0, 1)
+    ]
+    found = ate_within_pieces(final, circle.truth, piece)
+    assert found == pytest.approx(np.sqrt(sum(parts) / len(piece)))
+    assert found < ate(final, circle.truth)
+    assert ate_within_pieces(circle.final, circle.truth, 0 * piece) == ate(circle.final, circle.truth)
+
+
+def test_a_picture_shows_pieces_where_they_are_true(circle, parted):
+    shown = arrange_pieces(parted)
+    assert np.abs(shown.final[:, :2] - circle.truth[:, :2]).max() < 1e-6
+    draw_map(parted, score_run(parted))  # draws nothing outside of its frame
+    assert "2 pieces, 33% of the steps unjoined" in map_headline(score_run(parted))
+    assert "within the pieces of the map" in describe_score(score_run(parted))
+
+
+def test_without_truth_a_picture_shows_pieces_side_by_side(parted):
+    shown = arrange_pieces(parted._replace(truth=None))
+    first, second = (shown.final[shown.piece == one] for one in (0, 1))
+    assert first[:, 0].max() < second[:, 0].min() < first[:, 0].max() + np.ptp(first[:, 0])
+    for one in (0, 1):
+        steps = parted.piece == one
+        own, before = shown.final[steps], parted.final[steps]
+        assert np.allclose(between(own[:1], own)[:, :2], between(before[:1], before)[:, :2])
+    names = [label.get_text() for label in draw_map(parted, score_run(parted)).legends[0].get_texts()]
+    steps = int((parted.piece == 0).sum())
+    assert f"piece 1, {steps} steps" in names
+
+
+def test_the_pieces_of_steps_read_back_equal(tmp_path):
+    piece = np.array([0, 0, 1, 2, 0])
+    write_pieces(tmp_path / "pieces.csv", np.arange(5) / 3, piece)
+    assert read_pieces(tmp_path / "pieces.csv", 5).tolist() == piece.tolist()
+    assert read_pieces(tmp_path / "none.csv", 2).tolist() == [0, 0]
+    with pytest.raises(InputError, match="5 lines"):
+        read_pieces(tmp_path / "pieces.csv", 6)
