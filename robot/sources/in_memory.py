@@ -121,6 +121,17 @@ def truncate_log(log: InMemorySource, steps: int) -> InMemorySource:
     return replace(select_rows(log, np.arange(log.length)[:steps]), digest=f"{log.digest}[:{steps}]")
 
 
+def cut_log(log: InMemorySource, first: int, last: int | None = None) -> InMemorySource:
+    """The steps from `first` up to but without `last` (None: to the end) as a session of their own.
+
+    Its first step has no motion; its digest is the original one followed by these numbers.
+    """
+    last = log.length if last is None else min(last, log.length)
+    part = select_rows(log, np.arange(first, last))
+    part.motion[:1] = 0.0  # a copy: rows are chosen by number
+    return replace(part, digest=f"{log.digest}[{first}:{last}]")
+
+
 def select_rows(log: InMemorySource, rows: np.ndarray) -> InMemorySource:
     """The rows of a source in memory with these numbers [n]; motions stay as they are, and so does the
     digest."""

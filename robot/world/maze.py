@@ -6,6 +6,7 @@ converts them to boxes. Text files have posts `o` or `+`, walls `---` and `|`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,6 +157,28 @@ def between_cells(maze: Maze, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, 
     if abs(x - u) + abs(y - v) != 1:
         raise ValueError(f"cells {a} and {b} are not neighbours")
     return (maze.along, (y, max(x, u))) if y == v else (maze.across, (max(y, v), x))
+
+
+def change_walls(
+    maze: Maze, added: Sequence[tuple[Cell, Cell]], removed: Sequence[tuple[Cell, Cell]]
+) -> Maze:
+    """The maze with walls between these pairs of neighbouring cells put up and others taken away.
+
+    Raises:
+        InputError: two cells are not neighbours in the maze, or the wall is there already, or not there.
+    """
+    changed = Maze(maze.across.copy(), maze.along.copy())
+    for name, pairs, there in (("added", added, False), ("removed", removed, True)):
+        for number, (a, b) in enumerate(pairs):
+            where, cells = f"simulation.maze.{name}[{number}]", f"cells {tuple(a)} and {tuple(b)}"
+            if not (is_inside(maze, a) and is_inside(maze, b)) or abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
+                raise InputError(where, cells, "two neighbouring cells of the maze")
+            wall, place = between_cells(changed, a, b)
+            if wall[place] != there:
+                found = f"{'no' if there else 'a'} wall between {cells}"
+                raise InputError(where, found, f"{'a' if there else 'no'} wall there")
+            wall[place] = not there
+    return changed
 
 
 def is_open(maze: Maze, a: Cell, b: Cell) -> bool:

@@ -6,7 +6,7 @@ four in alternating directions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -33,8 +33,13 @@ def circuit_route(loop: Sequence[Cell], word: str) -> list[Cell]:
     return way
 
 
-def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Generator) -> list[Cell]:
+def exploration_route(
+    maze: Maze, start: Cell, cells: int, random: np.random.Generator, within: Collection[Cell] = ()
+) -> list[Cell]:
     """A random route of this many cells, which turns back only in dead ends.
+
+    Args:
+        within: the cells that it may enter; empty: all.
 
     Raises:
         InputError: the start is outside the maze or walled in.
@@ -42,7 +47,7 @@ def exploration_route(maze: Maze, start: Cell, cells: int, random: np.random.Gen
     way = [start]
     before: Cell | None = None
     while len(way) < cells:
-        options = neighbours(maze, way[-1])
+        options = [cell for cell in neighbours(maze, way[-1]) if not within or cell in within]
         if not options:
             raise InputError("simulation.maze", f"cell {start} is walled in", "a way out of it")
         onward = [cell for cell in options if cell != before] or options

@@ -15,6 +15,7 @@ from robot.world.maze import (
     WALL_HEIGHT,
     Cell,
     Maze,
+    change_walls,
     closed_maze,
     describe_box,
     maze_text,
@@ -57,6 +58,18 @@ class MazeConfig(Settings):
     """Wall heights, m, chosen at random for each wall; posts have the largest."""
     seed: NonNegativeInt | None = None
     """Seed of the maze; null: that of the simulation."""
+    added: tuple[tuple[Cell, Cell], ...] = ()
+    """Walls to put up afterwards, each between two neighbouring cells: a maze that has changed since."""
+    removed: tuple[tuple[Cell, Cell], ...] = ()
+    """Walls to take away afterwards, likewise."""
+
+    @model_validator(mode="after")
+    def _one_height(self) -> MazeConfig:
+        if (self.added or self.removed) and len(self.heights) > 1:
+            raise ValueError(
+                "added and removed walls need one height; several are drawn in order of the walls"
+            )
+        return self
 
 
 class PathConfig(Settings):
@@ -66,6 +79,11 @@ class PathConfig(Settings):
     """One letter per circuit: C clockwise seen from above, A anticlockwise; '' for none."""
     explore: NonNegativeFloat = 0.0
     """Duration of a free exploration instead, from the first cell of the loop, s."""
+    start: NonNegativeInt = 0
+    """Number of the cell of the loop, counted anticlockwise from its first, at which circuits or an
+    exploration start."""
+    within: tuple[Cell, ...] = ()
+    """Cells that an exploration may enter, the first of them its start; empty: all."""
     cells: tuple[Cell, ...] = ()
     """Cells (column, row), counted from the south-west, to visit instead, in order."""
     loop: tuple[Cell, ...] = ()
@@ -79,6 +97,10 @@ class PathConfig(Settings):
         if len(given) != 1:
             there = " and ".join(given) or "none"
             raise ValueError(f"{there} of circuits, explore and cells; give exactly one")
+        if self.cells and self.start:
+            raise ValueError("start: cells begin at their first one")
+        if self.within and (self.start or not self.explore):
+            raise ValueError("within: it is for an exploration, and its first cell is the start")
         return self
 
 
@@ -121,7 +143,7 @@ def make_scene(
         InputError: a gap in the outer wall, a path through walls, a whisker at rest inside one, walls higher
             than the head, or a path too short for the kidnaps.
     """
-    maze, loop = _make_maze(maze_config, path_config, seed)
+    maze, loop = make_maze(maze_config, path_config, seed)
     carriage = kidnaps.count * kidnaps.ahead
     explored = path_config.explore + carriage if path_config.explore else 0.0
     way = _plan_route(path_config, maze, loop, explored, motion, seed)
@@ -184,7 +206,18 @@ def _maze_seed(config: MazeConfig, seed: int) -> int:
     return seed if config.seed is None else config.seed
 
 
-def _make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
+def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
+    """The maze of a session with this seed, and its loop in anticlockwise order, empty without one.
+
+    Raises:
+        InputError: the maze or its loop is not possible, or the path needs a loop and there is none.
+    """
+    maze, loop = _make_first_maze(config, path, seed)
+    return change_walls(maze, config.added, config.removed), loop
+
+
+def _make_first_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
+    """The maze before walls were added and removed, and its loop."""
     seed = _maze_seed(config, seed)
     loop: list[Cell] = []
     maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
@@ -218,6 +251,11 @@ def _draw_walls(
 def _plan_route(
     config: PathConfig, maze: Maze, loop: list[Cell], explored: float, motion: MotionConfig, seed: int
 ) -> list[Cell]:
+    if config.start:
+        if config.start >= len(loop):
+            expected = f"less than {len(loop)}, the cells of the loop"
+            raise InputError("simulation.path.start", str(config.start), expected)
+        loop = loop[config.start :] + loop[: config.start]
     if config.circuits:
         way = circuit_route(loop, config.circuits)
     elif config.cells:
@@ -226,7 +264,8 @@ def _plan_route(
             raise InputError("simulation.path.cells", "one cell", "at least two")
     else:
         cells = int(1.2 * explored * motion.speed / CELL_SIDE) + 20  # upper limit for that time
-        way = exploration_route(maze, loop[0] if loop else (0, 0), cells, stream(seed, "path"))
+        first = [*config.within, *loop, (0, 0)][0]
+        way = exploration_route(maze, first, cells, stream(seed, "path"), config.within)
     check_route(maze, way)
     return way
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows, truncate_log
+from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory, select_rows, truncate_log
 
 ROWS, WHISKERS = 6, 4
 
@@ -49,3 +49,15 @@ def test_one_row_of_flags_holds_for_all() -> None:
     flags = np.array([True, False, True, True])
     for sample in source(flags):
         np.testing.assert_array_equal(sample.reading.alive, flags)
+
+
+def test_a_cut_log_starts_without_motion_and_leaves_the_original() -> None:
+    log = replace(source(np.ones(WHISKERS, bool)), motion=np.ones((ROWS, 4)))
+    before = log.motion.copy()
+    part = cut_log(log, 2, 5)
+    assert part.length == 3
+    assert not part.motion[0].any()
+    assert np.array_equal(part.motion[1:], before[3:5])
+    assert np.array_equal(log.motion, before)
+    assert part.digest == f"{log.digest}[2:5]"
+    assert cut_log(log, 1).length == log.length - 1

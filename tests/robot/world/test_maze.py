@@ -17,6 +17,8 @@ from robot.world.maze import (
     WALL_THICKNESS,
     Maze,
     cell_centre,
+    change_walls,
+    closed_maze,
     describe_box,
     is_open,
     maze_text,
@@ -203,3 +205,33 @@ def test_boxes_have_names() -> None:
 def test_cells_that_are_not_neighbours_are_a_programming_error() -> None:
     with pytest.raises(ValueError, match="not neighbours"):
         is_open(maze_of(0), (0, 0), (1, 1))
+
+
+def test_changed_walls_are_those_named() -> None:
+    before = maze_of(3)
+    gap = next((c, r) for r in range(5) for c in range(6) if not before.along[r, c + 1])
+    wall = next((c, r) for r in range(5) for c in range(6) if before.along[r, c + 1])
+    added, removed = (gap, (gap[0] + 1, gap[1])), (wall, (wall[0] + 1, wall[1]))
+    after = change_walls(before, [added], [removed[::-1]])
+    assert np.argwhere(after.along != before.along).tolist() == sorted([[r, c + 1] for c, r in (gap, wall)])
+    assert (after.across == before.across).all()
+    assert change_walls(after, [removed], [added]).along.tolist() == before.along.tolist()
+
+
+@pytest.mark.parametrize(
+    ("pair", "key", "found"),
+    [
+        (((0, 0), (1, 1)), "added", "cells"),
+        (((0, 0), (-1, 0)), "removed", "cells"),
+        (((0, 0), (1, 0)), "added", "a wall between"),
+    ],
+)
+def test_a_change_that_is_none_is_refused(
+    pair: tuple[tuple[int, int], tuple[int, int]], key: str, found: str, refused: Callable[..., InputError]
+) -> None:
+    changes: dict[str, list[tuple[tuple[int, int], tuple[int, int]]]] = {
+        "added": [],
+        "removed": [],
+        key: [pair],
+    }
+    refused(lambda: change_walls(closed_maze(2, 2), **changes), f"simulation.maze.{key}[0]: {found}")

@@ -105,3 +105,9 @@ def test_a_loop_is_made_anticlockwise(seed: int) -> None:
 def test_a_loop_has_at_least_four_different_cells(refused: Callable[..., InputError]) -> None:
     refused(lambda: make_anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "cell (0, 0) twice")
     refused(lambda: make_anticlockwise([]), "0 cells")
+
+
+def test_an_exploration_stays_within_its_cells() -> None:
+    maze, loop = world(1)
+    way = exploration_route(maze, loop[2], 200, stream(1, "path"), loop[2:8])
+    assert set(way) == set(loop[2:8])

@@ -379,3 +379,43 @@ def test_odometry_is_between_mid_protractions() -> None:
     assert np.allclose(session.odometry[1:, :2], true[:, :2], atol=1e-12)
     assert np.allclose(wrap(session.odometry[1:, 2] - true[:, 2]), 0, atol=1e-9)
     assert (session.odometry[1:, 3] == 1).all()
+
+
+def test_circuits_start_at_a_chosen_cell_of_the_same_maze() -> None:
+    first, other = simulate(), simulate(path={"circuits": "CA", "start": 7})
+    assert maze_text(first.scene.maze) == maze_text(other.scene.maze)
+    for session, number in ((first, 0), (other, 7)):
+        cell = np.floor(session.truth[0, :2] / CELL_SIDE).astype(int)
+        assert tuple(cell.tolist()) == session.scene.loop[number]
+
+
+def test_a_changed_maze_differs_in_the_changed_walls_alone() -> None:
+    first = simulate()
+    loop = first.scene.loop
+    shut = (loop[0], loop[-1])
+    way = [*loop, *loop[-2::-1]]
+    changed = simulate(maze={"added": [shut]}, path={"cells": way})
+    lines = zip(
+        maze_text(first.scene.maze).splitlines(), maze_text(changed.scene.maze).splitlines(), strict=True
+    )
+    assert sum(a != b for one, other in lines for a, b in zip(one, other, strict=True)) in (1, 3)
+    with pytest.raises(InputError, match="wall between"):
+        simulate(maze={"added": [shut]})  # the circuits pass there
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"maze": {"added": [[[0, 0], [1, 0]]], "heights": [0.03, 0.05]}}, "one height"),
+        ({"path": {"cells": [[0, 0], [1, 0]], "start": 2}}, "start"),
+        ({"path": {"circuits": "C", "within": [[0, 0]]}}, "within"),
+    ],
+)
+def test_settings_without_effect_are_refused(part: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        SimulationConfig.model_validate(part)
+
+
+def test_a_start_beyond_the_loop_is_refused() -> None:
+    with pytest.raises(InputError, match=r"simulation\.path\.start: 20"):
+        simulate(path={"circuits": "C", "start": 20})
