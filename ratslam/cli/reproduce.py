@@ -77,12 +77,34 @@ def add_commands(commands: Commands) -> None:
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
+    add_maps(names)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
     )  # fmt: skip
     add_config(train)
     train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
+
+
+def add_maps(names: Commands) -> None:
+    """Registers the rows of saved maps."""
+    maps = names.add(
+        "maps", _maps, "maps found again, continued, merged and changed",
+        "reproduce maps --rows start --sessions 1 -o runs/maps",
+    )  # fmt: skip
+    maps.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+    maps.add_argument(
+        "--sessions",
+        type=positive_integer,
+        metavar="N",
+        help="sessions per row (default: of the row, 2 to 20)",
+    )
+    add_count(maps, "--first", 32000, "seed of the first maze; each session has the next one")
+    maps.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / "maps", metavar="DIR",
+        help="folder for maps.md, a picture per row, and the maps, which are used again (default runs/maps)",
+    )  # fmt: skip
+    add_workers(maps, 1)
 
 
 def add_figure(names: Commands, name: str, title: str) -> None:
@@ -215,6 +237,22 @@ def _real(arguments: argparse.Namespace) -> int:
     for line in reproduce_real(names, data, arguments.output):
         print(line, flush=True)
     print(f"wrote {arguments.output / 'real.md'}")
+    return 0
+
+
+def _maps(arguments: argparse.Namespace) -> int:
+    prepare_jax(keep_compiled=False)
+    from ratslam.experiments.atlas.product import PRODUCT
+    from ratslam.experiments.atlas.reproduction import ROWS, reproduce_maps
+    from ratslam.experiments.tables.markdown import select_rows
+
+    names = select_rows(arguments.rows, ROWS, tuple(ROWS))
+    lines = reproduce_maps(
+        names, PRODUCT, arguments.output, arguments.first, arguments.sessions, arguments.workers
+    )
+    for line in lines:
+        print(line, flush=True)
+    print(f"wrote {arguments.output / 'maps.md'}")
     return 0
 
 

@@ -38,10 +38,7 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
 
 def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source."""
-    method = backend_settings(config.backend, config)
-    reserve = max(capacity_for(log.length), config.session.reserve)
-    session = _compiled(config.backend, method, config.session.precision, log.view_shape, reserve)
-    session.restart(config.session.seed)
+    session = start_session(config, log)
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
     nodes = session.map.graph().nodes
@@ -57,6 +54,15 @@ def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
         live=np.array([step.pose for step in steps]),
         piece=session.map.pieces(),
     )
+
+
+def start_session(config: RunConfig, log: InMemorySource) -> Session:
+    """A session at its start, for a configuration completed by its source; the next call takes it back."""
+    method = backend_settings(config.backend, config)
+    reserve = max(capacity_for(log.length), config.session.reserve)
+    session = _compiled(config.backend, method, config.session.precision, log.view_shape, reserve)
+    session.restart(config.session.seed)
+    return session
 
 
 def capacity_for(steps: int) -> int:

@@ -1,0 +1,1 @@
+"""Maps that are saved, found again, continued, merged and changed: scenarios, measures and rows."""

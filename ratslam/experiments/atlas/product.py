@@ -1,0 +1,77 @@
+"""The operations of this program on saved maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from ratslam.atlas.localiser import Localisation, Localiser
+from ratslam.core.session import Session
+from ratslam.experiments.atlas.methods import Localised, Methods
+from ratslam.experiments.atlas.sessions import Recorded
+from ratslam.experiments.atlas.stored_maps import MapArrays, StoredMap
+from ratslam.experiments.trials.touch_trial import capacity_for
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.localise import localising
+from ratslam.pipeline.saved_map import read_map
+from robot.touch_source import observation_of
+from tactile.base.errors import InputError
+
+
+def localise(made: StoredMap, recorded: Recorded) -> Localised:
+    """A session in a map, with `backend: localise`; poses are those given at each step.
+
+    Raises:
+        InputError: the session is not one of the map's sensor.
+    """
+    session = _session_in(made.path, capacity_for(recorded.log.length))
+    session.restart(recorded.config.session.seed)
+    steps = list(session.replay(observation_of(sample) for sample in recorded.log))
+    localiser = session.map
+    assert isinstance(localiser, Localiser)
+    states = localiser.states()
+    pose = np.array([step.pose for step in steps])
+    return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
+
+
+def extend(made: StoredMap, recorded: Recorded) -> MapArrays:
+    """The map of a session and then another one, which begins a new piece of it.
+
+    Raises:
+        InputError: the session is not one of the map's sensor.
+    """
+    session = read_map(made.path).open_session()
+    session.begin_piece()
+    for _ in session.replay(observation_of(sample) for sample in recorded.log):
+        pass
+    return MapArrays.of_session(session, np.concatenate([made.arrays.truth, recorded.truth]))
+
+
+def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
+    """One map of several, in a new folder."""
+    _refuse("merge maps")
+
+
+def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
+    """Places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first."""
+    _refuse("name changes")
+
+
+@lru_cache(maxsize=1)
+def _session_in(path: Path, reserve: int) -> Session:
+    """A session of any state in a map; the last one that was compiled is used again."""
+    saved = read_map(path)
+    config = localising(saved.config, saved)
+    rows = config.session.model_copy(update={"reserve": reserve})
+    return build_session(config.model_copy(update={"session": rows}), saved.source)
+
+
+def _refuse(verb: str) -> NoReturn:
+    raise InputError("reproduce maps", f"no method to {verb}", "other --rows")
+
+
+PRODUCT = Methods(localise, extend, merge, changes)

@@ -1,0 +1,89 @@
+"""One row of the table of saved maps: its sessions, its lines, its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.statistics import wilson_interval
+from ratslam.experiments.atlas.methods import Methods
+from ratslam.experiments.atlas.sessions import Recipe
+from ratslam.experiments.atlas.stored_maps import StoredMap, store_map
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+
+COLUMNS = ("figure", "goal", "measured", "control")
+
+
+class MapTask(NamedTuple):
+    """One session of a row.
+
+    Attributes:
+        seed: of its maze; in rows of recordings, the number of the recording. folder: for maps. methods: what
+            is measured.
+    """
+
+    seed: int
+    folder: Path
+    methods: Methods
+
+    def map_of(self, recipe: Recipe) -> StoredMap:
+        """The map of a session, made once for all rows."""
+        return store_map(recipe, self.folder)
+
+
+class Line(NamedTuple):
+    """A line of a row's table: a figure, its goal, what was measured, and the same of the control."""
+
+    figure: str
+    goal: str
+    measured: str
+    control: str
+
+
+class MapRow(NamedTuple):
+    """A row.
+
+    Attributes:
+        title: one line. sessions: their usual number. measure: the figures of one session. lines: of the
+            figures of all. draw: draws these into a new PNG file. recordings: names of the recordings that
+            are used instead of mazes.
+    """
+
+    title: str
+    sessions: int
+    measure: Callable[[MapTask], Any]
+    lines: Callable[[Sequence[Any]], Iterable[Line]]
+    draw: Callable[[Sequence[Any], Path], None]
+    recordings: tuple[str, ...] = ()
+
+    def seeds(self, first: int, sessions: int | None) -> range:
+        """The seeds of its tasks, from that of the first maze and the number of sessions (None: the
+        usual)."""
+        if self.recordings:
+            return range(len(self.recordings))[:sessions]
+        return range(first, first + (sessions or self.sessions))
+
+    def table(self, found: Sequence[Any]) -> list[str]:
+        """The lines of a Markdown table."""
+        return [markdown_header(COLUMNS), *(markdown_row(line) for line in self.lines(found))]
+
+
+def count(happened: Sequence[bool] | np.ndarray) -> str:
+    """How many of the sessions [n] bool, with the 95 % interval of the rate in percent."""
+    number, total = int(np.sum(happened)), len(happened)
+    if not total:
+        return "-"
+    low, high = wilson_interval(number, total)
+    return f"{number} of {total} [{100 * low:.0f}-{100 * high:.0f} %]"
+
+
+def spread(values: Sequence[float] | np.ndarray, digits: int = 2) -> str:
+    """Median and largest of values; `-` without a finite one."""
+    known = np.asarray(values, float)
+    known = known[~np.isnan(known)]
+    if not len(known):
+        return "-"
+    return f"{np.median(known):.{digits}f} ({known.max():.{digits}f})"
