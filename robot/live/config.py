@@ -10,12 +10,26 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.ur10.config import ArmConfig
 from robot.live.create_config import CreateLiveConfig
+from robot.live.goal_config import GoalConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.sources.odometry import OdometryConfig
 from tactile.base.config import Settings
 
 ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "budget", "grace")
 """Settings without a meaning for a Create."""
+
+
+class LivePlanConfig(SimulationConfig):
+    """Plan of a session on the arm: as of a simulated session, or goals on a saved map."""
+
+    goal: GoalConfig | None = None
+    """Goals to drive to on a saved map, instead of the path. The robot stands where the map ended: at the
+    end of the path, or of `waypoints`."""
+
+    def resolved(self, folder: Path) -> LivePlanConfig:
+        plan = super().resolved(folder)
+        assert isinstance(plan, LivePlanConfig)
+        return plan if plan.goal is None else plan.model_copy(update={"goal": plan.goal.resolved(folder)})
 
 
 class LiveConfig(Settings):
@@ -27,7 +41,7 @@ class LiveConfig(Settings):
     """The arm and its limits."""
     head: HeadLinkConfig = HeadLinkConfig()
     """The link to the whisker head."""
-    plan: SimulationConfig = SimulationConfig()
+    plan: LivePlanConfig = LivePlanConfig()
     """Route (maze, path, motion), whisking and calibration, as in a simulated session. The emulators use the
     other settings for their world; `odometry` and `kidnaps` have no effect.
     """

@@ -55,13 +55,18 @@ class Route:
 
 
 def plan_path(config: LiveConfig, head: Head) -> HeadPath:
-    """Poses of the head in the map over time, for motion without interruptions.
+    """Poses of the head in the map over time, for motion without interruptions; with goals only the first.
 
     Raises:
         InputError: the path cannot be planned or is empty.
     """
-    if config.waypoints:
-        return _waypoint_path(config)
+    path = _waypoint_path(config) if config.waypoints else _planned_path(config, head)
+    if config.plan.goal is not None:  # the arm starts at the end
+        return HeadPath(np.zeros(1), path.pose[-1:])
+    return path
+
+
+def _planned_path(config: LiveConfig, head: Head) -> HeadPath:
     made = plan_scene(config.plan, head)
     if len(made.jumps):
         raise InputError("live.plan.kidnaps", "kidnaps", "none on an arm", "remove them from the plan")
@@ -81,7 +86,7 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
 def _waypoint_path(config: LiveConfig) -> HeadPath:
     pose = np.array(config.waypoints)
     pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
-    if len(pose) < 2:
+    if len(pose) < 2 and config.plan.goal is None:
         raise InputError("live.waypoints", "one", "at least two")
     step = np.abs(np.diff(pose, axis=0))
     motion = config.plan.motion

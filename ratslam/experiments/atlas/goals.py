@@ -1,0 +1,255 @@
+"""Drives an emulated arm to goals on a map made in replay, in closed loop and in virtual time.
+
+Each goal is an experience drawn at random at most 1 m away along driven cells; a drive starts where the one
+before ended. In further drives a wall is put across the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import networkx
+import numpy as np
+
+from ratslam.config.run_config import RunConfig, load_config
+from ratslam.pipeline.goal_planner import GoalPlanner
+from ratslam.pipeline.slam import Slam
+from ratslam.pipeline.source import open_source
+from robot.live.config import LiveConfig
+from robot.live.goal_config import GoalConfig
+from robot.live.goal_drive import DriveState, GoalDrive, Sighting
+from robot.live.goal_route import GoalRoute
+from robot.live.virtual_arm import VirtualArm
+from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
+from robot.world.scene import Scene, make_scene
+from robot.world.walls import Surroundings, Walls
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, fit_rigid_motion
+from tactile.frontend import Frontend
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+
+NEAREST, FARTHEST = 0.18, 1.0
+"""Range of a goal's distance along driven cells, m: from one cell side."""
+RIGHT = 0.09
+"""Largest true distance from a goal that counts as reached, m: half a cell side."""
+LONGEST = 400
+"""Whisks after which a drive is given up."""
+
+
+class Drive(NamedTuple):
+    """A drive to one goal.
+
+    Attributes:
+        state, reason: its end. goal: the experience. whisks: their number. replans: new ways.
+        error: true distance from the goal at the end, m. length: of the true path, m. shortest: way over
+            driven cells, m. clearance: least distance of the head's axis from a wall on the way, m.
+        detected: whisks until the first obstacle was found; -1 without one.
+    """
+
+    state: DriveState
+    reason: str
+    goal: int
+    whisks: int
+    replans: int
+    error: float
+    length: float
+    shortest: float
+    clearance: float
+    detected: int
+
+    @property
+    def reached(self) -> bool:
+        """Whether it ended at its goal, by the truth too."""
+        return self.state is DriveState.REACHED and self.error <= RIGHT
+
+
+class DrivenMap(NamedTuple):
+    """A map with the world in which it was made.
+
+    Attributes:
+        config: of the run that made it. scene: of that run. file: checkpoint. to_truth: [3] the motion that
+            lays the map over the world. end: [3] true pose at its end.
+    """
+
+    config: RunConfig
+    scene: Scene
+    file: Path
+    to_truth: np.ndarray
+    end: np.ndarray
+
+
+def make_map(seed: int, folder: Path, assignments: Sequence[str] = ()) -> DrivenMap:
+    """Maps the session `whisker_maze` of a seed in replay and saves the map in the folder.
+
+    Args:
+        assignments: settings to replace, each `a.b=value`.
+    """
+    config = load_config("whisker_maze", [f"simulation.seed={seed}", *assignments])
+    plan = config.simulation
+    assert plan is not None
+    slam, truth = Slam(config), []
+    with open_source(config) as source:
+        for sample in source:
+            slam.step(sample)
+            truth.append(sample.truth)
+    file = folder / "map.npz"
+    slam.save(file)
+    true = np.array(truth, float)
+    head = ur10_head(HeadConfig())
+    scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
+    return DrivenMap(config, scene, file, fit_rigid_motion(slam.trajectory(), true), true[-1])
+
+
+def live_config(config: RunConfig) -> LiveConfig:
+    """The arm's session in the world of a simulated one, with its odometry errors."""
+    plan = config.simulation
+    assert plan is not None
+    settings = {"plan": plan.model_dump(), "noise": plan.odometry.model_dump(), "seed": plan.seed}
+    return LiveConfig.model_validate(settings)
+
+
+class ClosedLoop:
+    """The arm in its maze, its mapper and its drives, one after the other."""
+
+    def __init__(self, made: DrivenMap) -> None:
+        self._made = made
+        self._live = live_config(made.config)
+        self._slam = Slam.load(made.file)
+        self._frontend = Frontend(made.config.touch)
+        self._arm = VirtualArm(self._live, walls_of(made), made.end)
+        self._cell = made.config.pose_cells.cell_size
+        self.experiences: networkx.DiGraph = self._slam.map.graph()
+        self.poses: list[np.ndarray] = []
+
+    @property
+    def pose(self) -> np.ndarray:
+        """[3] true pose."""
+        return self._arm.poses[-1]
+
+    def place_of(self, experience: int) -> np.ndarray:
+        """[2] where an experience is in the world, m."""
+        node = self.experiences.nodes[experience]
+        return compose(self._made.to_truth, np.array([node["x"], node["y"], node["heading"]]))[:2]
+
+    def put_walls(self, walls: Surroundings) -> None:
+        """Replaces the walls."""
+        self._arm.surroundings = walls
+
+    def drive(self, experience: int) -> Drive:
+        """Drives to an experience."""
+        goal = GoalConfig(map=self._made.file, to=(experience,))
+        planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
+        drive = GoalDrive(goal, planner, self._cell, 1)
+        route, first = GoalRoute(drive, self._live), len(self._arm.poses) - 1
+        whisks, detected = 0, -1
+        while whisks < LONGEST and not route.advance(self._arm):
+            route.see(*self._sight())
+            whisks += 1
+            if detected < 0 and len(drive.obstacles):
+                detected = whisks
+        path = np.array(self._arm.poses[first:])
+        self.poses.append(path)
+        place = self.place_of(experience)
+        return Drive(
+            drive.state, drive.reason, experience, whisks, drive.replans,
+            float(np.hypot(*(self.pose[:2] - place))),
+            float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum()),
+            shortest_driven(self._made.scene.loop, path[0, :2], place),
+            clearance(self._arm.surroundings.walls, path),
+            detected,
+        )  # fmt: skip
+
+    def _sight(self) -> tuple[Sighting, np.ndarray]:
+        sample = self._arm.whisk()
+        seen = self._frontend.observe(sample.reading)
+        estimate = self._slam.step(seen)
+        assert sample.truth is not None
+        return Sighting(None if estimate.lost else estimate.pose, seen.point[seen.contact]), sample.truth
+
+
+def drive_pairs(loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator) -> Iterator[Drive]:
+    """Drives to goals drawn at random, each from where the last one ended."""
+    for _ in range(count):
+        yield loop.drive(draw_goal(loop, made, random))
+
+
+def drive_blocked(
+    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
+) -> Iterator[Drive]:
+    """The same with a wall across the shortest way, half-way; it is taken away after each drive."""
+    for _ in range(count):
+        while True:
+            goal = draw_goal(loop, made, random)
+            cells = cells_between(made.scene.loop, loop.pose[:2], loop.place_of(goal))
+            if len(cells) >= 3:  # the robot and the goal are not in the cells beside the wall
+                break
+        middle = len(cells) // 2
+        loop.put_walls(walls_of(made, (cells[middle - 1], cells[middle])))
+        yield loop.drive(goal)
+        loop.put_walls(walls_of(made))
+
+
+def draw_goal(loop: ClosedLoop, made: DrivenMap, random: np.random.Generator) -> int:
+    """An experience in the range of goals from the present true pose."""
+    far = {
+        place: shortest_driven(made.scene.loop, loop.pose[:2], loop.place_of(place))
+        for place in loop.experiences
+    }
+    return int(random.choice([place for place, length in far.items() if NEAREST <= length <= FARTHEST]))
+
+
+def walls_of(made: DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surroundings:
+    """The walls of the maze, with one more between two neighbouring cells."""
+    maze, plan = made.scene.maze, made.config.simulation
+    assert plan is not None
+    maze = Maze(maze.across.copy(), maze.along.copy())
+    if across is not None:
+        wall, place = between_cells(maze, *across)
+        wall[place] = True
+    heights = stream(plan.seed, "maze.heights")
+    return Surroundings(wall_boxes(maze, heights, plan.maze.heights), made.scene.surroundings.head)
+
+
+def cell_of(place: np.ndarray) -> Cell:
+    """The cell of a point, m."""
+    x, y = np.floor(place / NEAREST).astype(int)
+    return int(x), int(y)
+
+
+def _driven_graph(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> networkx.Graph:
+    """Cells of the loop, joined in its order, with two points joined to their cells and the next ones."""
+    links = list(zip(loop, [*loop[1:], loop[0]], strict=True))
+    graph = networkx.Graph()
+    for cell, other in links:
+        graph.add_edge(cell, other, length=float(np.hypot(*(cell_centre(cell) - cell_centre(other)))))
+    ends = {name: (cell_of(place), place) for name, place in (("from", a), ("to", b))}
+    for name, (cell, place) in ends.items():
+        for near in [cell, *graph[cell]] if name not in graph else []:
+            if isinstance(near, tuple):
+                graph.add_edge(name, near, length=float(np.hypot(*(cell_centre(near) - place))))
+    if ends["from"][0] == ends["to"][0] or graph.has_edge(ends["from"][0], ends["to"][0]):
+        graph.add_edge("from", "to", length=float(np.hypot(*(a - b))))
+    return graph
+
+
+def shortest_driven(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> float:
+    """Length of the shortest way between two points [2] over the cells of the loop, m: from centre to centre,
+    straight within two joined cells."""
+    return float(networkx.dijkstra_path_length(_driven_graph(loop, a, b), "from", "to", weight="length"))
+
+
+def cells_between(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> list[Cell]:
+    """The cells of that way, in order, with those of the points."""
+    way = networkx.dijkstra_path(_driven_graph(loop, a, b), "from", "to", weight="length")
+    cells = [cell_of(a), *way[1:-1], cell_of(b)]
+    return [cell for k, cell in enumerate(cells) if cell not in cells[:k]]
+
+
+def clearance(walls: Walls, path: np.ndarray) -> float:
+    """Least distance of points of a path [N, 2 or 3] from the walls, in plan, m."""
+    low, high = walls.box[:, :2], walls.box[:, 2:]
+    place = path[:, None, :2]
+    out = np.maximum(np.maximum(low - place, place - high), 0.0)
+    return float(np.linalg.norm(out, axis=-1).min())

@@ -1,0 +1,87 @@
+"""Plans ways to goals on a saved map for a drive (`robot.live.goal_drive`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ratslam.atlas.route import NoWay, Travel, Way, find_way, nearest_experience, position, travel_graph
+from robot.live.goal_config import GoalConfig
+from robot.live.goal_drive import DriveState, PlannedWay
+from robot.world.head_trajectory import MotionConfig
+from tactile.base.errors import InputError
+
+if TYPE_CHECKING:
+    import networkx
+
+
+HEADING_RADIUS = 0.05
+"""Distance that a difference in heading of 1 rad counts for in the search for the nearest experience, m."""
+
+
+class GoalPlanner:
+    """Ways over the experiences of a map; a `robot.live.goal_drive.Planner`.
+
+    Args:
+        experiences: graph of the map, see `KeyframeMap.graph`. motion: of the robot.
+
+    Attributes:
+        goals: experience of each goal.
+
+    Raises:
+        InputError: a goal is not on the map.
+    """
+
+    def __init__(self, experiences: networkx.DiGraph, config: GoalConfig, motion: MotionConfig) -> None:
+        self._experiences, self._config = experiences, config
+        self._travel = Travel(motion.speed, motion.turn_rate)
+        graph = travel_graph(experiences, self._travel)
+        self.goals = [
+            experience_at(graph, goal, config.farthest, f"live.plan.goal.to[{k}]")
+            for k, goal in enumerate(config.to)
+        ]
+
+    def plan(self, pose: np.ndarray, goal: int, obstacles: np.ndarray) -> PlannedWay:
+        """See `robot.live.goal_drive.Planner`."""
+        config = self._config
+        graph = travel_graph(self._experiences, self._travel, obstacles, config.standoff)
+        start = nearest_experience(graph, pose, config.farthest, HEADING_RADIUS)
+        if start is None:
+            reason = f"no experience within {config.farthest:g} m of the estimate"
+            return PlannedWay(None, DriveState.LOST, reason)
+        try:
+            return PlannedWay(find_way(graph, start, self.goals[goal], config.mode).poses)
+        except NoWay as error:
+            return PlannedWay(None, DriveState.BLOCKED, str(error))
+
+
+def experience_at(
+    graph: networkx.Graph, goal: Sequence[float] | int, farthest: float, where: str = "--to"
+) -> int:
+    """The experience of a goal: its number, or the nearest one to x, y (m).
+
+    Args:
+        farthest: largest distance of x, y from it, m. where: of the goal, for errors.
+
+    Raises:
+        InputError: there is no such experience, or none that near.
+    """
+    if isinstance(goal, int):
+        if goal not in graph:
+            last = max(graph.nodes(), default=-1)
+            raise InputError(where, f"experience {goal}", f"a number from 0 to {last}")
+        return goal
+    place = np.array(goal[:2], float)
+    found = nearest_experience(graph, place, farthest)
+    if found is not None:
+        return found
+    nearest = nearest_experience(graph, place, np.inf)
+    if nearest is None:
+        raise InputError(where, "a map without experiences", "a map with experiences")
+    x, y = position(graph, nearest)
+    away = float(np.hypot(x - place[0], y - place[1]))
+    text = f"({place[0]:g}, {place[1]:g}), {away:.2f} m from the nearest experience, {nearest} at ({x:.2f}, {y:.2f})"
+    raise InputError(where, text, f"a point within {farthest:g} m of an experience")

@@ -1,0 +1,44 @@
+"""Settings of a session that drives to goals on a saved map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+
+from tactile.base.config import Settings
+
+Point = tuple[float, float]
+
+
+class GoalConfig(Settings):
+    """Goals on a saved map. The head moves only along links between experiences, which were driven before."""
+
+    map: Path
+    """The map: a run directory or its `map.npz`."""
+    to: Annotated[tuple[Point | NonNegativeInt, ...], Field(min_length=1)]
+    """Goals in order: x, y in the map (m), or the number of an experience."""
+    mode: Literal["time", "temporal"] = "time"
+    """The way: `time` by least expected time, `temporal` by RatSLAM's goal temporal map."""
+    farthest: PositiveFloat = 0.1
+    """Largest distance of a goal, or of the robot, from the nearest experience, m."""
+    tolerance: PositiveFloat = 0.02
+    """Distance from the goal at which it is reached, by the estimate, m."""
+    standoff: PositiveFloat = 0.045
+    """Contacts nearer than this to the way ahead block it, m; less than half a corridor, whose walls are
+    beside the way."""
+    confirm: PositiveInt = 2
+    """Consecutive whisks with such a contact after which the way counts as blocked; the head rests from the
+    first one on."""
+    off_way: PositiveFloat = 1.2
+    """Distance of the estimate from the way above which a new way is planned, pose cells."""
+    patience: PositiveInt = 20
+    """Consecutive whisks without an estimate, or with one away from all experiences, after which the session
+    is lost; the head rests meanwhile."""
+    replans: NonNegativeInt = 5
+    """Number of new ways for a goal, after which it counts as blocked."""
+
+    def resolved(self, folder: Path) -> GoalConfig:
+        """A copy with a relative path of the map taken from the folder."""
+        return self.model_copy(update={"map": folder / self.map})
