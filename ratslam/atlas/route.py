@@ -8,6 +8,7 @@ A robot that only drives forwards must not use these ways.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -97,12 +98,12 @@ def blocked_links(graph: networkx.Graph, obstacles: np.ndarray, standoff: float)
     return [edge for edge, blocked in zip(edges, near, strict=True) if blocked]
 
 
-def find_way(graph: networkx.Graph, start: int, goal: int, mode: Mode = "time") -> Way:
-    """The way from an experience to another.
+def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode = "time") -> Way:
+    """The way from an experience to one of some others.
 
     `time`: the least expected time (Dijkstra). `temporal`: RatSLAM's rule (Milford & Wyeth 2010, III-F: the
-    goal temporal map): each experience gets its least duration to the goal over the links, and from each the
-    way goes on to the neighbour that is nearest to the goal in time. A map keeps no times of travel; the
+    goal temporal map): each experience gets its least duration to a goal over the links, and from each the
+    way goes on to the neighbour that is nearest to a goal in time. A map keeps no times of travel; the
     duration of a link is that of its motion.
 
     Raises:
@@ -110,14 +111,15 @@ def find_way(graph: networkx.Graph, start: int, goal: int, mode: Mode = "time") 
     """
     import networkx
 
-    for place in (start, goal):
+    for place in (start, *goals):
         if place not in graph:
             raise KeyError(f"the map has no experience {place}")
-    if not networkx.has_path(graph, start, goal):
-        raise NoWay(_reason(graph, start, goal))
-    if mode == "temporal":
-        return describe_way(graph, _descend(graph, start, goal))
-    return describe_way(graph, networkx.dijkstra_path(graph, start, goal, weight="expected"))
+    # From the goals: the edges have no direction.
+    weight = "expected" if mode == "time" else "seconds"
+    left, ways = networkx.multi_source_dijkstra(graph, set(goals), weight=weight)
+    if start not in left:
+        raise NoWay(_reason(graph, start, goals[0]))
+    return describe_way(graph, ways[start][::-1] if mode == "time" else _descend(graph, start, left))
 
 
 def describe_way(graph: networkx.Graph, experiences: list[int]) -> Way:
@@ -127,6 +129,19 @@ def describe_way(graph: networkx.Graph, experiences: list[int]) -> Way:
     poses = np.array([[node["x"], node["y"], node["heading"]] for node in nodes])
     total = [float(sum(link[name] for link in links)) for name in ("length", "seconds", "expected")]
     return Way(tuple(experiences), poses, *total)
+
+
+def experiences_near(graph: networkx.Graph, place: int, radius: float) -> list[int]:
+    """An experience, and the others of its piece within a distance (m), at any heading."""
+    here, piece = np.array(position(graph, place)), graph.nodes[place]["piece"]
+    others = [
+        other
+        for other in graph
+        if other != place
+        and graph.nodes[other]["piece"] == piece
+        and np.hypot(*(np.array(position(graph, other)) - here)) <= radius
+    ]
+    return [place, *others]
 
 
 def nearest_experience(
@@ -181,13 +196,10 @@ def _cost(a: dict, b: dict, traversals: int, travel: Travel) -> dict[str, float]
     }
 
 
-def _descend(graph: networkx.Graph, start: int, goal: int) -> list[int]:
-    """From each experience to the neighbour with the least time to the goal."""
-    import networkx
-
-    left = networkx.single_source_dijkstra_path_length(graph, goal, weight="seconds")
+def _descend(graph: networkx.Graph, start: int, left: Mapping[int, float]) -> list[int]:
+    """From each experience to the neighbour with the least time to a goal."""
     way = [start]
-    while way[-1] != goal:
+    while left[way[-1]] > 0:
         way.append(min(graph[way[-1]], key=lambda place: (left[place], place)))
     return way
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ratslam.atlas.route import NoWay, Travel, Way, find_way, nearest_experience, position, travel_graph
+from ratslam.atlas.route import (
+    NoWay,
+    Travel,
+    experiences_near,
+    find_way,
+    nearest_experience,
+    position,
+    travel_graph,
+)
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, PlannedWay
 from robot.world.head_trajectory import MotionConfig
@@ -18,7 +26,7 @@ if TYPE_CHECKING:
     import networkx
 
 
-HEADING_RADIUS = 0.05
+HEADING_RADIUS = 0.2
 """Distance that a difference in heading of 1 rad counts for in the search for the nearest experience, m."""
 
 
@@ -53,7 +61,8 @@ class GoalPlanner:
             reason = f"no experience within {config.farthest:g} m of the estimate"
             return PlannedWay(None, DriveState.LOST, reason)
         try:
-            return PlannedWay(find_way(graph, start, self.goals[goal], config.mode).poses)
+            goals = experiences_near(graph, self.goals[goal], config.tolerance)
+            return PlannedWay(find_way(graph, start, goals, config.mode).poses)
         except NoWay as error:
             return PlannedWay(None, DriveState.BLOCKED, str(error))
 

@@ -5,23 +5,19 @@ Pure: no clock, no devices. The estimate may come from any method; without one t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from robot.live.goal_config import GoalConfig
+from robot.live.legs import Leg, legs_of
 from tactile.base.se2 import compose, wrap
 from tactile.base.segments import line_distances
 
-DEVIATION, TURN_DEVIATION = 0.012, 0.3
-"""Largest deviation of a straight move from the way that it stands for, m and rad."""
-LONGEST_TURN = 2.5
-"""Largest turn of one move, rad: above half a turn its direction would be ambiguous."""
-TURN_LENGTH = 0.05
-"""Distance that a turn of 1 rad counts for along a way, m."""
-ALIGNED = 0.15
-"""Difference in heading at which a pose of the way is passed, rad."""
+STEADY = 0.2
+"""Difference in heading from that of a leg above which the robot turns, rad."""
 NEAR_WAY = 0.3
 """Length of the way ahead that contacts can block, m: more than the reach of the whiskers."""
 
@@ -79,7 +75,8 @@ class GoalDrive:
     Attributes:
         state: of the present goal, or the end. reason: of the last change. goal: number of the present goal.
         replans: new ways for it so far. target: [3] pose in the map to move to, None: rest. way: [K, 3] the
-            present way. obstacles: [n, 2] contacts found on ways, in the map, m.
+            present way. obstacles: [n, 2] contacts found on ways, in the map, m. off_way: largest distance from
+        the way, m.
     """
 
     def __init__(self, config: GoalConfig, planner: Planner, cell: float, count: int) -> None:
@@ -89,8 +86,9 @@ class GoalDrive:
         self.way: np.ndarray | None = None
         self.obstacles = np.zeros((0, 2))
         self._config, self._planner, self._count = config, planner, count
-        self._off_way = config.off_way * cell
-        self._next = self._aim = self._missing = self._touched = 0
+        self.off_way = config.off_way * cell
+        self._missing = self._touched = 0
+        self._legs: list[Leg] = []  # that are left
 
     @property
     def finished(self) -> bool:
@@ -112,7 +110,7 @@ class GoalDrive:
             return self._wait("no estimate")
         if self.way is None and not self._plan(sighting.pose):
             return self.state
-        if self._distance_to_way(sighting.pose) > self._off_way:
+        if self._distance_to_way(sighting.pose) > self.off_way:
             self.reason = "the estimate is off the way"
             if not self._replan(sighting.pose):
                 return self.state
@@ -150,9 +148,9 @@ class GoalDrive:
     def _plan(self, pose: np.ndarray) -> bool:
         """Plans a way; whether there is one."""
         made = self._planner.plan(pose, self.goal, self.obstacles)
-        self.way, self._next = made.poses, 0
+        self.way = made.poses
         if made.poses is not None:
-            self._aim = min(1, len(made.poses) - 1)
+            self._legs = legs_of(made.poses)
             return True
         if made.state is DriveState.LOST:
             self._wait(made.reason)
@@ -161,15 +159,17 @@ class GoalDrive:
         return False
 
     def _advance(self, pose: np.ndarray) -> DriveState:
-        way = self.way
-        assert way is not None
-        self._next = passed_poses(way, pose, self._next, self._aim, self._config.tolerance)
-        if self._next == len(way):
-            self.state, self.reason = DriveState.REACHED, ""
-            return self.state
+        while self._legs and is_passed(self._legs[0], pose, self._config.tolerance):
+            self._legs.pop(0)
         self.state, self.reason = DriveState.DRIVING, ""
-        self._aim = farthest_straight(way, pose, self._next)
-        self.target = way[self._aim]
+        if not self._legs:
+            self.state = DriveState.REACHED
+            return self.state
+        leg = self._legs[0]
+        if abs(wrap(leg.heading - pose[2])) > STEADY:
+            self.target = np.array([*pose[:2], leg.heading])
+        else:
+            self.target = np.array([*leg.end, pose[2]])
         return self.state
 
     def _is_blocked(self, sighting: Sighting) -> bool:
@@ -178,7 +178,7 @@ class GoalDrive:
         assert self.way is not None
         assert sighting.pose is not None
         points = points_in_map(sighting.pose, sighting.points)
-        line = way_ahead(self.way, sighting.pose, self._next)
+        line = line_ahead(self._legs, sighting.pose)
         near = line_distances(points, line) < self._config.standoff
         self._touched = self._touched + 1 if near.any() else 0
         if self._touched >= self._config.confirm:
@@ -187,43 +187,14 @@ class GoalDrive:
         return bool(near.any())
 
     def _distance_to_way(self, pose: np.ndarray) -> float:
-        assert self.way is not None
-        return float(line_distances(pose[None, :2], self.way[max(self._next - 1, 0) :, :2])[0])
+        line = [self._legs[0].start, *(leg.end for leg in self._legs)]
+        return float(line_distances(pose[None, :2], np.array(line))[0])
 
 
-def passed_poses(way: np.ndarray, pose: np.ndarray, start: int, aim: int, tolerance: float) -> int:
-    """Number of poses of the way [K, 3] that are passed, of which `start` were passed before.
-
-    Args:
-        aim: the pose that the robot moves to; later ones are not passed yet. tolerance: distance at which a
-            pose is passed, m; it must be `ALIGNED` too, except for the last one.
-    """
-    scale = np.array([1.0, 1.0, TURN_LENGTH])
-    off = scale * _apart(way[start : aim + 1], pose)
-    k = start + int(np.argmin(np.linalg.norm(off, axis=1)))
-    if k < aim and np.dot(scale * _apart(way[k + 1], way[k]), off[k - start]) < 0:
-        k += 1  # the robot is between the two
-    apart = _apart(way[k], pose)
-    near = np.hypot(apart[0], apart[1]) <= tolerance
-    return k + bool(near and (k == len(way) - 1 or abs(apart[2]) <= ALIGNED))
-
-
-def farthest_straight(way: np.ndarray, pose: np.ndarray, start: int) -> int:
-    """The farthest pose of the way from `start` on that a straight move from a pose reaches without leaving
-    the poses between by more than `DEVIATION` and `TURN_DEVIATION`."""
-    share = np.linspace(0.0, 1.0, 65)[:, None, None]
-    best = start
-    for end in range(start + 1, len(way)):
-        step = _apart(way[end], pose)
-        if abs(step[2]) > LONGEST_TURN:
-            break
-        off = _apart(way[start:end], pose + share * step)
-        near = np.hypot(off[..., 0], off[..., 1]) <= DEVIATION
-        near &= np.abs(off[..., 2]) <= TURN_DEVIATION
-        if not near.any(axis=0).all():
-            break
-        best = end
-    return best
+def is_passed(leg: Leg, pose: np.ndarray, tolerance: float) -> bool:
+    """Whether a pose is at the end of a leg, within the tolerance (m), or beyond it."""
+    step, left = leg.end - leg.start, leg.end - pose[:2]
+    return bool(np.hypot(*left) <= tolerance or step @ left < 0)
 
 
 def points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -232,15 +203,13 @@ def points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return compose(pose, np.column_stack([points, np.zeros(len(points))]))[:, :2]
 
 
-def way_ahead(way: np.ndarray, pose: np.ndarray, start: int) -> np.ndarray:
-    """[K, 2] the line from a pose over the poses of the way from `start` on, for `NEAR_WAY`."""
-    line = np.vstack([pose[None, :2], way[start:, :2]])
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    return line[: max(int(np.searchsorted(length, NEAR_WAY)) + 1, 2)]
-
-
-def _apart(poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """[..., 3] differences of poses to a pose, headings wrapped."""
-    apart = poses - pose
-    apart[..., 2] = wrap(apart[..., 2])
-    return apart
+def line_ahead(legs: Sequence[Leg], pose: np.ndarray) -> np.ndarray:
+    """[K, 2] the line from a pose over the ends of these legs, for `NEAR_WAY`."""
+    line = np.vstack([pose[None, :2], *(leg.end[None] for leg in legs)])
+    length = np.hypot(*np.diff(line, axis=0).T)
+    done = np.concatenate([[0.0], np.cumsum(length)])
+    count = int(np.searchsorted(done, NEAR_WAY))
+    if count < len(line):
+        share = (NEAR_WAY - done[count - 1]) / length[count - 1]
+        line[count] = line[count - 1] + share * (line[count] - line[count - 1])
+    return line[: count + 1]

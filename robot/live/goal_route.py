@@ -14,6 +14,8 @@ from robot.live.goal_drive import DriveState, GoalDrive, Sighting
 from robot.live.route import route_speed
 from tactile.base.se2 import between, compose, wrap
 
+GAIN = 0.15
+"""Share of the difference between estimate and expected pose that each whisk takes up."""
 SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
 
@@ -30,17 +32,20 @@ class SteeredArm(Protocol):
 class GoalRoute:
     """Moves the arm as a drive decides; without a target it halts the arm.
 
-    The map and the arm have frames of their own: the estimate of a whisk and the arm's pose in that whisk
-    give the motion between them, anew with each estimate.
+    The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
+    the pose to steer by is the arm's motion since the last whisk, corrected by the share `GAIN` of its
+    difference to the estimate. A difference of more than `jump` (m) is taken up at once: the robot is
+    elsewhere.
 
     Attributes:
-        drive: what decides. log: one entry for each goal that has ended.
+        drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
     """
 
-    def __init__(self, drive: GoalDrive, config: LiveConfig) -> None:
+    def __init__(self, drive: GoalDrive, config: LiveConfig, jump: float) -> None:
         self.drive = drive
-        self._placing, self._speed = config.arm.placing, route_speed(config)
-        self._seen: np.ndarray | None = None  # the last estimate
+        self.pose: np.ndarray | None = None
+        self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
+        self._arm_pose: np.ndarray | None = None  # in the whisk of that pose
         self._target: np.ndarray | None = None  # [3] by the arm
         self._sent: np.ndarray | None = None
 
@@ -48,12 +53,24 @@ class GoalRoute:
         """Takes the sighting of a whisk, and the arm's pose [3] in it."""
         if self.drive.state is DriveState.REACHED and not self.drive.finished:
             self.drive.next_goal()
-        state = self.drive.observe(sighting)
-        target, self._seen = self.drive.target, sighting.pose
+        if sighting.pose is not None:
+            self._correct(sighting.pose, arm_pose)
+            sighting = sighting._replace(pose=self.pose)
+        state, target = self.drive.observe(sighting), self.drive.target
         self._target = None
-        if target is not None and sighting.pose is not None:
-            self._target = compose(arm_pose, between(sighting.pose, target))
+        if target is not None and self.pose is not None:
+            self._target = compose(arm_pose, between(self.pose, target))
         return state
+
+    def _correct(self, estimate: np.ndarray, arm_pose: np.ndarray) -> None:
+        """Moves the pose with the arm and towards the estimate."""
+        pose = estimate
+        if self.pose is not None and self._arm_pose is not None:
+            expected = compose(self.pose, between(self._arm_pose, arm_pose))
+            apart = between(expected, estimate)
+            if np.hypot(apart[0], apart[1]) <= self._jump:
+                pose = compose(expected, GAIN * apart)
+        self.pose, self._arm_pose = pose, arm_pose
 
     def advance(self, arm: SteeredArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.
@@ -75,8 +92,8 @@ class GoalRoute:
             except TargetRefused:
                 if arm.fault is not None:
                     raise
-                assert self._seen is not None
-                self.drive.refuse(self._seen)
+                assert self.pose is not None
+                self.drive.refuse(self.pose)
                 self._target = None
         return False
 

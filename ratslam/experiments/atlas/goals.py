@@ -142,7 +142,7 @@ class ClosedLoop:
         goal = GoalConfig(map=self._made.file, to=(experience,))
         planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
         drive = GoalDrive(goal, planner, self._cell, 1)
-        route, first = GoalRoute(drive, self._live), len(self._arm.poses) - 1
+        route, first = GoalRoute(drive, self._live, drive.off_way), len(self._arm.poses) - 1
         whisks, detected = 0, -1
         while whisks < LONGEST and not route.advance(self._arm):
             route.see(*self._sight())
