@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from tactile.base.config import Settings
 
@@ -33,9 +33,11 @@ class GoalConfig(Settings):
     first one on."""
     off_way: PositiveFloat = 1.2
     """Distance of the estimate from the way above which a new way is planned, pose cells."""
+    coast: NonNegativeFloat = 0.3
+    """Way that the arm drives by its own motion while the method is lost, m; then the head rests."""
     patience: PositiveInt = 20
-    """Consecutive whisks without an estimate, or with one away from all experiences, after which the session
-    is lost; the head rests meanwhile."""
+    """Consecutive whisks at rest without an estimate, or with one away from all experiences, after which the
+    session is lost."""
     replans: NonNegativeInt = 5
     """Number of new ways for a goal, after which it counts as blocked."""
 

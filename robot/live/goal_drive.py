@@ -16,6 +16,8 @@ from robot.live.legs import Leg, legs_of
 from tactile.base.se2 import compose, wrap
 from tactile.base.segments import line_distances
 
+CORNER = 0.008
+"""Distance from the end of a leg at which the next one begins, m."""
 STEADY = 0.2
 """Difference in heading from that of a leg above which the robot turns, rad."""
 NEAR_WAY = 0.3
@@ -40,7 +42,7 @@ class Sighting(NamedTuple):
     """What is known after a whisk.
 
     Attributes:
-        pose: [3] estimate in the map (m, m, rad); None without one. points: [n, 2] contacts in base_link, m.
+        pose: [3] in the map (m, m, rad); None without an estimate. points: [n, 2] contacts in the map, m.
     """
 
     pose: np.ndarray | None
@@ -159,7 +161,9 @@ class GoalDrive:
         return False
 
     def _advance(self, pose: np.ndarray) -> DriveState:
-        while self._legs and is_passed(self._legs[0], pose, self._config.tolerance):
+        while self._legs and is_passed(
+            self._legs[0], pose, CORNER if len(self._legs) > 1 else self._config.tolerance
+        ):
             self._legs.pop(0)
         self.state, self.reason = DriveState.DRIVING, ""
         if not self._legs:
@@ -177,9 +181,8 @@ class GoalDrive:
         they are confirmed."""
         assert self.way is not None
         assert sighting.pose is not None
-        points = points_in_map(sighting.pose, sighting.points)
-        line = line_ahead(self._legs, sighting.pose)
-        near = line_distances(points, line) < self._config.standoff
+        points = sighting.points
+        near = line_distances(points, line_ahead(self._legs, sighting.pose)) < self._config.standoff
         self._touched = self._touched + 1 if near.any() else 0
         if self._touched >= self._config.confirm:
             self.reason = "a contact on the way"

@@ -10,12 +10,12 @@ from robot.drivers.outcome import Fault
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.config import LiveConfig
-from robot.live.goal_drive import DriveState, GoalDrive, Sighting
+from robot.live.goal_drive import DriveState, GoalDrive, Sighting, points_in_map
 from robot.live.route import route_speed
 from tactile.base.se2 import between, compose, wrap
 
-GAIN = 0.15
-"""Share of the difference between estimate and expected pose that each whisk takes up."""
+GAIN = 0.05
+"""Least share of the difference between estimate and expected pose that a whisk takes up."""
 SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
 
@@ -33,44 +33,62 @@ class GoalRoute:
     """Moves the arm as a drive decides; without a target it halts the arm.
 
     The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
-    the pose to steer by is the arm's motion since the last whisk, corrected by the share `GAIN` of its
-    difference to the estimate. A difference of more than `jump` (m) is taken up at once: the robot is
-    elsewhere.
+    the pose to steer by moves with the arm and takes up a share of its difference to each estimate: 1 / n in
+    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) is taken
+    up at once: the robot is elsewhere. Without estimates the arm's motion alone leads on for `coast` (m).
 
     Attributes:
         drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
     """
 
-    def __init__(self, drive: GoalDrive, config: LiveConfig, jump: float) -> None:
+    def __init__(self, drive: GoalDrive, config: LiveConfig, jump: float, coast: float) -> None:
         self.drive = drive
         self.pose: np.ndarray | None = None
         self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
+        self._coast, self._unseen = coast, 0.0  # way without an estimate, m
+        self._count = 0  # whisks since the last jump
         self._arm_pose: np.ndarray | None = None  # in the whisk of that pose
         self._target: np.ndarray | None = None  # [3] by the arm
         self._sent: np.ndarray | None = None
 
-    def see(self, sighting: Sighting, arm_pose: np.ndarray) -> DriveState:
-        """Takes the sighting of a whisk, and the arm's pose [3] in it."""
+    def see(
+        self, estimate: np.ndarray | None, points: np.ndarray, arm_pose: np.ndarray, arm_now: np.ndarray
+    ) -> DriveState:
+        """Takes the result of a whisk.
+
+        Args:
+            estimate: [3] of the whisk in the map; None without one. points: [n, 2] contacts in base_link, m.
+            arm_pose, arm_now: [3] poses by the arm, in that whisk and now.
+        """
         if self.drive.state is DriveState.REACHED and not self.drive.finished:
             self.drive.next_goal()
-        if sighting.pose is not None:
-            self._correct(sighting.pose, arm_pose)
-            sighting = sighting._replace(pose=self.pose)
-        state, target = self.drive.observe(sighting), self.drive.target
         self._target = None
-        if target is not None and self.pose is not None:
-            self._target = compose(arm_pose, between(self.pose, target))
+        self._move_with_arm(arm_pose)
+        if estimate is not None:
+            self._correct(estimate)
+        if self.pose is None or self._unseen > self._coast:
+            return self.drive.observe(Sighting(None, np.zeros((0, 2))))
+        now = compose(self.pose, between(arm_pose, arm_now))
+        state = self.drive.observe(Sighting(now, points_in_map(self.pose, points)))
+        if self.drive.target is not None:
+            self._target = compose(arm_now, between(now, self.drive.target))
         return state
 
-    def _correct(self, estimate: np.ndarray, arm_pose: np.ndarray) -> None:
-        """Moves the pose with the arm and towards the estimate."""
-        pose = estimate
+    def _move_with_arm(self, arm_pose: np.ndarray) -> None:
         if self.pose is not None and self._arm_pose is not None:
-            expected = compose(self.pose, between(self._arm_pose, arm_pose))
-            apart = between(expected, estimate)
-            if np.hypot(apart[0], apart[1]) <= self._jump:
-                pose = compose(expected, GAIN * apart)
-        self.pose, self._arm_pose = pose, arm_pose
+            step = between(self._arm_pose, arm_pose)
+            self.pose = compose(self.pose, step)
+            self._unseen += float(np.hypot(step[0], step[1]))
+        self._arm_pose = arm_pose
+
+    def _correct(self, estimate: np.ndarray) -> None:
+        """Moves the pose towards the estimate."""
+        self._unseen, self._count = 0.0, self._count + 1
+        apart = np.zeros(3) if self.pose is None else between(self.pose, estimate)
+        if self.pose is None or np.hypot(apart[0], apart[1]) > self._jump:
+            self.pose, self._count = estimate, 1
+        else:
+            self.pose = compose(self.pose, max(GAIN, 1 / self._count) * apart)
 
     def advance(self, arm: SteeredArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.

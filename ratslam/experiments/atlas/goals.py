@@ -19,7 +19,7 @@ from ratslam.pipeline.slam import Slam
 from ratslam.pipeline.source import open_source
 from robot.live.config import LiveConfig
 from robot.live.goal_config import GoalConfig
-from robot.live.goal_drive import DriveState, GoalDrive, Sighting
+from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute
 from robot.live.virtual_arm import VirtualArm
 from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
@@ -142,7 +142,7 @@ class ClosedLoop:
         goal = GoalConfig(map=self._made.file, to=(experience,))
         planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
         drive = GoalDrive(goal, planner, self._cell, 1)
-        route, first = GoalRoute(drive, self._live, drive.off_way), len(self._arm.poses) - 1
+        route, first = GoalRoute(drive, self._live, drive.off_way, goal.coast), len(self._arm.poses) - 1
         whisks, detected = 0, -1
         while whisks < LONGEST and not route.advance(self._arm):
             route.see(*self._sight())
@@ -161,12 +161,14 @@ class ClosedLoop:
             detected,
         )  # fmt: skip
 
-    def _sight(self) -> tuple[Sighting, np.ndarray]:
+    def _sight(self) -> tuple[np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]:
+        """Estimate and contacts of the next whisk, and the arm's poses in it and after it."""
         sample = self._arm.whisk()
         seen = self._frontend.observe(sample.reading)
         estimate = self._slam.step(seen)
         assert sample.truth is not None
-        return Sighting(None if estimate.lost else estimate.pose, seen.point[seen.contact]), sample.truth
+        pose = None if estimate.lost else estimate.pose
+        return pose, seen.point[seen.contact], sample.truth, self.pose
 
 
 def drive_pairs(loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator) -> Iterator[Drive]:
