@@ -16,6 +16,13 @@ from tactile.base.se2 import between, compose, wrap
 
 GAIN = 0.05
 """Least share of the difference between estimate and expected pose that a whisk takes up."""
+OUTLIER = np.array([0.03, 0.03, 0.1])
+"""Largest difference (m, m, rad) that is taken up; what exceeds it is an outlier (Huber 1964). Odometry with the
+errors of a mobile robot is wrong by up to 0.6 rad after a turn, until recall corrects it."""
+SETTLED = 5
+"""Whisks after which differences are limited so."""
+MOVED = 5
+"""Consecutive whisks elsewhere after which the robot has been moved."""
 SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
 
@@ -34,8 +41,8 @@ class GoalRoute:
 
     The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
     the pose to steer by moves with the arm and takes up a share of its difference to each estimate: 1 / n in
-    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) is taken
-    up at once: the robot is elsewhere. Without estimates the arm's motion alone leads on for `coast` (m).
+    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in `MOVED`
+    whisks is taken up at once: the robot is elsewhere. Without estimates the arm's motion alone leads on for `coast` (m).
 
     Attributes:
         drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
@@ -46,7 +53,7 @@ class GoalRoute:
         self.pose: np.ndarray | None = None
         self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
         self._coast, self._unseen = coast, 0.0  # way without an estimate, m
-        self._count = 0  # whisks since the last jump
+        self._count = self._elsewhere = 0  # whisks since the last jump; of them in a row elsewhere
         self._arm_pose: np.ndarray | None = None  # in the whisk of that pose
         self._target: np.ndarray | None = None  # [3] by the arm
         self._sent: np.ndarray | None = None
@@ -85,10 +92,13 @@ class GoalRoute:
         """Moves the pose towards the estimate."""
         self._unseen, self._count = 0.0, self._count + 1
         apart = np.zeros(3) if self.pose is None else between(self.pose, estimate)
-        if self.pose is None or np.hypot(apart[0], apart[1]) > self._jump:
-            self.pose, self._count = estimate, 1
-        else:
-            self.pose = compose(self.pose, max(GAIN, 1 / self._count) * apart)
+        self._elsewhere = self._elsewhere + 1 if np.hypot(apart[0], apart[1]) > self._jump else 0
+        if self.pose is None or self._elsewhere == MOVED:
+            self.pose, self._count, self._elsewhere = estimate, 1, 0
+            return
+        share = max(GAIN, 1 / self._count)
+        most = OUTLIER if self._count > SETTLED else np.full(3, np.inf)
+        self.pose = compose(self.pose, share * np.clip(apart, -most, most))
 
     def advance(self, arm: SteeredArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.

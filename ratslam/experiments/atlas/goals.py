@@ -120,6 +120,7 @@ class ClosedLoop:
         self._frontend = Frontend(made.config.touch)
         self._arm = VirtualArm(self._live, walls_of(made), made.end)
         self._cell = made.config.pose_cells.cell_size
+        self._route: GoalRoute | None = None
         self.experiences: networkx.DiGraph = self._slam.map.graph()
         self.poses: list[np.ndarray] = []
 
@@ -142,7 +143,10 @@ class ClosedLoop:
         goal = GoalConfig(map=self._made.file, to=(experience,))
         planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
         drive = GoalDrive(goal, planner, self._cell, 1)
-        route, first = GoalRoute(drive, self._live, drive.off_way, goal.coast), len(self._arm.poses) - 1
+        if self._route is None:
+            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast)
+        self._route.drive, route = drive, self._route
+        first = len(self._arm.poses) - 1
         whisks, detected = 0, -1
         while whisks < LONGEST and not route.advance(self._arm):
             route.see(*self._sight())
