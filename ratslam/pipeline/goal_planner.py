@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ratslam.atlas.contact_alignment import ContactCloud
 from ratslam.atlas.route import (
     NoWay,
     Travel,
@@ -17,10 +17,20 @@ from ratslam.atlas.route import (
     position,
     travel_graph,
 )
+from ratslam.core.backend import Map
+from ratslam.keyframes.appearance import WhiskerAppearance
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.recall.whisker_likelihood import level_heights
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, PlannedWay
+from robot.live.goal_route import Aligner, keep_pose
 from robot.world.head_trajectory import MotionConfig
 from tactile.base.errors import InputError
+from tactile.base.se2 import compose
+from tactile.base.types import Observation
+from tactile.features.whisker_image import ImageConfig
+from tactile.whiskers.contact_points import image_points
+from tactile.whiskers.head_geometry import Head
 
 if TYPE_CHECKING:
     import networkx
@@ -65,6 +75,27 @@ class GoalPlanner:
             return PlannedWay(find_way(graph, start, goals, config.mode).poses)
         except NoWay as error:
             return PlannedWay(None, DriveState.BLOCKED, str(error))
+
+
+def contact_aligner(made: Map, image: ImageConfig, head: Head) -> Aligner:
+    """Aligns contacts with those of the keyframes of a map; none if the map has no whisker images."""
+    if not isinstance(made, KeyframeMap) or not isinstance(made.keyframes().appearance, WhiskerAppearance):
+        return keep_pose
+    poses = made.solution().fit.poses
+    levels, _ = made.keyframes().appearance.stored(np.arange(len(poses)))
+    pixels = level_heights(levels[:, : len(head.length)])
+    points, there = image_points(head, pixels, image.tallest)
+    placed = compose(poses[:, None], np.concatenate([points, np.zeros((*there.shape, 1))], axis=-1))
+    return ContactCloud(placed[there][:, :2]).align
+
+
+def felt_points(observation: Observation, image: ImageConfig, head: Head) -> np.ndarray:
+    """[n, 2] contact points of a whisker image in base_link, m."""
+    pixels = observation.view[..., 0].reshape(-1)
+    if len(pixels) != len(head.length) or not observation.view_seen:
+        return np.asarray(observation.point)[observation.contact]
+    points, there = image_points(head, pixels, image.tallest)
+    return points[there & observation.alive]
 
 
 def experience_at(

@@ -81,6 +81,13 @@ def pixel_levels(view: Array, alive: Array) -> Array:
     return alive * height + (1 - alive) * DEAD
 
 
+def level_heights(level: np.ndarray) -> np.ndarray:
+    """Pixel values in 0..1 of levels [...]: the middle of each, 1 for the highest; 0 without contact and for
+    dead pixels."""
+    value = np.where(level == HEIGHTS, 1.0, (level - 0.5) / HEIGHTS)
+    return np.where((level > 0) & (level <= HEIGHTS), value, 0.0)
+
+
 class Background(NamedTuple):
     """Distribution of pixels over all places.
 

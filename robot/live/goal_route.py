@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +22,8 @@ OUTLIER = np.array([0.03, 0.03, 0.1])
 errors of a mobile robot is wrong by up to 0.6 rad after a turn, until recall corrects it."""
 SETTLED = 5
 """Whisks after which differences are limited so."""
+RECENT = 8
+"""Whisks whose contacts are aligned with those of the map."""
 MOVED = 5
 """Consecutive whisks elsewhere after which the robot has been moved."""
 SAME, SAME_TURN = 0.005, 0.03
@@ -36,6 +39,16 @@ class SteeredArm(Protocol):
     def halt(self) -> None: ...
 
 
+Aligner = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""The pose near a pose [3] in the map from which contacts [n, 2] in base_link fit those of the map."""
+
+
+def keep_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The aligner of a map without contacts."""
+    del points
+    return pose
+
+
 class GoalRoute:
     """Moves the arm as a drive decides; without a target it halts the arm.
 
@@ -44,14 +57,21 @@ class GoalRoute:
     the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in `MOVED`
     whisks is taken up at once: the robot is elsewhere. Without estimates the arm's motion alone leads on for `coast` (m).
 
+    Args:
+        align: aligns contacts of the last whisks with those of the map, which recall does not do.
+
     Attributes:
         drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
     """
 
-    def __init__(self, drive: GoalDrive, config: LiveConfig, jump: float, coast: float) -> None:
+    def __init__(
+        self, drive: GoalDrive, config: LiveConfig, jump: float, coast: float, align: Aligner = keep_pose
+    ) -> None:
         self.drive = drive
         self.pose: np.ndarray | None = None
         self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
+        self._align = align
+        self._recent: list[tuple[np.ndarray, np.ndarray]] = []  # arm's pose and contacts of the last whisks
         self._coast, self._unseen = coast, 0.0  # way without an estimate, m
         self._count = self._elsewhere = 0  # whisks since the last jump; of them in a row elsewhere
         self._arm_pose: np.ndarray | None = None  # in the whisk of that pose
@@ -73,6 +93,9 @@ class GoalRoute:
         self._move_with_arm(arm_pose)
         if estimate is not None:
             self._correct(estimate)
+        self._recent = [*self._recent, (arm_pose, points)][-RECENT:]
+        if self.pose is not None:
+            self.pose = self._align(self.pose, self._recent_points(arm_pose))
         if self.pose is None or self._unseen > self._coast:
             return self.drive.observe(Sighting(None, np.zeros((0, 2))))
         now = compose(self.pose, between(arm_pose, arm_now))
@@ -80,6 +103,11 @@ class GoalRoute:
         if self.drive.target is not None:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
+
+    def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
+        """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
+        seen = [points_in_map(between(arm_pose, before), points) for before, points in self._recent]
+        return np.concatenate(seen)
 
     def _move_with_arm(self, arm_pose: np.ndarray) -> None:
         if self.pose is not None and self._arm_pose is not None:

@@ -14,7 +14,7 @@ import networkx
 import numpy as np
 
 from ratslam.config.run_config import RunConfig, load_config
-from ratslam.pipeline.goal_planner import GoalPlanner
+from ratslam.pipeline.goal_planner import GoalPlanner, contact_aligner, felt_points
 from ratslam.pipeline.slam import Slam
 from ratslam.pipeline.source import open_source
 from robot.live.config import LiveConfig
@@ -121,6 +121,8 @@ class ClosedLoop:
         self._arm = VirtualArm(self._live, walls_of(made), made.end)
         self._cell = made.config.pose_cells.cell_size
         self._route: GoalRoute | None = None
+        self._head = ur10_head(made.config.touch.head)
+        self._align = contact_aligner(self._slam.map, made.config.touch.image, self._head)
         self.experiences: networkx.DiGraph = self._slam.map.graph()
         self.poses: list[np.ndarray] = []
 
@@ -144,7 +146,7 @@ class ClosedLoop:
         planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
         drive = GoalDrive(goal, planner, self._cell, 1)
         if self._route is None:
-            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast)
+            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast, self._align)
         self._route.drive, route = drive, self._route
         first = len(self._arm.poses) - 1
         whisks, detected = 0, -1
@@ -172,7 +174,8 @@ class ClosedLoop:
         estimate = self._slam.step(seen)
         assert sample.truth is not None
         pose = None if estimate.lost else estimate.pose
-        return pose, seen.point[seen.contact], sample.truth, self.pose
+        points = felt_points(seen, self._made.config.touch.image, self._head)
+        return pose, points, sample.truth, self.pose
 
 
 def drive_pairs(loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator) -> Iterator[Drive]:

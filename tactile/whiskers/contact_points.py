@@ -1,0 +1,29 @@
+"""Contact points from a whisker image and the height of the walls, without the noisy position along the shaft."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile.whiskers.head_geometry import Head
+
+
+def image_points(head: Head, image: np.ndarray, tallest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where whiskers touched walls of a known height.
+
+    A pixel is the height of the tip at first contact as a share of `tallest`, which gives the whisker's angle.
+    The contact is where the shaft crosses the height of the walls, or the tip if it is above.
+
+    Args:
+        image: [..., W] pixels in 0..1, 0 without contact. tallest: height of pixel value 1 and of the walls, m.
+
+    Returns:
+        [..., W, 2] points in base_link, m, and [..., W] bool, there is one.
+    """
+    touched = image > 0
+    tip = image * tallest
+    cos = np.clip((head.base[:, 2] - tip) / head.length, 0.0, 1.0)
+    radius = np.hypot(head.base[:, 0], head.base[:, 1])
+    tangent = np.sqrt(1 - cos**2) / np.maximum(cos, 1e-6)
+    reach = radius + (head.base[:, 2] - np.maximum(tip, tallest)) * tangent
+    outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
+    return reach[..., None] * outwards, touched
