@@ -20,6 +20,8 @@ CORNER = 0.008
 """Distance from the end of a leg at which the next one begins, m."""
 STEADY = 0.2
 """Difference in heading from that of a leg above which the robot turns, rad."""
+JOINED = 0.15
+"""Length of the beginning of a way in which the robot may join it, m."""
 NEAR_WAY = 0.3
 """Length of the way ahead that contacts can block, m: more than the reach of the whiskers."""
 
@@ -152,7 +154,7 @@ class GoalDrive:
         made = self._planner.plan(pose, self.goal, self.obstacles)
         self.way = made.poses
         if made.poses is not None:
-            self._legs = legs_of(made.poses)
+            self._legs = legs_of(join_way(made.poses, pose))
             return True
         if made.state is DriveState.LOST:
             self._wait(made.reason)
@@ -198,6 +200,17 @@ def is_passed(leg: Leg, pose: np.ndarray, tolerance: float) -> bool:
     """Whether a pose is at the end of a leg, within the tolerance (m), or beyond it."""
     step, left = leg.end - leg.start, leg.end - pose[:2]
     return bool(np.hypot(*left) <= tolerance or step @ left < 0)
+
+
+def join_way(way: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """The way [K, 3] from a pose [3] beside its beginning on, without the detour over its first poses."""
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
+    count = int(np.searchsorted(far, JOINED, side="right"))
+    if count < 2:
+        return np.vstack([[*pose[:2], way[0, 2]], way])
+    off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
+    first = int(np.argmin(off)) + 1
+    return np.vstack([[*pose[:2], way[first, 2]], way[first:]])
 
 
 def points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from robot.world.scene import Scene, make_scene
 from robot.world.walls import Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, fit_rigid_motion
+from tactile.base.segments import segment_distances
 from tactile.frontend import Frontend
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
@@ -192,7 +193,7 @@ def drive_blocked(
         while True:
             goal = draw_goal(loop, made, random)
             cells = cells_between(made.scene.loop, loop.pose[:2], loop.place_of(goal))
-            if len(cells) >= 3:  # the robot and the goal are not in the cells beside the wall
+            if len(cells) >= 2:  # the wall is between centres that the way passes
                 break
         middle = len(cells) // 2
         loop.put_walls(walls_of(made, (cells[middle - 1], cells[middle])))
@@ -221,39 +222,32 @@ def walls_of(made: DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surrou
     return Surroundings(wall_boxes(maze, heights, plan.maze.heights), made.scene.surroundings.head)
 
 
-def cell_of(place: np.ndarray) -> Cell:
-    """The cell of a point, m."""
-    x, y = np.floor(place / NEAREST).astype(int)
-    return int(x), int(y)
-
-
 def _driven_graph(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> networkx.Graph:
-    """Cells of the loop, joined in its order, with two points joined to their cells and the next ones."""
+    """Cells of the loop, joined in its order, with two points joined to both ends of the nearest link."""
     links = list(zip(loop, [*loop[1:], loop[0]], strict=True))
+    ends = np.array([[cell_centre(cell), cell_centre(other)] for cell, other in links])
     graph = networkx.Graph()
-    for cell, other in links:
-        graph.add_edge(cell, other, length=float(np.hypot(*(cell_centre(cell) - cell_centre(other)))))
-    ends = {name: (cell_of(place), place) for name, place in (("from", a), ("to", b))}
-    for name, (cell, place) in ends.items():
-        for near in [cell, *graph[cell]] if name not in graph else []:
-            if isinstance(near, tuple):
-                graph.add_edge(name, near, length=float(np.hypot(*(cell_centre(near) - place))))
-    if ends["from"][0] == ends["to"][0] or graph.has_edge(ends["from"][0], ends["to"][0]):
+    for (cell, other), (p, q) in zip(links, ends, strict=True):
+        graph.add_edge(cell, other, length=float(np.hypot(*(p - q))))
+    nearest = [int(np.argmin(segment_distances(point, ends[:, 0], ends[:, 1]))) for point in (a, b)]
+    for name, point, link in zip(("from", "to"), (a, b), nearest, strict=True):
+        for cell in links[link]:
+            graph.add_edge(name, cell, length=float(np.hypot(*(cell_centre(cell) - point))))
+    if nearest[0] == nearest[1]:
         graph.add_edge("from", "to", length=float(np.hypot(*(a - b))))
     return graph
 
 
 def shortest_driven(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> float:
-    """Length of the shortest way between two points [2] over the cells of the loop, m: from centre to centre,
-    straight within two joined cells."""
+    """Length of the shortest way between two points [2] over the cells of the loop, m: along the lines between
+    their centres, which were driven."""
     return float(networkx.dijkstra_path_length(_driven_graph(loop, a, b), "from", "to", weight="length"))
 
 
 def cells_between(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> list[Cell]:
-    """The cells of that way, in order, with those of the points."""
+    """The cells whose centres that way passes, in order."""
     way = networkx.dijkstra_path(_driven_graph(loop, a, b), "from", "to", weight="length")
-    cells = [cell_of(a), *way[1:-1], cell_of(b)]
-    return [cell for k, cell in enumerate(cells) if cell not in cells[:k]]
+    return way[1:-1]
 
 
 def clearance(walls: Walls, path: np.ndarray) -> float:
