@@ -73,7 +73,7 @@ def travel_graph(
     """
     import networkx  # slow to import
 
-    graph = networkx.Graph()
+    graph: networkx.Graph = networkx.Graph()
     for place, data in sorted(experiences.nodes(data=True)):
         graph.add_node(place, x=data["x"], y=data["y"], heading=data["heading"])
     for a, b, data in experiences.edges(data=True):
@@ -116,7 +116,8 @@ def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode
             raise KeyError(f"the map has no experience {place}")
     # From the goals: the edges have no direction.
     weight = "expected" if mode == "time" else "seconds"
-    left, ways = networkx.multi_source_dijkstra(graph, set(goals), weight=weight)
+    left: dict[int, float]
+    left, ways = networkx.multi_source_dijkstra(graph, set(goals), weight=weight)  # type: ignore[assignment]
     if start not in left:
         raise NoWay(_reason(graph, start, goals[0]))
     return describe_way(graph, ways[start][::-1] if mode == "time" else _descend(graph, start, left))

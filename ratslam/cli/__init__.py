@@ -16,6 +16,7 @@ from ratslam.cli import (
     localise,
     look,
     maps,
+    path,
     reproduce,
     run,
     studies,
@@ -86,6 +87,6 @@ def build_parser() -> Program:
     """The parser of the whole program."""
     parser = Program(prog="ratslam", description=DESCRIPTION)
     parser.commands = Commands(parser)
-    for module in (run, live, localise, maps, look, doctor, fit, studies, reproduce, files, check, tools):
+    for module in (run, live, localise, maps, path, look, doctor, fit, studies, reproduce, files, check, tools):
         module.add_commands(parser.commands)
     return parser

@@ -75,7 +75,7 @@ def _live(arguments: argparse.Namespace) -> int:
     _print(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED
-    return 0 if ended.outcome is SessionOutcome.COMPLETE else INPUT_ERROR
+    return 0 if ended.outcome.planned else INPUT_ERROR
 
 
 def _emulate(arguments: argparse.Namespace) -> int:

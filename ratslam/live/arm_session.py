@@ -10,10 +10,22 @@ from typing import Any
 import numpy as np
 
 from ratslam.config.run_config import RunConfig
+from ratslam.live.goal_steering import GoalSteering, plan_goals
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
+from robot.drivers.outcome import SessionOutcome
+from robot.live.goal_route import GoalRoute
 from robot.live.rig import Rig
-from robot.live.route import approach_route, check_targets, descent_route, main_route, plan_path, plan_scene
+from robot.live.route import (
+    ArmRoute,
+    approach_route,
+    check_targets,
+    descent_route,
+    main_route,
+    plan_path,
+    plan_scene,
+    whole_path,
+)
 from robot.live.selftest import find_devices, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.sources.source_info import SourceInfo
@@ -34,28 +46,45 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
     assert config.live is not None
     path = plan_path(config.live, ur10_head(config.touch.head))
     check_targets(config.live, path)
-    return lambda stopped: ArmSession(config, path, directory, stopped)
+    goals = None if config.live.plan.goal is None else plan_goals(config)
+    return lambda stopped: ArmSession(config, path, directory, stopped, goals)
 
 
 class ArmSession:
     """The arm's part of a session (`ratslam.live.live_robot.LiveRobot`).
 
     Args:
-        path: the route. stopped: whether the operator has requested the end.
+        path: the route. stopped: whether the operator has requested the end. goals: the route to goals, if there
+            are any.
     """
 
     unit = "whisk"
 
     def __init__(
-        self, config: RunConfig, path: HeadPath, directory: Path, stopped: Callable[[], bool]
+        self,
+        config: RunConfig,
+        path: HeadPath,
+        directory: Path,
+        stopped: Callable[[], bool],
+        goals: GoalRoute | None = None,
     ) -> None:
         assert config.live is not None
         self._config, self._path = config, path
         self.rig = Rig(config.live, config.touch.head, stopped)
-        self.job = mapping_job(config, path, directory)
-        self.total = config.live.whisks or ceil(path.duration * config.live.plan.whisking.rate)
+        self.job = mapping_job(config, directory)
+        self.total = config.live.whisks or (
+            None if goals else ceil(path.duration * config.live.plan.whisking.rate)
+        )
+        self._goals = goals
+        self._steering: GoalSteering | None = None
         self._whisks: list[WhiskReport] = []
         self._dropped = self._lost = 0
+
+    @property
+    def end(self) -> SessionOutcome:
+        """The outcome of a session that ends as planned."""
+        steered = self._steering is not None and self._steering.route.drive.finished
+        return SessionOutcome.REACHED if steered else SessionOutcome.COMPLETE
 
     @property
     def count(self) -> int:
@@ -80,25 +109,34 @@ class ArmSession:
             self._dropped, self._lost = self._dropped + (not whisk.seen), self._lost + whisk.missing
             late = f"late {1e3 * whisk.lateness:.0f} ms"
             lost = f"{self._lost} samples lost, {self._dropped} images dropped"
-            tell(f"{mapper_status(mapper)}{late}, {lost}")
+            steering = self._steering.status() if self._steering else ""
+            tell(f"{mapper_status(mapper)}{steering}{late}, {lost}")
 
-        run_whisk_loop(self.rig, main_route(self.rig.config, self._path), mapper, count)
+        route: ArmRoute = main_route(self.rig.config, self._path)
+        if self._goals is not None:
+            route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._whisks)
+        run_whisk_loop(self.rig, route, mapper, count)
+        fault = self._steering and self._steering.fault()
+        if fault:
+            raise fault
 
     def report(self) -> dict[str, Any]:
         return {
             "dropped": self._dropped,
             "missing": self._lost,
+            **({} if self._steering is None else {"goals": self._steering.ends}),
             "lateness_s": quantiles([whisk.lateness for whisk in self._whisks]),
             "state_age_s": quantiles(self.rig.state_ages),
             "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
         }
 
 
-def mapping_job(config: RunConfig, path: HeadPath, directory: Path) -> MappingJob:
+def mapping_job(config: RunConfig, directory: Path) -> MappingJob:
     """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     head = ur10_head(config.touch.head)
     plan = config.live.plan
+    path = whole_path(config.live, head)
     rate = plan.whisking.rate
     rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
     return MappingJob(
@@ -117,6 +155,7 @@ def mapping_job(config: RunConfig, path: HeadPath, directory: Path) -> MappingJo
         len(head.length),
         rate,
         float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
+        start=None if plan.goal is None else plan.goal.map,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from ratslam.config.run_config import RunConfig
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
+from robot.drivers.outcome import SessionOutcome
 from robot.live.create_loop import MotionReport, run_create_loop
 from robot.live.create_rig import CreateRig
 from robot.live.create_selftest import find_devices, start_and_check
@@ -48,6 +49,7 @@ class CreateSession:
         stopped: whether the operator has requested the end.
     """
 
+    end = SessionOutcome.COMPLETE
     unit = "report"
 
     def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:

@@ -74,6 +74,11 @@ class LiveRobot(Protocol):
         """Readings passed on so far."""
         ...
 
+    @property
+    def end(self) -> SessionOutcome:
+        """The outcome of a session that ends as planned."""
+        ...
+
     def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> Calibration | None:
         """Finds and tests the devices and waits for the mapper; returns the head's calibration, if any."""
         ...

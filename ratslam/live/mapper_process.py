@@ -24,14 +24,19 @@ import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
+from ratslam.core.session import Step
 from robot.drivers.process_priority import step_back
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
+from tactile.base.types import Observation
 from tactile.features.calibration import Calibration
+from tactile.frontend import TouchConfig
+from tactile.whiskers.head_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
+NO_POINTS = np.zeros((0, 2))
 FINISH_TIMEOUT = 120.0
 """Time limit of scoring and plotting, s."""
 
@@ -44,7 +49,7 @@ class MappingJob(NamedTuple):
             the calibration, which follows.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.
-        view: target of a live view, or None.
+        view: target of a live view, or None. start: map to go on from, or None.
     """
 
     config: RunConfig
@@ -55,6 +60,7 @@ class MappingJob(NamedTuple):
     rate_hz: float
     extent_m: float
     view: str | None = None
+    start: Path | None = None
 
 
 class MappedSample(NamedTuple):
@@ -63,7 +69,8 @@ class MappedSample(NamedTuple):
     Attributes:
         number: of the sample; a front end may add the motion of one to the next, which then has no result.
             pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
-            name. seconds: computing time. doubt: see `ratslam.core.session.Step`.
+            name. seconds: computing time. doubt: see `ratslam.core.session.Step`. lost: whether the method has lost
+            track of the position. points: [n, 2] contacts in base_link, m.
     """
 
     number: int
@@ -72,6 +79,8 @@ class MappedSample(NamedTuple):
     action: str
     seconds: float
     doubt: float = np.nan
+    lost: bool = False
+    points: np.ndarray = NO_POINTS
 
 
 class Mapper:
@@ -266,9 +275,9 @@ def run_mapper(line: Connection) -> None:
 
 def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
-    from ratslam.core.types import Action
     from ratslam.pipeline.build_session import build_session
     from ratslam.pipeline.runner import open_runner
+    from ratslam.pipeline.saved_map import read_map
     from ratslam.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
@@ -281,6 +290,8 @@ def _map(line: Connection) -> None:
         blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
         )
+        if job.start is not None:
+            read_map(job.start).restore(session)
         session.warm(blank)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
@@ -292,14 +303,23 @@ def _map(line: Connection) -> None:
             line.send(True)
             for sample in source:
                 (step,) = runner.process([sample])
-                action = Action(int(step.estimate.action)).name.lower()
                 took = time.monotonic() - fed.received
-                place = int(step.estimate.place)
-                _send(
-                    line, MappedSample(fed.count - 1, np.asarray(step.pose), place, action, took, step.doubt)
-                )
+                _send(line, _mapped_sample(fed.count - 1, sample.reading, step, config.touch, took))
             if runner.session.steps:
                 _send(line, runner.finish(fed.interrupted))
+
+
+def _mapped_sample(
+    number: int, observed: Observation, step: Step, touch: TouchConfig, seconds: float
+) -> MappedSample:
+    from ratslam.core.types import Action
+    from ratslam.pipeline.goal_planner import felt_points
+
+    estimate = step.estimate
+    return MappedSample(
+        number, np.asarray(step.pose), int(estimate.place), Action(int(estimate.action)).name.lower(), seconds,
+        step.doubt, bool(estimate.lost), felt_points(observed, touch.image, ur10_head(touch.head)),
+    )  # fmt: skip
 
 
 def _send(line: Connection, message: Any) -> None:

@@ -67,14 +67,14 @@ def run_live_session(
                 armed(directory)
                 with open_recorder(robot.job, calibration) as rig.recorder:
                     _run(robot, mapper)
-                fault = Fault(SessionOutcome.COMPLETE, f"{robot.count} {robot.unit}s", time.monotonic())
+                fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
             except SessionFault as error:
                 fault = error.fault
             except OperatorStop:
                 done = f"after {robot.count} {robot.unit}s"
                 fault = Fault(SessionOutcome.INTERRUPTED, done, time.monotonic())
             report = _report(fault, robot, mapper, rig.rest())
-        card = mapper.finish(fault.outcome is not SessionOutcome.COMPLETE) if robot.count else None
+        card = mapper.finish(not fault.outcome.planned) if robot.count else None
     with suppress(OSError):  # a full disk has been reported
         (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return fault, card

@@ -79,14 +79,21 @@ class GoalPlanner:
 
 def contact_aligner(made: Map, image: ImageConfig, head: Head) -> Aligner:
     """Aligns contacts with those of the keyframes of a map; none if the map has no whisker images."""
+    points = felt_walls(made, image, head)
+    return ContactCloud(points).align if len(points) else keep_pose
+
+
+def felt_walls(made: Map, image: ImageConfig, head: Head) -> np.ndarray:
+    """[n, 2] contact points of the keyframes of a map, m; none if it has no whisker images of this head."""
     if not isinstance(made, KeyframeMap) or not isinstance(made.keyframes().appearance, WhiskerAppearance):
-        return keep_pose
+        return np.zeros((0, 2))
     poses = made.solution().fit.poses
     levels, _ = made.keyframes().appearance.stored(np.arange(len(poses)))
-    pixels = level_heights(levels[:, : len(head.length)])
-    points, there = image_points(head, pixels, image.tallest)
+    if levels.shape[1] < len(head.length):
+        return np.zeros((0, 2))
+    points, there = image_points(head, level_heights(levels[:, : len(head.length)]), image.tallest)
     placed = compose(poses[:, None], np.concatenate([points, np.zeros((*there.shape, 1))], axis=-1))
-    return ContactCloud(placed[there][:, :2]).align
+    return placed[there][:, :2]
 
 
 def felt_points(observation: Observation, image: ImageConfig, head: Head) -> np.ndarray:

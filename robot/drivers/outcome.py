@@ -10,6 +10,9 @@ class SessionOutcome(Enum):
     """How a live session ended; the value tells the operator what to do."""
 
     COMPLETE = "nothing to do"
+    REACHED = "the robot is at its last goal"
+    BLOCKED = "no way to the goal is left: clear the way, or map it again"
+    LOST = "the robot does not know where it is: start again where the map ended"
     INTERRUPTED = "stopped by the operator; `run` on the recording maps the recorded part"
     REFUSED = "the robot has not moved: correct what the self-test reports and start again"
     ARM_GONE = "check the controller and its network, then start again from the present pose"
@@ -36,6 +39,11 @@ class SessionOutcome(Enum):
     CLOCK_JUMPED = "a device's clock jumped: restart that device"
     DISK_FULL = "free disk space; the recording is complete up to that point"
     MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording maps the recorded part"
+
+    @property
+    def planned(self) -> bool:
+        """Whether the session ended as planned."""
+        return self in (SessionOutcome.COMPLETE, SessionOutcome.REACHED)
 
 
 class Fault(NamedTuple):

@@ -98,7 +98,9 @@ class GoalDrive:
     def finished(self) -> bool:
         """Whether all goals are reached, or one cannot be."""
         last = self.goal == self._count - 1
-        return self.state in (DriveState.BLOCKED, DriveState.LOST) or self.state is DriveState.REACHED and last
+        return self.state in (DriveState.BLOCKED, DriveState.LOST) or (
+            self.state is DriveState.REACHED and last
+        )
 
     def next_goal(self) -> None:
         """Turns to the next goal; obstacles stay known."""

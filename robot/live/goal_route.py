@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
-from robot.drivers.outcome import Fault
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.config import LiveConfig
 from robot.live.goal_drive import DriveState, GoalDrive, Sighting, points_in_map
-from robot.live.route import route_speed
+from robot.live.route import MovableArm, route_speed
 from tactile.base.se2 import between, compose, wrap
 
 GAIN = 0.05
@@ -28,15 +26,6 @@ MOVED = 5
 """Consecutive whisks elsewhere after which the robot has been moved."""
 SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
-
-
-class SteeredArm(Protocol):
-    """The parts of `robot.drivers.ur10.arm.Arm` that the route uses."""
-
-    @property
-    def fault(self) -> Fault | None: ...
-    def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
-    def halt(self) -> None: ...
 
 
 Aligner = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -104,6 +93,10 @@ class GoalRoute:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
 
+    def forget(self) -> None:
+        """Coasting ends: without any result the arm rests."""
+        self._unseen = np.inf
+
     def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
         seen = [points_in_map(between(arm_pose, before), points) for before, points in self._recent]
@@ -128,7 +121,7 @@ class GoalRoute:
         most = OUTLIER if self._count > SETTLED else np.full(3, np.inf)
         self.pose = compose(self.pose, share * np.clip(apart, -most, most))
 
-    def advance(self, arm: SteeredArm) -> bool:
+    def advance(self, arm: MovableArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.
 
         A target that the checks of the arm refuse blocks the way there.

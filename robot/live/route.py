@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from robot.drivers.outcome import Fault
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.drivers.ur10.safety import check_target as allowed
@@ -20,8 +21,27 @@ from tactile.whiskers.head_geometry import Head
 class MovableArm(Protocol):
     """The methods of `robot.drivers.ur10.arm.Arm` that a route calls."""
 
+    @property
+    def fault(self) -> Fault | None: ...
     def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
     def arrived(self) -> bool: ...
+    def halt(self) -> None: ...
+
+
+class ArmRoute(Protocol):
+    """What the whisk loop asks of a route."""
+
+    def advance(self, arm: MovableArm) -> bool:
+        """Sends the arm on if necessary; returns whether it is at the end.
+
+        Raises:
+            robot.drivers.ur10.safety.TargetRefused: a target is rejected.
+        """
+        ...
+
+    def resend_last(self) -> None:
+        """Sends the last target again with the next `advance`, after a stop on the way to it."""
+        ...
 
 
 class Route:
@@ -60,10 +80,15 @@ def plan_path(config: LiveConfig, head: Head) -> HeadPath:
     Raises:
         InputError: the path cannot be planned or is empty.
     """
-    path = _waypoint_path(config) if config.waypoints else _planned_path(config, head)
+    path = whole_path(config, head)
     if config.plan.goal is not None:  # the arm starts at the end
         return HeadPath(np.zeros(1), path.pose[-1:])
     return path
+
+
+def whole_path(config: LiveConfig, head: Head) -> HeadPath:
+    """The path of the waypoints or of the plan, whatever the goals."""
+    return _waypoint_path(config) if config.waypoints else _planned_path(config, head)
 
 
 def _planned_path(config: LiveConfig, head: Head) -> HeadPath:

@@ -81,9 +81,7 @@ class VirtualArm:
         steps = np.array(self.poses[first:])
         steps[:, 2] = np.unwrap(steps[:, 2])
         path = HeadPath(np.linspace(begin, self.time, len(steps)), steps)
-        features = simulate_kinematic(
-            self._setup, self.surroundings, path, np.array([begin]), self._random
-        )
+        features = simulate_kinematic(self._setup, self.surroundings, path, np.array([begin]), self._random)
         stamp = begin + MID_PROTRACTION * period
         odometry, truth = self._odometer.step(stamp, stamp)
         alive = self._setup.head.alive

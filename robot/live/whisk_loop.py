@@ -16,7 +16,7 @@ from robot.drivers.ur10.safety import TargetRefused
 from robot.live.async_mapper import AsyncMapper, check_mapper
 from robot.live.polling import TICK, SessionFault, session_fault
 from robot.live.rig import Rig
-from robot.live.route import Route
+from robot.live.route import ArmRoute
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
@@ -31,13 +31,14 @@ class WhiskReport(NamedTuple):
 
     Attributes:
         number: of the whisk. lateness: time from its end to passing on, s. seen: whether its image was
-            included. missing: number of frames that had not arrived.
+            included. missing: number of frames that had not arrived. pose: [3] by the arm, at mid-protraction.
     """
 
     number: int
     lateness: float
     seen: bool
     missing: int
+    pose: np.ndarray
 
 
 class WhiskSequence(NamedTuple):
@@ -65,7 +66,9 @@ class WhiskSequence(NamedTuple):
         return (number - self.number) * self.period
 
 
-def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[WhiskReport], None]) -> None:
+def run_whisk_loop(
+    rig: Rig, route: ArmRoute, mapper: AsyncMapper, tell: Callable[[WhiskReport], None]
+) -> None:
     """Moves along the route and passes on every whisk; ends with the whisk in which the arm arrives.
 
     The arm rests while the head sends no samples.
@@ -92,12 +95,12 @@ def run_whisk_loop(rig: Rig, route: Route, mapper: AsyncMapper, tell: Callable[[
             wait_for_head(rig, route)
 
 
-def follow_route(rig: Rig, route: Route) -> None:
+def follow_route(rig: Rig, route: ArmRoute) -> None:
     """Moves along a route without whisks."""
     rig.wait_until(lambda: _advance(rig, route), MAX_ROUTE_TIME, SessionOutcome.NOT_ARRIVED, "the route")
 
 
-def wait_for_head(rig: Rig, route: Route) -> None:
+def wait_for_head(rig: Rig, route: ArmRoute) -> None:
     """Stops the arm until the head sends samples."""
     rig.arm.halt()
     rig.record_event("held", "the head sends no samples")
@@ -174,10 +177,11 @@ def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper
     if rig.recorder is not None:
         rig.recorder.add_whisk(cut, frames, truth)
     mapper.offer(Sample(stamp, assemble_cycle(frames, cut), truth))
-    return WhiskReport(number, time.monotonic() - due, cut.seen, sequence.samples - len(frames.sequence))
+    missing = sequence.samples - len(frames.sequence)
+    return WhiskReport(number, time.monotonic() - due, cut.seen, missing, truth)
 
 
-def _advance(rig: Rig, route: Route) -> bool:
+def _advance(rig: Rig, route: ArmRoute) -> bool:
     """Whether the arm has arrived at the end of the route; at a target, the next one is sent."""
     try:
         return route.advance(rig.arm)

@@ -179,7 +179,9 @@ class ClosedLoop:
         return pose, points, sample.truth, self.pose
 
 
-def drive_pairs(loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator) -> Iterator[Drive]:
+def drive_pairs(
+    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
+) -> Iterator[Drive]:
     """Drives to goals drawn at random, each from where the last one ended."""
     for _ in range(count):
         yield loop.drive(draw_goal(loop, made, random))
@@ -226,7 +228,7 @@ def _driven_graph(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> network
     """Cells of the loop, joined in its order, with two points joined to both ends of the nearest link."""
     links = list(zip(loop, [*loop[1:], loop[0]], strict=True))
     ends = np.array([[cell_centre(cell), cell_centre(other)] for cell, other in links])
-    graph = networkx.Graph()
+    graph: networkx.Graph = networkx.Graph()
     for (cell, other), (p, q) in zip(links, ends, strict=True):
         graph.add_edge(cell, other, length=float(np.hypot(*(p - q))))
     nearest = [int(np.argmin(segment_distances(point, ends[:, 0], ends[:, 1]))) for point in (a, b)]

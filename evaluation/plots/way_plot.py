@@ -1,0 +1,51 @@
+"""Plot of a way over the experiences of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, GREEN, GREY, INK, VERMILLION
+
+_BOTTOM, _MARGIN = 1.0, 0.08
+_FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
+
+
+def draw_way(
+    title: str, line: str, nodes: np.ndarray, links: np.ndarray, way: np.ndarray, felt: np.ndarray
+) -> style.Figure:
+    """Draws experiences, their links, contacts felt beside them and the way.
+
+    Args:
+        line: subtitle. nodes: [N, 2] experiences, m. links: [L, 2] their indices. way: [K, 3] poses of the
+            way, K >= 1 (m, m, rad). felt: [n, 2] contacts in the map, m; may be empty.
+    """
+    from matplotlib.collections import LineCollection
+
+    box = _frame(np.concatenate([nodes, felt, way[:, :2]]))
+    width, height = box[1] - box[0]
+    inner = style.WIDTH - style.LEFT - style.RIGHT
+    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
+    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
+    style.metre_grid(axes)
+    if len(felt):
+        axes.plot(*felt.T, ".", color=GREY, ms=2.2, mew=0, zorder=1, label="contact felt")
+    if len(links):
+        axes.add_collection(
+            LineCollection(list(nodes[links]), colors=BLUE, lw=0.7, alpha=0.55, zorder=2, label="link")
+        )
+    axes.plot(*nodes.T, "o", color=BLUE, ms=2.4, mew=0, zorder=3, label="experience")
+    axes.plot(*way[:, :2].T, color=VERMILLION, lw=3.2, solid_capstyle="round", zorder=4, label="way")
+    axes.plot(*way[0, :2], "o", ms=9, mfc="white", mec=GREEN, mew=2.2, ls="none", zorder=5, label="start")
+    axes.plot(*way[-1, :2], "*", ms=15, color=INK, mec="white", mew=0.8, ls="none", zorder=5, label="goal")
+    style.add_legend(figure, axes, columns=6)
+    return figure
+
+
+def _frame(points: np.ndarray) -> np.ndarray:
+    """Corners [[left, bottom], [right, top]] around points, m."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, size = (low + high) / 2, np.maximum(high - low + _MARGIN * (high - low).max(), 1e-3)
+    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
+    return np.stack([middle - size / 2, middle + size / 2])

@@ -1,0 +1,103 @@
+"""Steers the arm of a live session to goals by the estimates of its mapper."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ratslam.config.run_config import RunConfig
+from ratslam.live.mapper_process import Mapper
+from ratslam.pipeline.goal_planner import GoalPlanner, contact_aligner
+from ratslam.pipeline.saved_map import read_map
+from robot.drivers.outcome import SessionOutcome
+from robot.live.goal_drive import DriveState, GoalDrive
+from robot.live.goal_route import GoalRoute
+from robot.live.polling import SessionFault, session_fault
+from robot.live.rig import Rig
+from robot.live.route import MovableArm
+from robot.live.whisk_loop import WhiskReport
+from tactile.whiskers.head_geometry import ur10_head
+
+STALE = 3
+"""Whisks without a result of the mapper after which the head rests."""
+ENDS = {DriveState.BLOCKED: SessionOutcome.BLOCKED, DriveState.LOST: SessionOutcome.LOST}
+
+
+def plan_goals(config: RunConfig) -> GoalRoute:
+    """The route of a session with goals, on the map that its settings name.
+
+    Raises:
+        InputError: the map cannot be read, or a goal is not on it.
+    """
+    assert config.live is not None
+    goal = config.live.plan.goal
+    assert goal is not None
+    saved = read_map(goal.map)
+    made = saved.open_session().map
+    planner = GoalPlanner(made.graph(), goal, config.live.plan.motion)
+    drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
+    align = contact_aligner(made, config.touch.image, ur10_head(config.touch.head))
+    return GoalRoute(drive, config.live, drive.off_way, goal.coast, align)
+
+
+class GoalSteering:
+    """The route of the whisk loop (`robot.live.route.ArmRoute`) that follows the mapper's newest estimate.
+
+    Args:
+        whisks: reports of the whisks passed on so far; the list grows.
+
+    Attributes:
+        ends: of the goals so far, as JSON values.
+    """
+
+    def __init__(self, route: GoalRoute, rig: Rig, mapper: Mapper, whisks: Sequence[WhiskReport]) -> None:
+        self.route, self.ends = route, list[dict[str, Any]]()
+        self._rig, self._mapper, self._whisks = rig, mapper, whisks
+        self._mapped = self._told = 0  # results taken; whisks of which the route was told
+
+    def advance(self, arm: MovableArm) -> bool:
+        """See `robot.live.route.ArmRoute`."""
+        if not self.route.drive.finished:
+            self._take_results()
+        return self.route.advance(arm)
+
+    def resend_last(self) -> None:
+        """See `robot.live.route.ArmRoute`."""
+        self.route.resend_last()
+
+    def status(self) -> str:
+        """Goal and state as text."""
+        drive = self.route.drive
+        return f"goal {drive.goal + 1}: {drive.state.name.lower()}, "
+
+    def fault(self) -> SessionFault | None:
+        """The end of a session whose last goal was not reached."""
+        drive = self.route.drive
+        outcome = ENDS.get(drive.state)
+        return outcome and session_fault(outcome, f"goal {drive.goal + 1}: {drive.reason}")
+
+    def _take_results(self) -> None:
+        """Tells the route of the newest result, or of whisks that stay without one."""
+        self._mapper.receive()
+        mapped, count = self._mapper.mapped, len(self._whisks)
+        if len(mapped) > self._mapped and mapped[-1].number < count:
+            result, self._mapped, self._told = mapped[-1], len(mapped), count
+            pose = None if result.lost else np.asarray(result.pose, np.float64)
+            self._see(pose, result.points, self._whisks[result.number].pose)
+        elif count > self._told and count - len(mapped) > STALE:
+            self._told = count
+            self.route.forget()
+            self._see(None, np.zeros((0, 2)), self._whisks[-1].pose)
+
+    def _see(self, pose: np.ndarray | None, points: np.ndarray, arm_pose: np.ndarray) -> None:
+        drive = self.route.drive
+        now = self._rig.odometer.pose(time.monotonic())
+        if self.route.see(pose, points, arm_pose, now).ended:
+            end = {"goal": drive.goal + 1, "state": drive.state.name.lower(), "reason": drive.reason}
+            self.ends.append(end | {"replans": drive.replans, "whisk": len(self._whisks)})
+            self._rig.record_event(
+                "goal", f"{drive.goal + 1}: {drive.state.name.lower()} {drive.reason}".strip()
+            )
