@@ -1,8 +1,8 @@
 """Aligns contacts of whiskers with those remembered in a map: a pose within a place.
 
 Recall names the place; whisker images vary little over some centimetres and tenths of a radian. The contact
-points of several whisks, laid over those of the map's keyframes by point-to-line ICP (Chen & Medioni 1992; Censi
-2008), give the lateral position and the heading that steering in a corridor needs.
+points of several whisks, laid over those of the map's keyframes by point-to-line ICP (Chen & Medioni 1992;
+Censi 2008), give the lateral position and the heading that steering in a corridor needs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Ways over the experience graph of a map, by expected time or by RatSLAM's goal temporal map.
 
-Assumption: the robot is holonomic, or at least drives backwards and turns on the spot. It takes the poses of
-the experiences, so a link is used in either direction (backwards with the heading in which it was driven), and
+Assumption: the robot drives backwards and turns on the spot. It takes the poses of the experiences, so a link is used in either direction (backwards with the heading in which it was driven), and
 where two experiences of one piece stand within `turn_radius` of each other it may turn from one to the other.
 A robot that only drives forwards must not use these ways.
 """
@@ -9,6 +8,7 @@ A robot that only drives forwards must not use these ways.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -63,8 +63,8 @@ def travel_graph(
     """The graph of travel: an edge for each link, in both directions, and for each turn on the spot.
 
     Edges carry `length` (m), `seconds` of the motion, in which the robot moves and turns at once, and the
-    `expected` seconds: a link driven n times is passable with probability (n + 1) / (n + 2) (Laplace's rule of
-    succession), and the expected time is seconds / probability; a turn without a link has n = 0. Nodes carry
+    `expected` seconds: a link driven n times is passable with probability (n + 1) / (n + 2) (Laplace's rule
+    of succession), and the expected time is seconds / probability; a turn without a link has n = 0. Nodes carry
     x, y, heading and `piece`: connected by links, numbered in the order of their first experiences.
 
     Args:
@@ -125,7 +125,7 @@ def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode
 
 def describe_way(graph: networkx.Graph, experiences: list[int]) -> Way:
     """The way over these experiences, each joined to the next."""
-    links = [graph.edges[pair] for pair in zip(experiences[:-1], experiences[1:], strict=True)]
+    links = [graph.edges[pair] for pair in pairwise(experiences)]
     nodes = [graph.nodes[place] for place in experiences]
     poses = np.array([[node["x"], node["y"], node["heading"]] for node in nodes])
     total = [float(sum(link[name] for link in links)) for name in ("length", "seconds", "expected")]

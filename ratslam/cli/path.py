@@ -25,7 +25,11 @@ def add_commands(commands: Commands) -> None:
         help="start: a point of the map, m, an experience, or the map's last pose (default)",
     )  # fmt: skip
     path.add_argument(
-        "--to", dest="goal", required=True, metavar="X,Y|EXPERIENCE", help="goal: a point, m, or an experience"
+        "--to",
+        dest="goal",
+        required=True,
+        metavar="X,Y|EXPERIENCE",
+        help="goal: a point, m, or an experience",
     )
     path.add_argument(
         "--mode", choices=("time", "temporal"), default="time",
@@ -43,7 +47,7 @@ def _path(arguments: argparse.Namespace) -> int:
 
     saved = read_map(arguments.map, lambda line: print(f"ratslam: {line}", file=sys.stderr))
     made = saved.open_session().map
-    start = "here" if arguments.start == "here" else _place(arguments.start, "--from")
+    start = None if arguments.start == "here" else _place(arguments.start, "--from")
     try:
         way = find_map_way(made, saved, start, _place(arguments.goal, "--to"), arguments.mode)
     except NoWay as error:
@@ -56,7 +60,9 @@ def _path(arguments: argparse.Namespace) -> int:
         print(json.dumps(content))
         return 0
     places = way.experiences
-    print(f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s")
+    print(
+        f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
+    )
     print(f"expected {way.expected:.0f} s by the number of traversals of each link")
     return 0
 

@@ -54,8 +54,8 @@ class ArmSession:
     """The arm's part of a session (`ratslam.live.live_robot.LiveRobot`).
 
     Args:
-        path: the route. stopped: whether the operator has requested the end. goals: the route to goals, if there
-            are any.
+        path: the route. stopped: whether the operator has requested the end. goals: the route to goals, if
+            there are any.
     """
 
     unit = "whisk"

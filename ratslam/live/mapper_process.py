@@ -69,8 +69,8 @@ class MappedSample(NamedTuple):
     Attributes:
         number: of the sample; a front end may add the motion of one to the next, which then has no result.
             pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
-            name. seconds: computing time. doubt: see `ratslam.core.session.Step`. lost: whether the method has lost
-            track of the position. points: [n, 2] contacts in base_link, m.
+            name. seconds: computing time. doubt: see `ratslam.core.session.Step`. lost: whether
+            the method has lost track of the position. points: [n, 2] contacts in base_link, m.
     """
 
     number: int
@@ -316,10 +316,10 @@ def _mapped_sample(
     from ratslam.pipeline.goal_planner import felt_points
 
     estimate = step.estimate
-    return MappedSample(
-        number, np.asarray(step.pose), int(estimate.place), Action(int(estimate.action)).name.lower(), seconds,
-        step.doubt, bool(estimate.lost), felt_points(observed, touch.image, ur10_head(touch.head)),
-    )  # fmt: skip
+    action = Action(int(estimate.action)).name.lower()
+    points = felt_points(observed, touch.image, ur10_head(touch.head))
+    pose, lost = np.asarray(step.pose), bool(estimate.lost)
+    return MappedSample(number, pose, int(estimate.place), action, seconds, step.doubt, lost, points)
 
 
 def _send(line: Connection, message: Any) -> None:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from evaluation.plots.way_plot import draw_way
-from ratslam.atlas.route import Mode, Travel, Way, experiences_near, find_way, nearest_experience, travel_graph
+from ratslam.atlas.route import (
+    Mode,
+    Travel,
+    Way,
+    experiences_near,
+    find_way,
+    nearest_experience,
+    travel_graph,
+)
 from ratslam.core.backend import Map
 from ratslam.pipeline.goal_planner import HEADING_RADIUS, experience_at, felt_walls
 from ratslam.pipeline.saved_map import SavedMap
@@ -24,7 +31,7 @@ FARTHEST, TOLERANCE = (GoalConfig.model_fields[name].default for name in ("farth
 def find_map_way(
     made: Map,
     saved: SavedMap,
-    start: tuple[float, float] | int | Literal["here"],
+    start: tuple[float, float] | int | None,
     goal: tuple[float, float] | int,
     mode: Mode = "time",
 ) -> Way:
@@ -32,15 +39,19 @@ def find_map_way(
 
     Args:
         made: the map in `saved`. start, goal: x, y (m) within `FARTHEST` of an experience, or its number;
-            `here`: the map's last pose.
+            None: the map's last pose.
 
     Raises:
         InputError: a place is not on the map. NoWay: nothing joins the two.
     """
     motion = MotionConfig()
     graph = travel_graph(made.graph(), Travel(motion.speed, motion.turn_rate))
-    if start == "here":
-        first = nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS) if saved.steps else None
+    if start is None:
+        first = (
+            nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
+            if saved.steps
+            else None
+        )
         if first is None:
             found = f"the map's last pose has no experience within {FARTHEST:g} m"
             raise InputError("--from", found, "a robot on driven ground", "give X,Y or an experience")

@@ -6,6 +6,7 @@ a way over experiences, whose poses scatter, is driven in long straight legs, ea
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -38,10 +39,7 @@ def legs_of(way: np.ndarray) -> list[Leg]:
     if len(way) == 1:
         return [Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
     marks = _vertices(way[:, :2])
-    return [
-        Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1]))
-        for a, b in zip(marks[:-1], marks[1:], strict=True)
-    ]
+    return [Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1])) for a, b in pairwise(marks)]
 
 
 def leg_heading(poses: np.ndarray) -> float:
