@@ -1,8 +1,9 @@
 """Ways over the experience graph of a map, by expected time or by RatSLAM's goal temporal map.
 
-Assumption: the robot drives backwards and turns on the spot. It takes the poses of the experiences, so a link is used in either direction (backwards with the heading in which it was driven), and
-where two experiences of one piece stand within `turn_radius` of each other it may turn from one to the other.
-A robot that only drives forwards must not use these ways.
+Assumption: the robot drives backwards and turns on the spot. It takes the poses of the experiences, so a link
+is used in either direction (backwards with the heading in which it was driven), and where two experiences of
+one piece stand within `turn_radius` of each other it may turn from one to the other. A robot that only drives
+forwards must not use these ways.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def travel_graph(
 
     Edges carry `length` (m), `seconds` of the motion, in which the robot moves and turns at once, and the
     `expected` seconds: a link driven n times is passable with probability (n + 1) / (n + 2) (Laplace's rule
-    of succession), and the expected time is seconds / probability; a turn without a link has n = 0. Nodes carry
-    x, y, heading and `piece`: connected by links, numbered in the order of their first experiences.
+    of succession), and the expected time is seconds / probability; a turn without a link has n = 0. Nodes
+    carry x, y, heading and `piece`: connected by links, numbered in the order of their first experiences.
 
     Args:
         experiences: as `KeyframeMap.graph`. obstacles: [n, 2] points in the map, m; links that pass within

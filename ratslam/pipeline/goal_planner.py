@@ -130,5 +130,5 @@ def experience_at(
         raise InputError(where, "a map without experiences", "a map with experiences")
     x, y = position(graph, nearest)
     away = float(np.hypot(x - place[0], y - place[1]))
-    found = f"({place[0]:g}, {place[1]:g}), {away:.2f} m from experience {nearest} at ({x:.2f}, {y:.2f})"
-    raise InputError(where, found, f"a point within {farthest:g} m of an experience")
+    text = f"({place[0]:g}, {place[1]:g}), {away:.2f} m from experience {nearest} at ({x:.2f}, {y:.2f})"
+    raise InputError(where, text, f"a point within {farthest:g} m of an experience")

@@ -79,8 +79,8 @@ class GoalDrive:
     Attributes:
         state: of the present goal, or the end. reason: of the last change. goal: number of the present goal.
         replans: new ways for it so far. target: [3] pose in the map to move to, None: rest. way: [K, 3] the
-            present way. obstacles: [n, 2] contacts found on ways, in the map, m. off_way: largest distance from
-        the way, m.
+            present way. obstacles: [n, 2] contacts found on ways, in the map, m. off_way: largest distance
+        from the way, m.
     """
 
     def __init__(self, config: GoalConfig, planner: Planner, cell: float, count: int) -> None:

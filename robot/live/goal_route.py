@@ -16,8 +16,8 @@ from tactile.base.se2 import between, compose, wrap
 GAIN = 0.05
 """Least share of the difference between estimate and expected pose that a whisk takes up."""
 OUTLIER = np.array([0.03, 0.03, 0.1])
-"""Largest difference (m, m, rad) that is taken up; what exceeds it is an outlier (Huber 1964). Odometry with the
-errors of a mobile robot is wrong by up to 0.6 rad after a turn, until recall corrects it."""
+"""Largest difference (m, m, rad) that is taken up; what exceeds it is an outlier (Huber 1964). Odometry with
+the errors of a mobile robot is wrong by up to 0.6 rad after a turn, until recall corrects it."""
 SETTLED = 5
 """Whisks after which differences are limited so."""
 RECENT = 8
@@ -43,8 +43,9 @@ class GoalRoute:
 
     The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
     the pose to steer by moves with the arm and takes up a share of its difference to each estimate: 1 / n in
-    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in `MOVED`
-    whisks is taken up at once: the robot is elsewhere. Without estimates the arm's motion alone leads on for `coast` (m).
+    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in
+    `MOVED` whisks is taken up at once: the robot is elsewhere. Without estimates the arm's motion alone leads
+    on for `coast` (m).
 
     Args:
         align: aligns contacts of the last whisks with those of the map, which recall does not do.

@@ -1,7 +1,7 @@
 """Straight legs of a way: what a robot drives that turns on the spot and then moves without turning.
 
-Odometry errs most in turns, and views are those remembered only at the headings at which the way was driven. So
-a way over experiences, whose poses scatter, is driven in long straight legs, each at one heading.
+Odometry errs most in turns, and views are those remembered only at the headings at which the way was driven.
+So a way over experiences, whose poses scatter, is driven in long straight legs, each at one heading.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Leg(NamedTuple):
 
 
 def legs_of(way: np.ndarray) -> list[Leg]:
-    """The legs of a way [K, 3] (m, m, rad), K >= 1: its poses within `SCATTER` of the legs (Douglas & Peucker
-    1973). A way of one place is one leg without length."""
+    """The legs of a way [K, 3] (m, m, rad), K >= 1: its poses within `SCATTER` of the legs (Douglas &
+    Peucker 1973). A way of one place is one leg without length."""
     if len(way) == 1:
         return [Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
     marks = _vertices(way[:, :2])
@@ -43,8 +43,8 @@ def legs_of(way: np.ndarray) -> list[Leg]:
 
 
 def leg_heading(poses: np.ndarray) -> float:
-    """The heading of a leg over poses [K, 3]: its direction or the reverse, if it was driven so; otherwise the
-    mean of the headings, each weighted by the length beside it."""
+    """The heading of a leg over poses [K, 3]: its direction or the reverse, if it was driven so; otherwise
+    the mean of the headings, each weighted by the length beside it."""
     length = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     weight = np.convolve(length, [0.5, 0.5])
     weight = weight if weight.sum() > 0 else np.ones(len(poses))

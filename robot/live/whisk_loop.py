@@ -31,7 +31,8 @@ class WhiskReport(NamedTuple):
 
     Attributes:
         number: of the whisk. lateness: time from its end to passing on, s. seen: whether its image was
-            included. missing: number of frames that had not arrived. pose: [3] by the arm, at mid-protraction.
+            included. missing: number of frames that had not arrived. pose: [3] by the arm, at
+            mid-protraction.
     """
 
     number: int

@@ -1,4 +1,4 @@
-"""Contact points from a whisker image and the height of the walls, without the noisy position along the shaft."""
+"""Contact points from a whisker image and the height of the walls, not from the position along the shaft."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tactile.whiskers.head_geometry import Head
 def image_points(head: Head, image: np.ndarray, tallest: float) -> tuple[np.ndarray, np.ndarray]:
     """Where whiskers touched walls of a known height.
 
-    A pixel is the height of the tip at first contact as a share of `tallest`, which gives the whisker's angle.
-    The contact is where the shaft crosses the height of the walls, or the tip if it is above.
+    A pixel is the height of the tip at first contact as a share of `tallest`, hence the whisker's angle. The
+    contact is where the shaft crosses the height of the walls, or the tip if it is above.
 
     Args:
-        image: [..., W] pixels in 0..1, 0 without contact. tallest: height of pixel value 1 and of the walls, m.
+        image: [..., W] pixels in 0..1, 0 without contact. tallest: height of pixel value 1 and of walls, m.
 
     Returns:
         [..., W, 2] points in base_link, m, and [..., W] bool, there is one.

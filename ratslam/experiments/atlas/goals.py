@@ -241,8 +241,8 @@ def _driven_graph(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> network
 
 
 def shortest_driven(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> float:
-    """Length of the shortest way between two points [2] over the cells of the loop, m: along the lines between
-    their centres, which were driven."""
+    """Length of the shortest way between two points [2] over the cells of the loop, m: along the lines
+    between their centres, which were driven."""
     return float(networkx.dijkstra_path_length(_driven_graph(loop, a, b), "from", "to", weight="length"))
 
 
