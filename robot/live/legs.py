@@ -17,8 +17,8 @@ from tactile.base.segments import line_distances
 SCATTER = 0.02
 """Largest distance of the poses of a way from its legs, m."""
 ALONG = 0.35
-"""Largest difference between the headings on a leg and its direction, or the reverse, at which it is driven
-along that direction, rad."""
+"""Largest difference between a heading on a leg and its direction, or the reverse, at which it was driven so,
+rad."""
 
 
 class Leg(NamedTuple):
@@ -43,18 +43,18 @@ def legs_of(way: np.ndarray) -> list[Leg]:
 
 
 def leg_heading(poses: np.ndarray) -> float:
-    """The heading of a leg over poses [K, 3]: its direction or the reverse, if it was driven so; otherwise
-    the mean of the headings, each weighted by the length beside it."""
+    """The heading of a leg over poses [K, 3]: its direction or the reverse, if at least half of it was driven
+    so; otherwise the mean of the headings, each weighted by the length beside it."""
     length = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     weight = np.convolve(length, [0.5, 0.5])
     weight = weight if weight.sum() > 0 else np.ones(len(poses))
-    middle = float(np.angle(np.sum(weight * np.exp(1j * poses[:, 2]))))
     step = poses[-1, :2] - poses[0, :2]
     direction = float(np.arctan2(step[1], step[0]))
     for candidate in (direction, direction + np.pi):
-        if np.hypot(*step) > SCATTER and abs(float(wrap(candidate - middle))) <= ALONG:
+        along = np.abs(wrap(poses[:, 2] - candidate)) <= ALONG
+        if np.hypot(*step) > SCATTER and weight[along].sum() >= weight.sum() / 2:
             return float(wrap(candidate))
-    return middle
+    return float(np.angle(np.sum(weight * np.exp(1j * poses[:, 2]))))
 
 
 def _vertices(line: np.ndarray) -> list[int]:

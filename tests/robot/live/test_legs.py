@@ -12,7 +12,9 @@ from tactile.base.segments import line_distances
 def test_a_corner_has_two_legs_that_pass_all_poses():
     scatter = 0.4 * SCATTER * np.random.default_rng(1).uniform(-1, 1, (20, 2))
     straight = np.linspace(0, 0.5, 10)
-    place = np.vstack([np.column_stack([straight, 0 * straight]), np.column_stack([0 * straight + 0.5, straight])])
+    place = np.vstack(
+        [np.column_stack([straight, 0 * straight]), np.column_stack([0 * straight + 0.5, straight])]
+    )
     way = np.column_stack([place + scatter, np.repeat([0.0, np.pi / 2], 10)])
     legs = legs_of(way)
     assert len(legs) == 2
