@@ -155,8 +155,15 @@ def mapping_job(config: RunConfig, directory: Path) -> MappingJob:
         len(head.length),
         rate,
         float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
-        start=None if plan.goal is None else plan.goal.map,
+        start=continued_map(config),
     )
+
+
+def continued_map(config: RunConfig) -> Path | None:
+    """The map that the mapper goes on from: that of the goals, unless the method only localises in it."""
+    assert config.live is not None
+    goal = config.live.plan.goal
+    return None if goal is None or config.backend == "localise" else goal.map
 
 
 def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:
