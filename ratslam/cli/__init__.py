@@ -25,6 +25,8 @@ from ratslam.cli import (
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
 
+MODULES = (run, live, localise, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
+"""The commands, in the order of the help."""
 GROUPS = ("run", "live", "maps", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
@@ -87,6 +89,6 @@ def build_parser() -> Program:
     """The parser of the whole program."""
     parser = Program(prog="ratslam", description=DESCRIPTION)
     parser.commands = Commands(parser)
-    for module in (run, live, localise, maps, path, look, doctor, fit, studies, reproduce, files, check, tools):
+    for module in MODULES:
         module.add_commands(parser.commands)
     return parser

@@ -1,2 +1,1 @@
 """Maps that are saved, found again, continued, merged and changed: scenarios, measures and rows."""
-"""Measurements of what is done with saved maps."""

@@ -10,6 +10,7 @@ from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.piece_ties import no_tie
 from tactile.base.types import Odometry, observation
 
 CELL = 0.5
@@ -44,9 +45,9 @@ class Pose(NamedTuple):
     action: int
 
 
-def new_map(acceptance=AcceptByOdds, **settings):
+def new_map(acceptance=AcceptByOdds, find_tie=no_tie, **settings):
     config = KeyframeMapConfig.model_validate(settings)
-    return KeyframeMap(config, CELL, LabelAppearance(), acceptance)
+    return KeyframeMap(config, CELL, LabelAppearance(), acceptance, find_tie=find_tie)
 
 
 def drive(map, recalled, control=None, first=0, last=LAP + 60, bias=BIAS):
