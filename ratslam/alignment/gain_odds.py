@@ -10,6 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import isotonic_regression
+from scipy.special import ndtri
 
 BINS = 24
 """Number of bins of the gain."""
@@ -25,7 +27,7 @@ LEAVING = -2.0
 
 class GainOdds(NamedTuple):
     """Attributes:
-    edges: [BINS - 1] limits between the bins of the gain, nat. odds: [BINS] log-odds of each.
+    edges: [BINS - 1] limits between the bins of the gain, nat. odds: [BINS] log-odds of each, ascending.
     expected: mean log-odds at a true pose.
     """
 
@@ -46,14 +48,14 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray) -> GainOdds:
     edges = np.linspace(low, high, BINS - 1)
     same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
     mixed = (1 - OUTLIERS) * same + OUTLIERS * other
-    odds = np.log(mixed / ((1 - OUTLIERS) * other + OUTLIERS * same))
+    raw = np.log(mixed / ((1 - OUTLIERS) * other + OUTLIERS * same))
+    # A better fit is never evidence against a place; bins without gains say little.
+    odds = isotonic_regression(raw, weights=same + other + 1e-6).x
     return GainOdds(edges, odds, float(same @ odds))
 
 
 def _quantiles(mean: float, deviation: float) -> np.ndarray:
     """Evenly spread quantiles of a normal distribution."""
-    from scipy.special import ndtri  # slow to import
-
     share = (np.arange(64) + 0.5) / 64
     return mean + deviation * ndtri(share)
 

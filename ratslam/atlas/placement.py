@@ -62,9 +62,15 @@ def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[P
     for k, pose in _proposals(ground, session):
         if not any(same_pose(ground, path.poses[k : k + 1], pose)[0] for path in found):
             path = session.follow(ground, odds, k, pose)
-            if path is not None:
+            if path is not None and not any(_is_same(ground, path, other) for other in found):
                 found.append(path)
     return sorted(found, key=lambda path: -path.odds.sum())
+
+
+def _is_same(ground: Ground, path: Path, other: Path) -> bool:
+    """Whether two paths are the same placement: they are together at most keyframes."""
+    together = [same_pose(ground, path.poses[k : k + 1], pose)[0] for k, pose in enumerate(other.poses)]
+    return bool(np.mean(together) > 0.5)
 
 
 def _proposals(ground: Ground, session: Traverse) -> Iterator[tuple[int, np.ndarray]]:

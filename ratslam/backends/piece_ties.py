@@ -16,6 +16,7 @@ from ratslam.alignment.hypotheses import SPAN
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
+from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog
 from ratslam.recall.memory import Memory
@@ -49,7 +50,7 @@ class PieceTies:
         self._views: MapViews | None = None
         self._odds: dict[tuple[int, ...], GainOdds] = {}
 
-    def __call__(self, graph: KeyframeGraph, log: ClosureLog) -> list[Candidate]:
+    def __call__(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> list[Candidate]:
         """Closures that tie the newest piece to another one; none if its views do not decide."""
         piece = graph.pieces(log)
         own = np.flatnonzero(piece == piece[-1])[-SPAN:]
@@ -61,7 +62,8 @@ class PieceTies:
         for other in np.unique(piece[piece != piece[-1]]).tolist():
             frames = np.flatnonzero(piece == other)
             if len(frames) >= FEWEST:
-                found += self._place(graph, own, self._ground(self._views, graph, frames), self._views)
+                on = self._ground(self._views, graph, archive, frames)
+                found += self._place(graph, own, on, self._views)
         found.sort(key=lambda one: -one[0])
         needed = graph.config.tie_log_odds
         if not found or found[0][0] < needed:
@@ -69,11 +71,14 @@ class PieceTies:
         rival = found[1][0] if len(found) > 1 else -np.inf
         return found[0][1] if found[0][0] - rival >= needed / 2 else []
 
-    def _ground(self, views: MapViews, graph: KeyframeGraph, frames: np.ndarray) -> PlacedOn:
+    def _ground(
+        self, views: MapViews, graph: KeyframeGraph, archive: Archive, frames: np.ndarray
+    ) -> PlacedOn:
         taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
         key = (len(frames), int(taken[0]), int(taken[-1]))
         if key not in self._odds:
-            self._odds[key] = views.odds(taken, poses)
+            every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
+            self._odds[key] = views.odds(every, archive.poses(graph.pose.rows)[every])
         return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), self._odds[key])
 
     def _place(

@@ -10,11 +10,11 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 
 TIE_EVERY = 16
 """Keyframes between two trials."""
-FindTie = Callable[[KeyframeGraph, ClosureLog], Sequence[Candidate]]
+FindTie = Callable[[KeyframeGraph, ClosureLog, Archive], Sequence[Candidate]]
 """Finds closures that tie the newest piece of a map to another one; none if the views do not decide."""
 
 
-def no_tie(graph: KeyframeGraph, log: ClosureLog) -> Sequence[Candidate]:
+def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Sequence[Candidate]:
     """The rule by which pieces stay apart."""
     return []
 
@@ -27,7 +27,7 @@ def tie_newest_piece(graph: KeyframeGraph, log: ClosureLog, archive: Archive, fi
     """
     if graph.ever % TIE_EVERY or not graph.begins.rows.any() or not graph.pieces(log)[-1]:
         return False
-    closures = find(graph, log)
+    closures = find(graph, log, archive)
     for k, candidate in enumerate(closures):
         sequence = log.add(candidate, k > 0)
         archive.add(candidate, k > 0, graph)

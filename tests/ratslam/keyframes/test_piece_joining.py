@@ -10,6 +10,7 @@ from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.loop_closures import Candidate
 from ratslam.keyframes.map_health import DOUBTED
 from ratslam.keyframes.piece_placement import APART
+from ratslam.keyframes.piece_ties import no_tie
 from tests.ratslam.keyframes.map_cases import CELL, LAP, drive, new_map, sequence
 
 BEGIN = LAP
@@ -21,12 +22,12 @@ RULES = pytest.mark.parametrize(
 TIE = [Candidate(LAP + k, k, 0, 1.0, 4.0) for k in range(2, 14)]
 
 
-def tie_late(graph, log):
+def tie_late(graph, log, archive):
     """The tie of the second lap to the first, once the views that show it are there."""
     return TIE if graph.ever > LAP + 14 else []
 
 
-def driven(rule, *sequences, find_tie=lambda graph, log: [], last=LAP + 60):
+def driven(rule, *sequences, find_tie=no_tie, last=LAP + 60):
     """A lap and a part of the next one, which begins a piece."""
     map = drive(new_map(rule, find_tie=find_tie), {}, last=BEGIN)
     map.begin_piece()
