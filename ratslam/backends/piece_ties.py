@@ -12,13 +12,13 @@ import numpy as np
 from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.hypotheses import SPAN
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog
+from ratslam.keyframes.piece_ties import Tie
 from ratslam.recall.memory import Memory
 
 if TYPE_CHECKING:
@@ -50,26 +50,26 @@ class PieceTies:
         self._views: MapViews | None = None
         self._odds: dict[tuple[int, ...], GainOdds] = {}
 
-    def __call__(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> list[Candidate]:
-        """Closures that tie the newest piece to another one; none if its views do not decide."""
-        piece = graph.pieces(log)
-        own = np.flatnonzero(piece == piece[-1])[-SPAN:]
+    def __call__(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Tie | None:
+        """The best placement of the keyframes since the newest beginning on one of the pieces before."""
+        begin = int(np.flatnonzero(graph.begins.rows)[-1])
+        own, piece = np.arange(begin, graph.count), graph.pieces(log)[:begin]
         if len(own) < FEWEST:
-            return []
+            return None
         if self._views is None or self._views.graph is not graph:
             self._views = MapViews(self._recall, graph)
-        found: list[tuple[float, list[Candidate]]] = []
-        for other in np.unique(piece[piece != piece[-1]]).tolist():
-            frames = np.flatnonzero(piece == other)
+        found: list[Tie] = []
+        for number in np.unique(piece).tolist():
+            frames = np.flatnonzero(piece == number)
             if len(frames) >= FEWEST:
                 on = self._ground(self._views, graph, archive, frames)
                 found += self._place(graph, own, on, self._views)
-        found.sort(key=lambda one: -one[0])
-        needed = graph.config.tie_log_odds
-        if not found or found[0][0] < needed:
-            return []
-        rival = found[1][0] if len(found) > 1 else -np.inf
-        return found[0][1] if found[0][0] - rival >= needed / 2 else []
+        if not found:
+            return None
+        best, *others = sorted(found, key=lambda tie: -tie.log_odds)
+        rival = others[0].log_odds if others else -np.inf
+        margin = graph.config.tie_log_odds / 2
+        return best if best.log_odds - rival >= margin else best._replace(log_odds=best.log_odds - rival)
 
     def _ground(
         self, views: MapViews, graph: KeyframeGraph, archive: Archive, frames: np.ndarray
@@ -81,16 +81,14 @@ class PieceTies:
             self._odds[key] = views.odds(every, archive.poses(graph.pose.rows)[every])
         return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), self._odds[key])
 
-    def _place(
-        self, graph: KeyframeGraph, own: np.ndarray, on: PlacedOn, views: MapViews
-    ) -> list[tuple[float, list[Candidate]]]:
-        """Log-odds beyond the logarithm of the number of places, and closures, of each placement."""
+    def _place(self, graph: KeyframeGraph, own: np.ndarray, on: PlacedOn, views: MapViews) -> list[Tie]:
+        """All placements on a ground."""
         motions = _motions(graph, own)
         compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
         places = float(np.log(max(on.ground.places(), 1.0)))
         session = Traverse(compared, motions)
         return [
-            (
+            Tie(
                 float(path.odds.sum()) - places,
                 [
                     Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)

@@ -137,7 +137,7 @@ class AcceptByOdds(Acceptance):
         odds, open_ = result.odds, log.verdicts()[sequences] == Verdict.OPEN
         open_ &= np.isin(sequences, among) & ~spans_pieces(graph, log)[sequences]
         # Odometry foretells nothing where a piece begins: there only the map can.
-        accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph, log)[sequences]
+        accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph.begins.rows, log)[sequences]
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
         doubtful = open_ & accepted & graph.config.may_be_carried
         if (undecided | doubtful).any():

@@ -15,9 +15,13 @@ def spans_pieces(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     return _spans(graph.pieces(log), log)
 
 
-def spans_beginnings(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
-    """[R] bool: sequences that have a candidate across the beginning of a piece, joined or not."""
-    return _spans(np.cumsum(graph.begins.rows), log)
+def spans_beginnings(begins: np.ndarray, log: ClosureLog) -> np.ndarray:
+    """[R] bool: sequences that have a candidate across the beginning of a piece, joined or not.
+
+    Args:
+        begins: [N] bool, see `KeyframeGraph`.
+    """
+    return _spans(np.cumsum(begins), log)
 
 
 def _spans(piece: np.ndarray, log: ClosureLog) -> np.ndarray:

@@ -1,37 +1,75 @@
-"""Ties of the newest piece of a map to another one, by a rule that the map is given."""
+"""Ties of the newest piece of a map to older keyframes, by a rule that the map is given.
+
+A tie is tried again while its piece is young: one that the views of later keyframes contradict is undone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
 
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.keyframes.piece_joining import spans_beginnings
 
 TIE_EVERY = 16
 """Keyframes between two trials."""
-FindTie = Callable[[KeyframeGraph, ClosureLog, Archive], Sequence[Candidate]]
-"""Finds closures that tie the newest piece of a map to another one; none if the views do not decide."""
+YOUNG = 400
+"""Number of keyframes of a piece up to which its tie is tried."""
 
 
-def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Sequence[Candidate]:
+class Tie(NamedTuple):
+    """A placement of the newest piece: its log-odds beyond the number of places, less those of the best other
+    one where that is closer than half of what is needed; and the closures that it implies."""
+
+    log_odds: float
+    closures: Sequence[Candidate]
+
+
+FindTie = Callable[[KeyframeGraph, ClosureLog, Archive], Tie | None]
+"""Finds the best placement of the keyframes since the newest beginning among those before; None without
+any."""
+
+
+def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Tie | None:
     """The rule by which pieces stay apart."""
-    return []
+    return None
 
 
 def tie_newest_piece(graph: KeyframeGraph, log: ClosureLog, archive: Archive, find: FindTie) -> bool:
-    """Accepts a tie, if a trial is due and finds one, as one closure sequence; moves the pieces together.
+    """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the views
+    contradict it.
 
     Returns:
-        whether there was one.
+        whether the map has changed.
     """
-    if graph.ever % TIE_EVERY or not graph.begins.rows.any() or not graph.pieces(log)[-1]:
+    starts = np.flatnonzero(graph.begins.rows)
+    if graph.ever % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
         return False
-    closures = find(graph, log, archive)
+    tie, across = find(graph, log, archive), _across(graph, log)
+    if not len(across):
+        if tie is None or tie.log_odds < graph.config.tie_log_odds:
+            return False
+        _accept(graph, log, archive, tie.closures)
+    elif tie is not None and tie.log_odds >= 0:
+        return False
+    for sequence in across.tolist():
+        log.judge(sequence, Verdict.UNDONE)
+    graph.place_pieces(log)
+    return True
+
+
+def _across(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+    """Accepted sequences between keyframes before the newest beginning and since."""
+    begins = graph.begins.rows.copy()
+    begins[: np.flatnonzero(begins)[-1]] = False
+    return np.flatnonzero(spans_beginnings(begins, log) & (log.verdicts() == Verdict.ACCEPTED))
+
+
+def _accept(graph: KeyframeGraph, log: ClosureLog, archive: Archive, closures: Sequence[Candidate]) -> None:
     for k, candidate in enumerate(closures):
         sequence = log.add(candidate, k > 0)
         archive.add(candidate, k > 0, graph)
         log.judge(sequence, Verdict.ACCEPTED)
-    if closures:
-        graph.place_pieces(log)
-    return bool(closures)

@@ -10,7 +10,7 @@ from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.loop_closures import Candidate
 from ratslam.keyframes.map_health import DOUBTED
 from ratslam.keyframes.piece_placement import APART
-from ratslam.keyframes.piece_ties import no_tie
+from ratslam.keyframes.piece_ties import Tie, no_tie
 from tests.ratslam.keyframes.map_cases import CELL, LAP, drive, new_map, sequence
 
 BEGIN = LAP
@@ -24,7 +24,7 @@ TIE = [Candidate(LAP + k, k, 0, 1.0, 4.0) for k in range(2, 14)]
 
 def tie_late(graph, log, archive):
     """The tie of the second lap to the first, once the views that show it are there."""
-    return TIE if graph.ever > LAP + 14 else []
+    return Tie(20.0, TIE) if graph.ever > LAP + 14 else None
 
 
 def driven(rule, *sequences, find_tie=no_tie, last=LAP + 60):
@@ -43,6 +43,17 @@ def test_a_tie_joins_two_pieces(rule):
     pose = map.solution().fit.poses
     assert np.hypot(*(pose[LAP + 8] - pose[8])[:2]) < CELL
     assert np.hypot(*(pose[LAP + 50] - pose[50])[:2]) < 2 * CELL
+
+
+@RULES
+def test_a_tie_that_later_views_contradict_is_undone(rule):
+    def tie_once(graph, log, archive):
+        return Tie(20.0 if graph.ever < LAP + 40 else -1.0, TIE) if graph.ever > LAP + 14 else None
+
+    assert not driven(rule, find_tie=tie_once, last=LAP + 38).pieces().any()
+    map = driven(rule, find_tie=tie_once)
+    assert np.array_equal(map.pieces(), np.arange(LAP + 60) >= BEGIN)
+    assert len(map.closures()) == 0
 
 
 @RULES
