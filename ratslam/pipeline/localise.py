@@ -19,6 +19,11 @@ from ratslam.pipeline.saved_map import SavedMap, read_map
 from ratslam.pipeline.source import open_observations
 from tactile.base.errors import InputError
 
+NOT_LOCALISED = {
+    "grid": "in which the contacts of a session fit several poses, and those of other places fit too"
+}
+"""Why nothing can be localised in the maps of a method, where that was measured."""
+
 
 class LocalisationSummary(NamedTuple):
     """The course of a localisation.
@@ -57,8 +62,12 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
         InputError: the map was made by a method in whose maps nothing can be localised.
     """
     if saved.config.backend != "recall":
-        expected = "a map of a method that can localise: recall"
-        raise InputError(str(saved.path), f"a map made by `backend: {saved.config.backend}`", expected)
+        found = f"a map made by `backend: {saved.config.backend}`"
+        reason = NOT_LOCALISED.get(saved.config.backend)
+        if reason:
+            found = f"{found}, {reason}"
+        cure = "map the place again with `backend: recall`"
+        raise InputError(str(saved.path), found, "a map made by `backend: recall`", cure)
     own = {name: getattr(config, name) for name in SourceConfig.model_fields}
     update = own | {"backend": "localise", "localise": LocaliseConfig(map=saved.path.resolve())}
     if config.localise.model_fields_set - {"map"}:

@@ -1,0 +1,34 @@
+"""Maps in which nothing can be localised are refused with the reason and the cure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ratslam.config.run_config import LoopConfig
+from ratslam.pipeline.localise import localising
+from ratslam.pipeline.saved_map import FORMAT, SavedMap
+from robot.sources.description import SourceDescription
+from tactile.base.errors import InputError
+
+
+def map_of(backend):
+    """A map file of a method, without its arrays."""
+    config = LoopConfig.model_validate({"backend": backend})
+    return SavedMap(Path("map.npz"), FORMAT, "", config, SourceDescription((1, 36, 1), 0, 10.0), "", {})
+
+
+@pytest.mark.parametrize(
+    ("backend", "reason"), [("grid", r"contacts of a session fit several poses"), ("classic", "classic")]
+)
+def test_other_methods_are_refused_with_the_cure(backend, reason):
+    saved = map_of(backend)
+    with pytest.raises(InputError, match=reason) as error:
+        localising(saved.config, saved)
+    assert "map the place again with `backend: recall`" in str(error.value)
+
+
+def test_a_recall_map_is_not_refused():
+    saved = map_of("recall")
+    assert localising(saved.config, saved).backend == "localise"
