@@ -9,8 +9,10 @@ import numpy as np
 from ratslam.alignment.ground import Ground
 from tactile.base.se2 import compose, inverse, wrap
 
+DEVIATIONS = 2.0
+"""Standard deviations of a supposed pose by which the reach of the ground grows."""
 MOST_REACH, MOST_REACH_HEADING = 3.0, 2.0
-"""Largest reaches after odometry alone, as multiples of those of the ground."""
+"""Largest reaches, as multiples of those of the ground."""
 
 
 class Supposed(NamedTuple):
@@ -36,7 +38,7 @@ STILL = Motion(np.zeros(3), np.zeros(3))
 
 
 def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None) -> tuple[Supposed, float]:
-    """Moves a supposed pose, and corrects it by the views that it is compared with.
+    """Moves a supposed pose, and corrects it by the keyframes near by, weighted by how well their views fit.
 
     Args:
         gain: [S, N] log-likelihood of the newest view at each keyframe less that at a new place; None if it
@@ -45,10 +47,10 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     Returns:
         the pose thereafter; the gain of the best keyframe near by, NaN where no keyframe is near.
     """
-    at = _move(at, moved)
+    at = move(at, moved)
     if gain is None:
         return at, np.nan
-    x, y, heading = np.sqrt(np.diag(at.covariance))
+    x, y, heading = DEVIATIONS * np.sqrt(np.diag(at.covariance))
     reach = min(ground.reach + max(x, y), MOST_REACH * ground.reach)
     reach_heading = min(ground.reach_heading + heading, MOST_REACH_HEADING * ground.reach_heading)
     shift, frame = ground.near(at.pose, reach, reach_heading)
@@ -64,7 +66,8 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
 
 
-def _move(at: Supposed, moved: Motion) -> Supposed:
+def move(at: Supposed, moved: Motion) -> Supposed:
+    """A pose moved by odometry, to first order in its noise (Smith and Cheeseman 1986)."""
     if not moved.motion.any() and not moved.variance.any():
         return at
     cosine, sine = np.cos(at.pose[2]), np.sin(at.pose[2])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ratslam.alignment.following import Motion
+from ratslam.alignment.following import Motion, Supposed, move
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import Hypotheses, SessionViews
@@ -27,31 +27,33 @@ if TYPE_CHECKING:
     import networkx
 
 CONFIRMING = 3
-"""Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
+"""Number of recalled poses in a row that have to agree with odometry before one is proposed."""
 UNEXPLAINED = 4.0
 """The session is not in the map if its views, were it there, would have given this multiple of the log-odds
 needed to be found, and the best supposed pose has less than half of these."""
+LARGEST_EXPONENT = 700.0
+"""Of a double, rounded down."""
 
 
 class Localisation(IntEnum):
     """Whether the robot's pose in the map is known."""
 
     SEARCHING = 0
-    """Not yet: what was seen so far fits several places, or none."""
+    """Not yet: the views so far fit several places, or none."""
     FOUND = 1
     """The pose is known."""
     LOST = 2
-    """It was known, but what was seen since does not fit it."""
+    """It was known, but the views since do not fit it."""
     NOT_THIS_MAP = 3
-    """So much has been seen that fits nowhere that the session is most likely not in this map, or in a part
-    that was never driven."""
+    """So many views fit nowhere that the session is most likely not in this map, or in a part that was never
+    driven."""
 
 
 class LocalisedPose(NamedTuple):
     """Attributes:
     state: see `Localisation`. pose: [3] the most likely pose in the map, m, m, rad; by odometry alone where
-        none was ever supposed. covariance: [3, 3] of it. mass: its probability against all other poses and
-        against not being in this map. log_odds: of the session being there.
+        none is supposed. covariance: [3, 3] of it, were it the right one. mass: its probability against all
+        other poses and against not being in this map. log_odds: of the session being there.
     """
 
     state: Localisation
@@ -82,7 +84,9 @@ class Localiser(Checkpointed, Map):
             places is subtracted.
     """
 
-    VALUES = ("_travel", "_state", "_recalled", "_anchor", "_last")
+    VALUES = (
+        "_travel", "_state", "_recalled", "_agreeing", "_newest", "_covariance", "_mass", "_log_odds",
+    )  # fmt: skip
     PARTS = ("_views", "_hypotheses")
 
     def __init__(self, place: Place, log_odds: float) -> None:
@@ -93,25 +97,20 @@ class Localiser(Checkpointed, Map):
         self._views, self._hypotheses = SessionViews(shifts, count), Hypotheses()
         self._travel = HALT
         self._state = int(Localisation.SEARCHING)
-        self._recalled = np.full(
-            5, np.nan
-        )  # keyframe and pose of the newest recalled pose, keyframes agreeing
-        self._anchor = np.zeros(3)  # pose of the newest keyframe
-        self._last = np.zeros(11)  # its covariance, mass and log-odds
+        self._recalled = np.full(3, np.nan)  # the newest recalled pose, moved on by odometry
+        self._agreeing = 0  # number of recalled poses in a row that agree with odometry
+        self._newest, self._covariance = np.zeros(3), np.zeros((3, 3))  # pose of the newest keyframe
+        self._mass, self._log_odds = 0.0, -self._places
         self._pose = GrowableArray((3,), np.float64)
-        self._known = GrowableArray((), np.int64)  # state of each step
-        self._frame = GrowableArray((), np.int64)  # step of each keyframe
+        self._states = GrowableArray((), np.int64)
         self._record = GrowableArray((3,), np.float64)  # mass, log-odds, greatest standard deviation
 
     # Queries
 
     def localisation(self) -> LocalisedPose:
-        """Where the robot is now."""
-        pose = compose(self._anchor, self._corrected()[0])
-        covariance = self._last[:9].reshape(3, 3)
-        return LocalisedPose(
-            Localisation(self._state), pose, covariance, float(self._last[9]), float(self._last[10])
-        )
+        """The robot's pose now, and whether it is known."""
+        now = move(Supposed(self._newest, self._covariance), self._moved())
+        return LocalisedPose(Localisation(self._state), *now, self._mass, self._log_odds)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         del estimate
@@ -123,11 +122,11 @@ class Localiser(Checkpointed, Map):
 
     def states(self) -> np.ndarray:
         """[T] the `Localisation` at each step."""
-        return self._known.rows.copy()
+        return self._states.rows.copy()
 
     def pieces(self) -> np.ndarray:
         """[T] 0 where the pose was found; each stretch between is a piece of its own."""
-        found = self._known.rows == Localisation.FOUND
+        found = self._states.rows == Localisation.FOUND
         begins = np.diff(found.astype(int), prepend=1) < 0
         return np.where(found, 0, np.cumsum(begins))
 
@@ -137,9 +136,7 @@ class Localiser(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the graph of the finished map."""
-        return {"localisation.csv": self._write} | {
-            name: write for name, write in self.place.map.files().items() if name == "map.json"
-        }
+        return {"localisation.csv": self._write, "map.json": self.place.map.files()["map.json"]}
 
     # Changes
 
@@ -149,102 +146,109 @@ class Localiser(Checkpointed, Map):
         if int(evidence.keyframe) >= 0:
             self._add_keyframe(evidence)
         now = self.localisation()
-        self._pose.append(now.pose)
-        self._known.append(int(now.state))
-        deviation = float(np.sqrt(max(now.covariance[0, 0], now.covariance[1, 1])))
-        self._record.append((now.mass, now.log_odds, deviation))
         spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
+        self._pose.append(now.pose)
+        self._states.append(int(now.state))
+        self._record.append((now.mass, now.log_odds, spread[:2].max()))
         lost = np.bool_(now.state != Localisation.FOUND)
         return estimate._replace(
             pose=now.pose, spread=spread, lost=lost, action=np.int32(Action.NONE), place=np.int32(-1)
         )
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The whole state, with the poses of the finished map."""
+        return super().arrays() | {"ground": self.place.ground.poses.copy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`.
+
+        Raises:
+            ValueError: the finished map has changed since.
+        """
+        if not np.array_equal(arrays["ground"], self.place.ground.poses):
+            raise ValueError("a session in another map, or in this one before it was changed")
+        super().restore(arrays)
+
     def _add_keyframe(self, evidence: Evidence) -> None:
         ground, odds = self.place.ground, self.place.odds
-        moved = Motion(*self._corrected())
+        moved = self._moved()
         gain = np.asarray(evidence.gain)[:, : len(ground.poses)] if bool(evidence.shows) else None
         self._views.append(moved, gain)
-        self._frame.append(len(self._pose.rows))
         self._hypotheses.advance(ground, odds, moved, gain)
         self._propose(evidence, moved)
         self._travel = HALT
         self._judge(moved)
 
-    def _corrected(self) -> tuple[np.ndarray, np.ndarray]:
-        """The motion since the newest keyframe without systematic errors, and its variance [3]."""
+    def _moved(self) -> Motion:
+        """The motion since the newest keyframe without the systematic errors that the map knows.
+
+        A map learns the noise of its own session, and little of it from few loop closures: the noise of
+        another session is not taken to be less than the settings say."""
         graph, (motion, length, turn) = self.place.graph, self._travel
         variance = graph.odometry_variance(np.array([length]), np.array([turn]))[0]
-        return graph.correct(motion, length), variance
+        variance[2] /= min(graph.heading_noise.factor, 1.0)
+        return Motion(graph.correct(motion, length), variance)
 
     def _propose(self, evidence: Evidence, moved: Motion) -> None:
-        """Proposes the recalled pose once it agrees with odometry for some keyframes.
-
-        `_recalled` holds the keyframe of the newest one, its pose, and how many in a row agree.
-        """
+        """Proposes the recalled pose once some in a row agree with odometry."""
+        expected = compose(self._recalled, moved.motion)
         if int(evidence.match) < 0 or float(evidence.posterior) <= 0.5:
-            self._recalled[1:4] = compose(self._recalled[1:4], moved.motion)
+            self._recalled = expected
             return
         ground = self.place.ground
-        shift = int(evidence.shift_row)
-        pose = ground.claims(np.array([shift]), np.array([int(evidence.match)]))[0]
-        expected = compose(self._recalled[1:4], moved.motion)
-        error = between(expected, pose)
+        shift, frame = np.array([int(evidence.shift_row)]), np.array([int(evidence.match)])
+        self._recalled = ground.claims(shift, frame)[0]
+        error = between(expected, self._recalled)
         agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
-        count = self._recalled[4] + 1 if agrees else 1.0
-        self._recalled = np.array([float(len(self._frame.rows)), *pose, count])
-        if count >= CONFIRMING:
-            self._hypotheses.propose(ground, self.place.odds, self._views, pose)
+        self._agreeing = self._agreeing + 1 if agrees else 1
+        if self._agreeing >= CONFIRMING:
+            self._hypotheses.propose(ground, self.place.odds, self._views, self._recalled)
 
     def _judge(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""
         known = self._hypotheses
         if not known.count:
-            self._anchor = compose(self._anchor, moved.motion)
-            self._last = np.array([*np.zeros(9), 0.0, -self._places])
-            self._judge_without(0.0)
+            self._newest, self._covariance = move(Supposed(self._newest, self._covariance), moved)
+            self._mass, self._log_odds = 0.0, -self._places
+            self._judge_unknown(0.0)
             return
         order = known.ranked()
         best, odds = int(order[0]), known.log_odds.rows
-        others = np.logaddexp.reduce([*(odds[order[1:]]), self._needed])
-        mass = float(1 / (1 + np.exp(np.minimum(others - odds[best], 700))))
+        others = np.logaddexp.reduce([*odds[order[1:]], self._needed])
+        self._newest, self._covariance = known.pose.rows[best].copy(), known.covariance.rows[best].copy()
+        self._mass = float(1 / (1 + np.exp(np.minimum(others - odds[best], LARGEST_EXPONENT))))
+        self._log_odds = float(odds[best] - self._places)
         rival = odds[order[1]] if known.count > 1 else -np.inf
-        self._anchor = known.pose.rows[best].copy()
-        self._last = np.array(
-            [*known.covariance.rows[best].reshape(-1), mass, float(odds[best] - self._places)]
-        )
         fell = known.best.rows[best] - odds[best] > self._needed
         if odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
             self._state = int(Localisation.FOUND)
-        elif self._state == Localisation.FOUND:
-            if fell or odds[best] < self._needed / 2:
-                self._lose()
-        else:
-            self._judge_without(float(odds[best]))
+        elif self._state != Localisation.FOUND:
+            self._judge_unknown(float(odds[best]))
+        elif fell or odds[best] < self._needed / 2:
+            self._lose()
 
-    def _judge_without(self, best: float) -> None:
-        """The state while no pose is found."""
+    def _judge_unknown(self, best: float) -> None:
+        """The state while no pose is found, and the best supposed one has these log-odds."""
         if self._state == Localisation.FOUND:
             self._lose()
-        seen = int(self._views.shows.rows.sum())
-        possible = seen * self.place.odds.expected
-        if possible >= UNEXPLAINED * self._needed and best < self._needed / 2:
+        possible = int(self._views.shows.rows.sum()) * self.place.odds.expected
+        if best >= self._needed / 2:
+            if self._state == Localisation.NOT_THIS_MAP:
+                self._state = int(Localisation.SEARCHING)
+        elif possible >= UNEXPLAINED * self._needed:
             self._state = int(Localisation.NOT_THIS_MAP)
-        elif self._state == Localisation.NOT_THIS_MAP:
-            self._state = int(Localisation.SEARCHING)
 
     def _lose(self) -> None:
-        """The pose is lost: the search begins anew, with what was seen from now on."""
+        """The pose is lost: the search begins anew, with the views from now on."""
         self._state = int(Localisation.LOST)
+        self._mass, self._log_odds = 0.0, -self._places
         self._hypotheses.clear()
         self._views.forget(0)
 
     def _write(self, path: Path) -> None:
         lines = ["step,state,mass,log_odds,sd"]
-        for step, (state, record) in enumerate(
-            zip(self._known.rows, self._record.rows.tolist(), strict=True)
-        ):
-            mass, log_odds, deviation = record
-            lines.append(
-                f"{step},{Localisation(int(state)).name.lower()},{mass!r},{log_odds!r},{deviation!r}"
-            )
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        rows = zip(self._states.rows.tolist(), self._record.rows.tolist(), strict=True)
+        for step, (state, (mass, log_odds, deviation)) in enumerate(rows):
+            name = Localisation(state).name.lower()
+            lines.append(f"{step},{name},{mass!r},{log_odds!r},{deviation!r}")
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")

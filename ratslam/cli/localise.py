@@ -11,9 +11,10 @@ from ratslam.cli.run import add_rerun, open_target
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
+    from ratslam.pipeline.saved_map import SavedMap
 
 CONFIGURATIONS = (".yaml", ".yml", "")
-"""Suffixes of a configuration; other files are recordings."""
+"""Suffixes of a configuration or its name; other files, and folders, are recordings."""
 
 
 def add_commands(commands: Commands) -> None:
@@ -38,13 +39,16 @@ def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics.scorecard import render_scorecard
     from ratslam.pipeline.localise import localise
+    from ratslam.pipeline.run import print_status
+    from ratslam.pipeline.saved_map import read_map
     from ratslam.viewer.observer import open_viewer
 
-    config, target = _read_recording(arguments), open_target(arguments)
+    target, saved = open_target(arguments), read_map(arguments.map, print_status)
+    config = _read_recording(arguments, saved)
     place = arguments.map.name.removesuffix(".npz") or "map"
     directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"
     with open_viewer(target) as observers:
-        card, summary, interrupted = localise(arguments.map, config, directory, observers)
+        card, summary, interrupted = localise(saved, config, directory, observers)
     print(render_scorecard(card))
     print(f"\n{summary.describe()}")
     print(f"{directory}/localisation.csv holds the state and the probability of every step,")
@@ -52,9 +56,11 @@ def _localise(arguments: argparse.Namespace) -> int:
     return INTERRUPTED if interrupted else 0
 
 
-def _read_recording(arguments: argparse.Namespace) -> RunConfig:
-    from ratslam.config.run_config import RunConfig, load_config
+def _read_recording(arguments: argparse.Namespace, saved: SavedMap) -> RunConfig:
+    from ratslam.config.run_config import load_config
+    from ratslam.pipeline.localise import recorded_alike
 
-    if arguments.recording.suffix in CONFIGURATIONS:
-        return load_config(arguments.recording, arguments.set)
-    return RunConfig.model_validate({"recording": {"file": str(arguments.recording.resolve())}})
+    file: Path = arguments.recording
+    if file.suffix in CONFIGURATIONS and not file.is_dir():
+        return load_config(file, arguments.set)
+    return recorded_alike(file, saved, arguments.set)

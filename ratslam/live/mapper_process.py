@@ -276,7 +276,7 @@ def run_mapper(line: Connection) -> None:
 def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
     from ratslam.pipeline.build_session import build_session
-    from ratslam.pipeline.runner import open_runner
+    from ratslam.pipeline.runner import check_finished_map, open_runner
     from ratslam.pipeline.saved_map import read_map
     from ratslam.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
@@ -286,6 +286,7 @@ def _map(line: Connection) -> None:
     with PipeSource(job, line) as fed, open_viewer(job.view) as observers:
         config = complete(job.config, fed, job.extent_m)
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
+        check_finished_map(config, source)
         session = build_session(config, source)
         blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers

@@ -10,13 +10,14 @@ import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.atlas.localiser import Localisation, Localiser
-from ratslam.backends.config import LocaliseConfig
 from ratslam.config.run_config import RunConfig, SourceConfig
+from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.run import print_status, process_source
 from ratslam.pipeline.runner import open_runner
-from ratslam.pipeline.saved_map import SavedMap, read_map
+from ratslam.pipeline.saved_map import SavedMap
 from ratslam.pipeline.source import open_observations
+from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
 
 NOT_LOCALISED = {
@@ -42,7 +43,7 @@ class LocalisationSummary(NamedTuple):
         if not len(found):
             return f"not found in {len(self.states)} steps: {describe_state(last)}"
         lost = int((np.diff((self.states == Localisation.FOUND).astype(int)) < 0).sum())
-        again = f", lost {lost} times" if lost else ""
+        again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
         return (
             f"found after {found[0] + 1} of {len(self.states)} steps, known in {len(found)} of them{again}; "
             f"at the end: {describe_state(last)}, probability {self.mass:.3f}"
@@ -55,8 +56,8 @@ def describe_state(state: Localisation) -> str:
 
 
 def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
-    """The configuration of a session that is localised in a saved map: source and touch of `config`, the rest
-    as the map was made.
+    """The configuration of a session that is localised in a saved map: source, touch and scores of `config`,
+    the rest as the map was made.
 
     Raises:
         InputError: the map was made by a method in whose maps nothing can be localised.
@@ -68,20 +69,35 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
             found = f"{found}, {reason}"
         cure = "map the place again with `backend: recall`"
         raise InputError(str(saved.path), found, "a map made by `backend: recall`", cure)
-    own = {name: getattr(config, name) for name in SourceConfig.model_fields}
-    update = own | {"backend": "localise", "localise": LocaliseConfig(map=saved.path.resolve())}
-    if config.localise.model_fields_set - {"map"}:
-        update["localise"] = config.localise.model_copy(update={"map": saved.path.resolve()})
-    return saved.config.model_copy(update=update | {"score": config.score})
+    own = {name: getattr(config, name) for name in (*SourceConfig.model_fields, "score")}
+    place = config.localise.model_copy(update={"map": saved.path.resolve()})
+    return saved.config.model_copy(update=own | {"backend": "localise", "localise": place})
+
+
+def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ()) -> RunConfig:
+    """The configuration of a recording by the sensor of a saved map: its readings become views as those of
+    the map did.
+
+    Args:
+        assignments: settings to replace, each `a.b=value`.
+
+    Raises:
+        InputErrors: the assignments have errors.
+    """
+    like, file = saved.config.recording, file.resolve()
+    recording = RecordingConfig(file=file) if like is None else like.model_copy(update={"file": file})
+    sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
+    text = dump(saved.config.model_copy(update=sources))
+    return validate(override(parse(text, str(saved.path)), assignments), RunConfig)
 
 
 def localise(
-    map: Path, config: RunConfig, directory: Path, observers: Sequence[Observer] = ()
+    saved: SavedMap, config: RunConfig, directory: Path, observers: Sequence[Observer] = ()
 ) -> tuple[Scorecard, LocalisationSummary, bool]:
     """Localises the source of a configuration in a saved map, which stays as it is.
 
     Args:
-        map: a run directory or its map file. config: with absolute paths; its source and touch are used.
+        saved: the map. config: with absolute paths; its source and touch are used.
         directory: the new run directory. observers: are told of the progress.
 
     Returns:
@@ -91,7 +107,6 @@ def localise(
         InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
             map.
     """
-    saved = read_map(map, print_status)
     with (
         open_observations(localising(config, saved), print_status) as (completed, source),
         open_runner(completed, source, directory, observers=observers) as runner,

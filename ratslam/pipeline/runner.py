@@ -207,9 +207,7 @@ def open_runner(
     if config.score.relations:
         read_relations(config.score.relations)  # fails before the directory is created
     build_metrics(config.score.metrics)
-    if config.localise.map is not None:
-        saved = read_map(config.localise.map)
-        check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+    check_finished_map(config, source)
     session = session or build_session(config, source)
     skip, estimate = _resume(session, resume, config, source) if resume else (0, START)
     if source.length is not None and source.length <= skip:
@@ -304,6 +302,14 @@ def _write_final_map(session: Session, directory: RunDirectory) -> None:
     pairs = session.map.closures()
     if "closures.csv" not in files and len(pairs):
         directory.file("closures.csv", lambda path: write_closure_pairs(path, pairs))
+
+
+def check_finished_map(config: RunConfig, source: Source) -> None:
+    """Raises `InputError` if the source cannot be localised in the map that the configuration names, because
+    the map is broken or of another sensor."""
+    if config.backend == "localise" and config.localise.map is not None:
+        saved = read_map(config.localise.map)
+        check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
 
 
 def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> tuple[int, PoseEstimate]:
