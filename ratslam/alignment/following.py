@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,13 @@ class Supposed(NamedTuple):
 
     pose: np.ndarray
     covariance: np.ndarray
+
+    def deviations(self) -> tuple[float, float]:
+        """Standard deviations: of the position in the direction where it is largest, m; of the heading,
+        rad."""
+        (xx, xy), (_, yy) = self.covariance[:2, :2].tolist()
+        largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+        return math.sqrt(largest), math.sqrt(self.covariance[2, 2])
 
 
 class Motion(NamedTuple):
@@ -50,9 +58,10 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     at = move(at, moved)
     if gain is None:
         return at, np.nan
-    x, y, heading = DEVIATIONS * np.sqrt(np.diag(at.covariance))
-    reach = min(ground.reach + max(x, y), MOST_REACH * ground.reach)
-    reach_heading = min(ground.reach_heading + heading, MOST_REACH_HEADING * ground.reach_heading)
+    position, heading = at.deviations()
+    reach = min(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
+    most = MOST_REACH_HEADING * ground.reach_heading
+    reach_heading = min(ground.reach_heading + DEVIATIONS * heading, most)
     shift, frame = ground.near(at.pose, reach, reach_heading)
     if not len(frame):
         return at, np.nan

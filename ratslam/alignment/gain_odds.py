@@ -10,8 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import isotonic_regression
-from scipy.special import ndtri
 
 BINS = 24
 """Number of bins of the gain."""
@@ -19,6 +17,9 @@ PRIOR_TRUE, PRIOR_FALSE = (1.9, 0.8), (0.5, 1.6)
 """Mean and standard deviation of the gains at true and at false poses, before any were counted, nat."""
 PRIOR_COUNT = 40.0
 """Number of gains that the prior counts as."""
+FARTHEST = 20.0
+"""Largest absolute value of the limits between bins, nat: gains beyond are certain, and finer bins tell
+more."""
 OUTLIERS = 0.04
 """Share of either distribution that is drawn from the other: something has changed, or was misread."""
 LEAVING = -2.0
@@ -42,13 +43,19 @@ class GainOdds(NamedTuple):
 
 def learn_gain_odds(true: np.ndarray, false: np.ndarray) -> GainOdds:
     """Log-odds of gains from those counted at true poses [n] and at false ones [m]."""
+    from scipy.optimize import isotonic_regression  # slow to import
+
     prior_true, prior_false = (_quantiles(*prior) for prior in (PRIOR_TRUE, PRIOR_FALSE))
     pooled = np.concatenate([true, false, prior_true, prior_false])
-    low, high = np.quantile(pooled, [0.005, 0.995]).tolist()
+    low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
     edges = np.linspace(low, high, BINS - 1)
     same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
-    mixed = (1 - OUTLIERS) * same + OUTLIERS * other
-    raw = np.log(mixed / ((1 - OUTLIERS) * other + OUTLIERS * same))
+    mixed_same, mixed_other = (
+        (1 - OUTLIERS) * same + OUTLIERS * other,
+        (1 - OUTLIERS) * other + OUTLIERS * same,
+    )
+    tiny = np.finfo(float).tiny  # a bin without counts has no odds
+    raw = np.log((mixed_same + tiny) / (mixed_other + tiny))
     # A better fit is never evidence against a place; bins without gains say little.
     odds = isotonic_regression(raw, weights=same + other + 1e-6).x
     return GainOdds(edges, odds, float(same @ odds))
@@ -56,6 +63,8 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray) -> GainOdds:
 
 def _quantiles(mean: float, deviation: float) -> np.ndarray:
     """Evenly spread quantiles of a normal distribution."""
+    from scipy.special import ndtri  # slow to import
+
     share = (np.arange(64) + 0.5) / 64
     return mean + deviation * ndtri(share)
 

@@ -103,7 +103,7 @@ class Localiser(Checkpointed, Map):
         self._mass, self._log_odds = 0.0, -self._places
         self._pose = GrowableArray((3,), np.float64)
         self._states = GrowableArray((), np.int64)
-        self._record = GrowableArray((3,), np.float64)  # mass, log-odds, greatest standard deviation
+        self._record = GrowableArray((3,), np.float64)  # mass, log-odds, largest standard deviation
 
     # Queries
 
@@ -149,7 +149,7 @@ class Localiser(Checkpointed, Map):
         spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
         self._pose.append(now.pose)
         self._states.append(int(now.state))
-        self._record.append((now.mass, now.log_odds, spread[:2].max()))
+        self._record.append((now.mass, now.log_odds, Supposed(now.pose, now.covariance).deviations()[0]))
         lost = np.bool_(now.state != Localisation.FOUND)
         return estimate._replace(
             pose=now.pose, spread=spread, lost=lost, action=np.int32(Action.NONE), place=np.int32(-1)
