@@ -125,10 +125,13 @@ class Localiser(Checkpointed, Map):
         return self._states.rows.copy()
 
     def pieces(self) -> np.ndarray:
-        """[T] 0 where the pose was found; each stretch between is a piece of its own."""
+        """[T] the piece of each step: all steps where the pose was found are one, and so is each stretch
+        between."""
         found = self._states.rows == Localisation.FOUND
-        begins = np.diff(found.astype(int), prepend=1) < 0
-        return np.where(found, 0, np.cumsum(begins))
+        begins = np.diff(found.astype(int), prepend=0) < 0
+        kinds = np.where(found, -1, np.cumsum(begins))
+        _, first, row = np.unique(kinds, return_index=True, return_inverse=True)
+        return np.argsort(np.argsort(first))[row]  # numbered as they appear
 
     def graph(self) -> networkx.DiGraph:
         """The graph of the finished map."""
@@ -150,9 +153,13 @@ class Localiser(Checkpointed, Map):
         self._pose.append(now.pose)
         self._states.append(int(now.state))
         self._record.append((now.mass, now.log_odds, Supposed(now.pose, now.covariance).deviations()[0]))
-        lost = np.bool_(now.state != Localisation.FOUND)
+        dtype = np.asarray(estimate.pose).dtype
         return estimate._replace(
-            pose=now.pose, spread=spread, lost=lost, action=np.int32(Action.NONE), place=np.int32(-1)
+            pose=now.pose.astype(dtype),
+            spread=spread.astype(dtype),
+            lost=np.bool_(now.state != Localisation.FOUND),
+            action=np.int32(Action.NONE),
+            place=np.int32(-1),
         )
 
     def arrays(self) -> dict[str, np.ndarray]:

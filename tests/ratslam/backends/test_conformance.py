@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ratslam.atlas.localiser import Localisation
 from ratslam.backends.grid import GridOutcome
 from ratslam.backends.registry import BACKENDS
 from ratslam.checks.backend import CHECKS
@@ -44,6 +47,7 @@ METHODS = {
     "classic": pose_cells("classic", "views"),
     "classic-labels": pose_cells("classic", "labels"),
     "grid": ("grid", {"grid": DOUBTFUL}),
+    "localise": pose_cells("localise", "views", **TOUCH),
 }
 EXAMPLE = "dead-reckoning"
 OFTEN = {"recall-labels", "classic-labels", "signed-touch"}
@@ -60,8 +64,17 @@ def trial_of(name):
     if name == EXAMPLE:
         return BackendTrial(dead_reckoning.ENTRY, dead_reckoning.Config())
     method, settings = METHODS[name]
+    if name == "localise":
+        settings = settings | {"localise": {"map": str(touch_map()), "log_odds": 3.0}}
     entry = BACKENDS.get(method, "backend")
     return BackendTrial(entry, entry.config_class.model_validate(settings))
+
+
+def touch_map():
+    """The file of the map that `touch` makes of the walk of the checks."""
+    file = Path(os.environ["RATSLAM_TEST_FOLDER"]) / f"touch_{os.getpid()}.npz"
+    np.savez(file, **trial_of("touch").arrays)
+    return file
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
@@ -94,7 +107,13 @@ def test_the_grid_filter_resamples_in_these_walks():
     assert 10 < (outcomes == GridOutcome.RESAMPLED).sum() < 330
 
 
-@pytest.mark.parametrize("name", some(["classic", "classic-labels", "grid", EXAMPLE]))
+def test_the_pose_is_found_and_searched_for_in_these_walks():
+    # Otherwise the checks of replay and checkpoints would not cover it.
+    states = trial_of("localise").map.states()
+    assert 100 < (states == Localisation.FOUND).sum() < 336
+
+
+@pytest.mark.parametrize("name", some(["classic", "classic-labels", "grid", "localise", EXAMPLE]))
 def test_memory_does_not_grow_on_known_ground(name):
     """Otherwise time and memory of long sessions on known ground would grow."""
     trial = trial_of(name)
