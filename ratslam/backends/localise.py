@@ -140,7 +140,7 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     """
     settings = config.localise
     if settings.map is None:
-        raise InputError("localise.map", "missing", "a map: a run directory or its map.npz")
+        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
     recall = RecallBackend(config, view_shape, dtype)
     return LocaliseBackend(recall, read_keyframe_map(recall, settings.map), settings.log_odds)
 

@@ -126,13 +126,14 @@ class SessionServer:
         mapper: float | None = 0.0,
         without: Sequence[str] = (),
         rate_check: bool = False,
+        options: Sequence[str] = (),
     ) -> Session:
         """Starts a session.
 
         Args:
             config: its configuration. mapper: s that the stub takes for each sample; None: no stub, the
                 mapper itself. without: libraries that it cannot import. rate_check: whether it checks the
-                head's rate.
+                head's rate. options: more of `live`.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -141,7 +142,7 @@ class SessionServer:
         file.write_text(json.dumps(config))
         log.touch()
         order = {
-            "arguments": ["live", str(file), "-o", str(folder / "run")],
+            "arguments": ["live", str(file), "-o", str(folder / "run"), *options],
             "log": str(log),
             "code": str(code),
             "mapper": mapper,
@@ -287,16 +288,22 @@ class Bench:
 
     @contextmanager
     def session(
-        self, mapper: float = 0.0, without: Sequence[str] = (), rate_check: bool = False, **settings: Any
+        self,
+        mapper: float | None = 0.0,
+        without: Sequence[str] = (),
+        rate_check: bool = False,
+        options: Sequence[str] = (),
+        **settings: Any,
     ) -> Iterator[Session]:
         """A quick session, started; its processes end with the block.
 
         Args:
-            mapper: s that it takes for each sample. without: libraries that it cannot import.
+            mapper: s that it takes for each sample; None: it maps. without: libraries that it cannot import.
             rate_check: whether it listens to the head for as long as in use and checks its rate.
-            settings: of the section `live`.
+            options: more of `live`. settings: of the section `live`.
         """
-        session = self._server.start({"live": self.quick(**settings)}, mapper, without, rate_check)
+        config = {"live": self.quick(**settings)}
+        session = self._server.start(config, mapper, without, rate_check, options)
         try:
             yield session
         finally:
