@@ -21,7 +21,12 @@ def test_odds_are_bounded_for_every_gain(true: np.ndarray, false: np.ndarray, ga
     odds = learn_gain_odds(true, false)
     assert abs(odds.of(gain)) <= MOST + 1e-9
     assert odds.odds.shape == (BINS,)
-    assert 0 <= odds.expected <= MOST  # at true poses the odds are for them on average
+    assert abs(odds.expected) <= MOST + 1e-9
+
+
+@given(GAINS, GAINS)
+def test_a_better_fit_is_never_evidence_against_a_place(true: np.ndarray, false: np.ndarray) -> None:
+    assert (np.diff(learn_gain_odds(true, false).odds) >= -1e-12).all()
 
 
 @given(SEEDS, st.floats(0.5, 3.0))
