@@ -18,6 +18,7 @@ from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.odometry_noise import HeadingNoise
 from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation, Odometry, observation
 from tests.ratslam.alignment.alignment_cases import (
@@ -33,7 +34,13 @@ from tests.ratslam.alignment.alignment_cases import (
 
 LOOP, ODDS = square_loop(), odds_of()
 COUNT, NEEDED = 60, 15.0
-MAP = KeyframeMap(KeyframeMapConfig(), 0.05, LabelAppearance(), AcceptByOdds, guard=20)
+
+
+def new_map() -> KeyframeMap:
+    return KeyframeMap(KeyframeMapConfig(), 0.05, LabelAppearance(), AcceptByOdds, guard=20)
+
+
+MAP = new_map()
 FOUND, LOST = Localisation.FOUND, Localisation.LOST
 BLANK = Estimate(np.zeros(3), np.zeros(3), np.int32(-1), np.int32(-1), np.int32(Action.NONE), np.bool_(True))
 
@@ -166,6 +173,18 @@ def test_without_views_the_pose_is_that_of_odometry() -> None:
     assert_same_pose(localiser.trajectory(), expected)
     assert np.diff([spread.max() for spread in spreads]).min() >= 0
     assert spreads[-1].min() > 0
+
+
+def test_what_a_map_learns_of_its_odometry_does_not_make_that_of_others_better() -> None:
+    def heading_spread(factor: float) -> float:
+        made, driven = new_map(), drive()
+        made.kept_keyframes().heading_noise = HeadingNoise(float(np.log(factor)))
+        localiser = Localiser(Place(made, LOOP.ground, ODDS), NEEDED)
+        nothing = Evidence(-1, -1, 0, 0.0, False, driven.evidence[0].gain)
+        return float([localiser.update(seen, BLANK, nothing) for seen in driven.observations][-1].spread[2])
+
+    assert heading_spread(0.5) == pytest.approx(heading_spread(1.0))
+    assert heading_spread(4.0) > 1.5 * heading_spread(1.0)
 
 
 def test_odometry_that_is_not_finite_is_left_out() -> None:
