@@ -6,11 +6,14 @@ unknown start by hypotheses is Fox et al. 1999."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ratslam.alignment.following import Motion, Supposed, advance
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
+from ratslam.alignment.interruptions import LONGEST, continue_states, summed, uninterrupted
 from ratslam.alignment.paths import Path, follow, keyframe_odds
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -23,6 +26,13 @@ HOPELESS = -25.0
 SAME_HEADING = 0.5
 """Difference in heading within which two supposed poses are the same, rad; in position it is the ground's
 reach."""
+
+
+class Recalled(NamedTuple):
+    """The pose [3] at which recall places the newest keyframe, m, m, rad, and the gain of its view there, nat."""
+
+    pose: np.ndarray
+    gain: float
 
 
 class SessionViews(Checkpointed):
@@ -77,13 +87,15 @@ class SessionViews(Checkpointed):
 class Hypotheses(Checkpointed):
     """Attributes:
     pose: [h, 3], covariance: [h, 3, 3] of each supposed pose now. log_odds: [h] of the session so far.
-    best: [h] largest log-odds so far. inside: [h] bool, on mapped ground.
+    states: [h, 1 + LONGEST] log-odds since it was proposed if the ground may have changed, see
+        `interruptions`. best: [h] the largest sum of these so far. inside: [h] bool, on mapped ground.
     """
 
     def __init__(self) -> None:
         self.pose = GrowableArray((3,), np.float64)
         self.covariance = GrowableArray((3, 3), np.float64)
         self.log_odds = GrowableArray((), np.float64)
+        self.states = GrowableArray((1 + LONGEST,), np.float64)
         self.best = GrowableArray((), np.float64)
         self.inside = GrowableArray((), np.bool_)
 
@@ -96,16 +108,29 @@ class Hypotheses(Checkpointed):
         """A supposed pose."""
         return Supposed(self.pose.rows[k], self.covariance.rows[k])
 
-    def advance(self, ground: Ground, odds: GainOdds, moved: Motion, gain: np.ndarray | None) -> None:
+    def advance(
+        self,
+        ground: Ground,
+        odds: GainOdds,
+        moved: Motion,
+        gain: np.ndarray | None,
+        recalled: Recalled | None = None,
+    ) -> None:
         """Moves all supposed poses to the newest keyframe; drops hopeless ones, and the weaker of two that
         have become one."""
+        log_odds = np.zeros(self.count)
         for k in range(self.count):
             at, gained = advance(ground, self.at(k), moved, gain)
-            log_odds, inside = keyframe_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
+            log_odds[k], inside = keyframe_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
             self.pose.rows[k], self.covariance.rows[k] = at
-            self.log_odds.rows[k] += log_odds
             self.inside.rows[k] = inside
-        self.best.rows[:] = np.maximum(self.best.rows, self.log_odds.rows)
+        self.log_odds.rows[:] += log_odds
+        elsewhere = np.zeros(self.count)
+        if recalled is not None:
+            another = ~same_pose(ground, self.pose.rows, recalled.pose)
+            elsewhere = np.where(another, max(odds.of(recalled.gain), 0.0), 0.0)
+        self.states.rows[:] = continue_states(self.states.rows, log_odds, elsewhere)
+        self.best.rows[:] = np.maximum(self.best.rows, summed(self.states.rows))
         self._drop(ground)
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
@@ -119,12 +144,17 @@ class Hypotheses(Checkpointed):
         self.pose.append(pose)
         self.covariance.append(np.diag(ground.variance))
         self.log_odds.append(total)
-        self.best.append(total)
+        self.states.append(uninterrupted(1)[0])
+        self.best.append(0.0)
         self.inside.append(True)
 
     def clear(self) -> None:
         """Drops all."""
         self._keep(np.zeros(self.count, bool))
+
+    def fall(self, k: int) -> float:
+        """By how much the log-odds of a supposed pose are below their best, changed ground allowed for."""
+        return float(self.best.rows[k] - summed(self.states.rows[k : k + 1])[0])
 
     def ranked(self) -> np.ndarray:
         """[h] the supposed poses by descending log-odds."""
@@ -140,7 +170,7 @@ class Hypotheses(Checkpointed):
             self._keep(np.isin(np.arange(self.count), kept))
 
     def _keep(self, rows: np.ndarray) -> None:
-        for array in (self.pose, self.covariance, self.log_odds, self.best, self.inside):
+        for array in (self.pose, self.covariance, self.log_odds, self.states, self.best, self.inside):
             array.replace(array.rows[rows].copy())
 
 

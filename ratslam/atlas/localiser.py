@@ -12,7 +12,8 @@ import numpy as np
 from ratslam.alignment.following import Motion, Supposed, move
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.hypotheses import Hypotheses, SessionViews
+from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
+from ratslam.alignment.interruptions import LONGEST
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -33,6 +34,8 @@ UNEXPLAINED = 4.0
 needed to be found, and the best supposed pose has less than half of these."""
 LARGEST_EXPONENT = 700.0
 """Of a double, rounded down."""
+UNCERTAIN = 2 * LONGEST
+"""Keyframes before a pose is lost at which it may have been wrong already."""
 
 
 class Localisation(IntEnum):
@@ -64,9 +67,15 @@ class LocalisedPose(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A finished map to localise in: its keyframe map, the ground, and the log-odds of gains on it."""
+    """A finished map to localise in.
+
+    Attributes:
+        map: its keyframe map. frames: [N] the keyframes of the ground, numbered as they were taken. ground:
+            them as ground. odds: log-odds of gains on it.
+    """
 
     map: KeyframeMap
+    frames: np.ndarray
     ground: Ground
     odds: GainOdds
 
@@ -74,6 +83,18 @@ class Place(NamedTuple):
     def graph(self) -> KeyframeGraph:
         """The keyframes that are not merged."""
         return self.map.kept_keyframes()
+
+
+class Visits(NamedTuple):
+    """The keyframes of a session whose pose in the map was found and that show something.
+
+    Attributes:
+        step: [K] of the session. pose: [K, 3] in the map, m, m, rad. view: [K, D] as the map stores views.
+    """
+
+    step: np.ndarray
+    pose: np.ndarray
+    view: np.ndarray
 
 
 class Localiser(Checkpointed, Map):
@@ -104,6 +125,10 @@ class Localiser(Checkpointed, Map):
         self._pose = GrowableArray((3,), np.float64)
         self._states = GrowableArray((), np.int64)
         self._record = GrowableArray((3,), np.float64)  # mass, log-odds, largest standard deviation
+        self._frame = GrowableArray((), np.int64)  # step of each keyframe
+        self._found = GrowableArray((3,), np.float64)  # its pose, NaN where that is not known
+        size = place.map.appearance.stored(place.frames[:1])[0].shape[1]
+        self._view = GrowableArray((size,), np.float64)  # its view
 
     # Queries
 
@@ -123,6 +148,12 @@ class Localiser(Checkpointed, Map):
     def states(self) -> np.ndarray:
         """[T] the `Localisation` at each step."""
         return self._states.rows.copy()
+
+    def visits(self) -> Visits:
+        """Where the session was in the map, and what it saw there."""
+        pose = self._found.rows
+        found = np.isfinite(pose[:, 0])
+        return Visits(self._frame.rows[found], pose[found], self._view.rows[found])
 
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step: all steps where the pose was found are one, and so is each stretch
@@ -147,6 +178,7 @@ class Localiser(Checkpointed, Map):
         """Moves all supposed poses by one step, and compares them with the view of a keyframe."""
         self._travel = self._travel.onwards(observation.odometry)
         if int(evidence.keyframe) >= 0:
+            self._view.append(self.place.map.appearance.view_of(observation))
             self._add_keyframe(evidence)
         now = self.localisation()
         spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
@@ -181,10 +213,15 @@ class Localiser(Checkpointed, Map):
         moved = self._moved()
         gain = np.asarray(evidence.gain)[:, : len(ground.poses)] if bool(evidence.shows) else None
         self._views.append(moved, gain)
-        self._hypotheses.advance(ground, odds, moved, gain)
-        self._propose(evidence, moved)
+        self._frame.append(len(self._pose.rows))
+        recalled = self._recall(evidence, moved)
+        self._hypotheses.advance(ground, odds, moved, gain, recalled)
+        if recalled is not None:
+            self._hypotheses.propose(ground, odds, self._views, recalled.pose)
         self._travel = HALT
         self._judge(moved)
+        known = self._state == Localisation.FOUND and gain is not None
+        self._found.append(self._newest if known else np.full(3, np.nan))
 
     def _moved(self) -> Motion:
         """The motion since the newest keyframe without the systematic errors that the map knows.
@@ -196,20 +233,20 @@ class Localiser(Checkpointed, Map):
         variance[2] /= min(graph.heading_noise.factor, 1.0)
         return Motion(graph.correct(motion, length), variance)
 
-    def _propose(self, evidence: Evidence, moved: Motion) -> None:
-        """Proposes the recalled pose once some in a row agree with odometry."""
+    def _recall(self, evidence: Evidence, moved: Motion) -> Recalled | None:
+        """The recalled pose once some in a row agree with odometry."""
         expected = compose(self._recalled, moved.motion)
         if int(evidence.match) < 0 or float(evidence.posterior) <= 0.5:
             self._recalled = expected
-            return
-        ground = self.place.ground
-        shift, frame = np.array([int(evidence.shift_row)]), np.array([int(evidence.match)])
-        self._recalled = ground.claims(shift, frame)[0]
+            return None
+        ground, shift, frame = self.place.ground, int(evidence.shift_row), int(evidence.match)
+        self._recalled = ground.claims(np.array([shift]), np.array([frame]))[0]
         error = between(expected, self._recalled)
         agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
         self._agreeing = self._agreeing + 1 if agrees else 1
-        if self._agreeing >= CONFIRMING:
-            self._hypotheses.propose(ground, self.place.odds, self._views, self._recalled)
+        if self._agreeing < CONFIRMING:
+            return None
+        return Recalled(self._recalled, float(np.asarray(evidence.gain)[shift, frame]))
 
     def _judge(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""
@@ -226,12 +263,12 @@ class Localiser(Checkpointed, Map):
         self._mass = float(1 / (1 + np.exp(np.minimum(others - odds[best], LARGEST_EXPONENT))))
         self._log_odds = float(odds[best] - self._places)
         rival = odds[order[1]] if known.count > 1 else -np.inf
-        fell = known.best.rows[best] - odds[best] > self._needed
+        fell = known.fall(best) > self._needed
         if odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
             self._state = int(Localisation.FOUND)
         elif self._state != Localisation.FOUND:
             self._judge_unknown(float(odds[best]))
-        elif fell or odds[best] < self._needed / 2:
+        elif fell:
             self._lose()
 
     def _judge_unknown(self, best: float) -> None:
@@ -249,6 +286,7 @@ class Localiser(Checkpointed, Map):
         """The pose is lost: the search begins anew, with the views from now on."""
         self._state = int(Localisation.LOST)
         self._mass, self._log_odds = 0.0, -self._places
+        self._found.rows[-UNCERTAIN:] = np.nan
         self._hypotheses.clear()
         self._views.forget(0)
 

@@ -84,6 +84,10 @@ class Appearance(Checkpointed, ABC):
         """The present metric of recall."""
 
     @abstractmethod
+    def view_of(self, observation: Observation) -> np.ndarray:
+        """[D] the view of an observation, as `stored` gives it of a keyframe."""
+
+    @abstractmethod
     def append(self, observation: Observation, turn: float, length: float) -> None:
         """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
 
@@ -122,6 +126,9 @@ class LabelAppearance(Appearance):
 
     def metric(self) -> ViewMetric:
         return ViewMetric(0.0, 0.0, NO_LIKENESS)
+
+    def view_of(self, observation: Observation) -> np.ndarray:
+        return np.zeros(0)
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
@@ -164,10 +171,13 @@ class ViewAppearance(Appearance):
     def metric(self) -> ViewMetric:
         return ViewMetric(self._fan.angle if self._fan else 0.0, self._scale[1], NO_LIKENESS)
 
-    def append(self, observation: Observation, turn: float, length: float) -> None:
+    def view_of(self, observation: Observation) -> np.ndarray:
         size = self._view.rows.shape[1]
         view = self._normalise(np.asarray(observation.view, float)) if size else np.zeros(0)
-        self._view.append(np.asarray(view, float).reshape(-1)[:size])
+        return np.asarray(view, float).reshape(-1)[:size]
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._view.append(self.view_of(observation))
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
 
@@ -238,11 +248,17 @@ class WhiskerAppearance(Appearance):
     def metric(self) -> ViewMetric:
         return ViewMetric(self._angle, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
-    def append(self, observation: Observation, turn: float, length: float) -> None:
+    @property
+    def layout(self) -> PixelLayout:
+        """The layout of the pixels."""
+        return self._pixels
+
+    def view_of(self, observation: Observation) -> np.ndarray:
         view = self._normalise(np.asarray(observation.view, float))
-        self._level.append(
-            pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
-        )
+        return pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._level.append(self.view_of(observation))
 
     def take(self, frames: np.ndarray) -> None:
         self._level.replace(self._level.rows[frames])

@@ -43,9 +43,12 @@ class SignedAppearance(Appearance):
     def metric(self) -> ViewMetric:
         return ViewMetric(0.0, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
-    def append(self, observation: Observation, turn: float, length: float) -> None:
+    def view_of(self, observation: Observation) -> np.ndarray:
         view = np.asarray(observation.view, float).reshape(-1)
-        self._image.append(stored_image(view, live_pixels(observation).reshape(-1)))
+        return stored_image(view, live_pixels(observation).reshape(-1))
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._image.append(self.view_of(observation))
 
     def take(self, frames: np.ndarray) -> None:
         self._image.replace(self._image.rows[frames])
