@@ -7,12 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evaluation.artifacts import change_table
 from evaluation.artifacts.closure_table import read_closures
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
 from evaluation.artifacts.run_directory import read_run, read_scorecard, read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays
+from evaluation.plots.change_plot import draw_changes
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
 from evaluation.plots.map_plot import draw_map
@@ -26,8 +28,8 @@ if TYPE_CHECKING:
 def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
     """The plots of a scored run: name -> function that draws the plot.
 
-    Every run has `map`, runs with whiskers also `whiskers` and `experiences`, runs with a grid map also
-    `grid`.
+    Every run has `map`, runs with whiskers also `whiskers` and `experiences`, sessions localised in a map also
+    `changes`, runs with a grid map also `grid`.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -39,6 +41,9 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         images = read_whisker_views(directory / "views.npz")
         plots["whiskers"] = lambda: draw_whiskers(run, card, images, walls)
         plots["experiences"] = lambda: draw_experience_history(run, card)
+    if (directory / change_table.NAME).exists():
+        changes = change_table.read_changes(directory / change_table.NAME)
+        plots["changes"] = lambda: draw_changes(card.name, run, changes, walls)
     if (directory / "grid.npz").exists():
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))
     return plots

@@ -79,10 +79,10 @@ class LocaliseBackend(Backend):
         self._recall, self._log_odds = recall, log_odds
         self._views = views = MapViews(recall, map.kept_keyframes())
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
-        kept = map.kept_keyframes().taken.rows
-        self._memory = views.freeze(kept, poses[kept])
-        odds = views.odds(np.arange(len(poses)), poses)
-        self._place = Place(map, views.ground(poses[kept]), odds)
+        frames, known = valid_keyframes(map), np.flatnonzero(~map.outdated.flags(len(poses)))
+        self._memory = views.freeze(frames, poses[frames])
+        odds = views.odds(known, poses[known])
+        self._place = Place(map, frames, views.ground(poses[frames]), odds)
 
     def init(self, key: Array, capacity: int) -> LocaliseState:
         """The map, and no idea where in it. `key` and `capacity` are not used."""
@@ -145,6 +145,12 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     return LocaliseBackend(recall, read_keyframe_map(recall, settings.map), settings.log_odds)
 
 
+def valid_keyframes(map: KeyframeMap) -> np.ndarray:
+    """[N] keyframes that are neither merged nor outdated, numbered as they were taken."""
+    kept = map.kept_keyframes()
+    return kept.taken.rows[~map.outdated.flags(kept.ever)[kept.taken.rows]]
+
+
 def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
     """The keyframe map in a map file that was made with these settings.
 
@@ -159,6 +165,6 @@ def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         expected = "a map made by `backend: recall` with the same settings"
         raise InputError(str(path), str(error) or type(error).__name__, expected) from None
-    if not map.kept_keyframes().count:
+    if not len(valid_keyframes(map)):
         raise InputError(str(path), "a map without keyframes", "a map in which a session can be found")
     return map

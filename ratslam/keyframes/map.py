@@ -33,6 +33,7 @@ from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.keyframes.optimizer import MapFit
+from ratslam.keyframes.outdated import OutdatedKeyframes
 from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
@@ -58,13 +59,13 @@ class KeyframeMap(Checkpointed, Map):
             study. acceptance: makes the rule for closure sequences. find_tie: see `FindTie`.
 
     Attributes:
-        log: of the keyframes that are not merged. archive, appearance: of all. merger, selection: at work.
+        log: of the kept keyframes. archive, appearance, outdated: of all. merger, selection: at work.
     """
 
     VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
-        "_live", "selection",
+        "_live", "selection", "outdated",
     )  # fmt: skip
 
     def __init__(
@@ -89,7 +90,7 @@ class KeyframeMap(Checkpointed, Map):
         self.selection = SelectionWorker(config.select_every)
         self._acceptance, self._find_tie = acceptance(self._graph), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
-        self._steps = StepRecord()
+        self._steps, self.outdated = StepRecord(), OutdatedKeyframes()
         self._travel = HALT
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece
@@ -110,8 +111,8 @@ class KeyframeMap(Checkpointed, Map):
         a bias that only views show may be wrong."""
         del estimate
         confirmed = (self.log.verdicts() == Verdict.ACCEPTED).any()
-        after = self._graph.pose_after if confirmed else self._graph.reckoned_after
-        return after(self._travel.motion, self._travel.length)
+        graph, (motion, length, _) = self._graph, self._travel
+        return graph.pose_after(motion, length) if confirmed else graph.reckoned_after(motion, length)
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
@@ -345,6 +346,5 @@ class KeyframeMap(Checkpointed, Map):
         self._forget_solution()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._forget_solution()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.atlas.localiser import Localisation, Localiser
 from ratslam.config.run_config import RunConfig, SourceConfig
@@ -30,14 +31,19 @@ class LocalisationSummary(NamedTuple):
     """The course of a localisation.
 
     Attributes:
-        states: [T] a `Localisation` after each step. mass: probability of the last pose.
+        states: [T] a `Localisation` after each step. mass: probability of the last pose. changes: places at
+            which the session does not agree with the map.
     """
 
     states: np.ndarray
     mass: float
+    changes: Sequence[ChangeRow]
 
     def describe(self) -> str:
-        """The summary in one sentence."""
+        """The summary in one sentence, and a line for each change."""
+        return "\n".join([self._describe_course(), *(change.describe() for change in self.changes)])
+
+    def _describe_course(self) -> str:
         found = np.flatnonzero(self.states == Localisation.FOUND)
         last = Localisation(int(self.states[-1])) if len(self.states) else Localisation.SEARCHING
         if not len(found):
@@ -115,5 +121,6 @@ def localise(
         card = runner.finish(interrupted)
         made = runner.session.map
         assert isinstance(made, Localiser)
-        summary = LocalisationSummary(made.states(), made.localisation().mass)
+        changes = read_changes(directory / NAME)
+        summary = LocalisationSummary(made.states(), made.localisation().mass, changes)
     return card, summary, interrupted

@@ -40,6 +40,7 @@ from ratslam.pipeline.artifacts import (
 )
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
+from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
 from ratslam.pipeline.run_directory import RunDirectory
@@ -135,6 +136,7 @@ class Runner:
         save_whisker_views(self._views, config.touch, directory)
         save_closure_views(self._images, directory)
         save_grid_map(directory)
+        save_changes(self.session.map, config.touch, directory)
         card = score_run(
             read_run(directory.path),
             directory.path.name,

@@ -1,0 +1,69 @@
+"""File `changes.csv`: places at which a localised session does not agree with the map."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tactile.base.errors import InputError
+
+NAME = "changes.csv"
+COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
+"""m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the session
+that contradict."""
+
+
+class ChangeRow(NamedTuple):
+    """One place, see `COLUMNS`."""
+
+    x: float
+    y: float
+    extent: float
+    kind: str
+    evidence: float
+    alarms: float
+    passes: int
+    first_step: int
+    last_step: int
+
+    def describe(self) -> str:
+        """The place in one line."""
+        what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
+        return (
+            f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, {self.passes} passes, "
+            f"steps {self.first_step} to {self.last_step}, evidence {self.evidence:.0f} nat"
+        )
+
+
+def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
+    """Writes the places, the surest first."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(changes)
+
+
+def read_changes(path: Path) -> list[ChangeRow]:
+    """Reads the places.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    rows = []
+    with path.open(encoding="utf-8", newline="") as file:
+        for number, line in enumerate(csv.DictReader(file), start=2):
+            try:
+                numbers = [float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")]
+                steps = [int(line[name]) for name in ("passes", "first_step", "last_step")]
+                kind = str(line["kind"])
+            except (KeyError, TypeError, ValueError):
+                expected = f"the columns {', '.join(COLUMNS)}"
+                raise InputError(f"{path}:{number}", "a malformed change", expected) from None
+            if not np.isfinite(numbers).all():
+                raise InputError(f"{path}:{number}", "a number that is not finite", "finite numbers")
+            rows.append(ChangeRow(*numbers[:3], kind, *numbers[3:], *steps))
+    return rows

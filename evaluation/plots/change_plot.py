@@ -1,0 +1,84 @@
+"""Plot of the places at which a localised session does not agree with its map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from evaluation.artifacts.change_table import ChangeRow
+from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.trajectory import align
+from evaluation.plots import style
+from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, wall_corners
+from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
+from tactile.base.se2 import compose
+
+_BOTTOM = 1.0  # inches below the axes
+_MARGIN = 0.06  # m around all
+_KINDS = {
+    "new": (VERMILLION, "something new"),
+    "gone": (GREEN, "something gone"),
+    "different": (PURPLE, "different"),
+}
+
+
+def draw_changes(
+    name: str, run: RunArrays, changes: Sequence[ChangeRow], walls: np.ndarray = NO_WALLS
+) -> style.Figure:
+    """Draws the path of a session in its map, and the changes.
+
+    Args:
+        name: of the run. run: its poses in the frame of the map. changes: the surest first. walls: [B, 5] west,
+            south, east, north, height, m, as the session found them; drawn with truth, in whose frame they are.
+    """
+    rows = truth_rows(run)
+    known = run.truth is not None and len(rows) > 0
+    move = align(run.final[rows], run.truth[rows]) if known and run.truth is not None else np.zeros(3)
+    path = compose(move, run.final)[:, :2]
+    places = np.array([[change.x, change.y, 0.0] for change in changes]).reshape(-1, 3)
+    places = compose(move, places)[:, :2]
+    shown = walls if known else NO_WALLS
+    low, high = bounds(path, places, wall_corners(shown))
+    low, high = low - _MARGIN, high + _MARGIN
+    inner = style.WIDTH - style.LEFT - style.RIGHT
+    tall = inner * (high - low)[1] / (high - low)[0]
+    figure = style.new_figure(tall + style.TOP + _BOTTOM, name, _headline(changes))
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    style.metre_grid(axes)
+    if len(shown):
+        draw_walls(axes, shown)
+    axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label="path in the map")
+    _mark(axes, changes, places, (high - low).max())
+    style.add_legend(figure, axes)
+    return figure
+
+
+def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, size: float) -> None:
+    from matplotlib.patches import Circle
+
+    labelled = set()
+    for number, (change, place) in enumerate(zip(changes, places, strict=True), start=1):
+        color, what = _KINDS[change.kind]
+        label = None if what in labelled else what
+        labelled.add(what)
+        radius = max(change.extent / 2, 0.02 * size)
+        ring = {"facecolor": (*_rgb(color), 0.18), "edgecolor": color, "lw": 2.0, "zorder": 6, "label": label}
+        axes.add_patch(Circle((place[0], place[1]), radius, **ring))
+        at = (place[0] + 1.1 * radius, place[1] + 1.1 * radius)
+        axes.text(*at, str(number), color=color, fontsize=11, fontweight="bold", zorder=7)
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    from matplotlib.colors import to_rgb
+
+    return to_rgb(color)
+
+
+def _headline(changes: Sequence[ChangeRow]) -> str:
+    if not changes:
+        return "the session agrees with the map"
+    places = "place has" if len(changes) == 1 else "places have"
+    surest = changes[0]
+    return f"{len(changes)} {places} changed  ·  surest: {surest.evidence:.0f} nat in {surest.passes} passes"

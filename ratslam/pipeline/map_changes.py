@@ -1,0 +1,58 @@
+"""Changes between a map and a session that is localised in it: the file changes.csv, and outdated keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from evaluation.artifacts.change_table import NAME, ChangeRow, write_changes
+from ratslam.atlas.change import Change
+from ratslam.atlas.localiser import Localiser
+from ratslam.atlas.session_changes import Touch, contradicted_keyframes, session_changes
+from ratslam.core.backend import Map
+from ratslam.pipeline.run_directory import RunDirectory
+from tactile.frontend import TouchConfig
+from tactile.whiskers.head_geometry import ur10_head
+
+
+def save_changes(map: Map, config: TouchConfig, directory: RunDirectory) -> None:
+    """Writes changes.csv of a session that was localised in a map."""
+    if isinstance(map, Localiser):
+        rows = change_rows(map, changes_of(map, config))
+        directory.file(NAME, lambda path: write_changes(path, rows))
+
+
+def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
+    """The places at which a localised session does not agree with its map, the surest first."""
+    return session_changes(localiser.place, localiser.visits(), _touch(config))
+
+
+def outdated_by(localiser: Localiser, config: TouchConfig) -> np.ndarray:
+    """[n] keyframes of the map that a localised session contradicts, numbered as they were taken: to be marked
+    (`KeyframeMap.outdated`) when the map takes up the session."""
+    changes = changes_of(localiser, config)
+    return contradicted_keyframes(localiser.place, localiser.visits(), _touch(config), changes)
+
+
+def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:
+    """The lines of changes.csv."""
+    steps = localiser.visits().step
+    return [
+        ChangeRow(
+            x=float(change.position[0]),
+            y=float(change.position[1]),
+            extent=change.extent,
+            kind=change.kind,
+            evidence=change.evidence,
+            alarms=change.alarms,
+            passes=change.passes,
+            first_step=int(steps[change.keyframes[0]]),
+            last_step=int(steps[change.keyframes[-1]]),
+        )
+        for change in changes
+    ]
+
+
+def _touch(config: TouchConfig) -> Touch:
+    return Touch(ur10_head(config.head), config.image.tallest)
