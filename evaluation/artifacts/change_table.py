@@ -13,8 +13,10 @@ from tactile.base.errors import InputError
 
 NAME = "changes.csv"
 COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
-"""m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the session
-that contradict."""
+"""m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the
+session that contradict."""
+
+NUMBERS = ("x", "y", "extent", "evidence", "alarms")
 
 
 class ChangeRow(NamedTuple):
@@ -34,8 +36,8 @@ class ChangeRow(NamedTuple):
         """The place in one line."""
         what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
         return (
-            f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, {self.passes} passes, "
-            f"steps {self.first_step} to {self.last_step}, evidence {self.evidence:.0f} nat"
+            f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, "
+            f"{self.passes} passes, steps {self.first_step} to {self.last_step}, evidence {self.evidence:.0f} nat"
         )
 
 
@@ -57,13 +59,13 @@ def read_changes(path: Path) -> list[ChangeRow]:
     with path.open(encoding="utf-8", newline="") as file:
         for number, line in enumerate(csv.DictReader(file), start=2):
             try:
-                numbers = [float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")]
-                steps = [int(line[name]) for name in ("passes", "first_step", "last_step")]
+                x, y, extent, evidence, alarms = (float(line[name]) for name in NUMBERS)
+                passes, first, last = (int(line[name]) for name in ("passes", "first_step", "last_step"))
                 kind = str(line["kind"])
             except (KeyError, TypeError, ValueError):
                 expected = f"the columns {', '.join(COLUMNS)}"
                 raise InputError(f"{path}:{number}", "a malformed change", expected) from None
-            if not np.isfinite(numbers).all():
+            if not np.isfinite([x, y, extent, evidence, alarms]).all():
                 raise InputError(f"{path}:{number}", "a number that is not finite", "finite numbers")
-            rows.append(ChangeRow(*numbers[:3], kind, *numbers[3:], *steps))
+            rows.append(ChangeRow(x, y, extent, kind, evidence, alarms, passes, first, last))
     return rows

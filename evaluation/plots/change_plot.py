@@ -29,8 +29,9 @@ def draw_changes(
     """Draws the path of a session in its map, and the changes.
 
     Args:
-        name: of the run. run: its poses in the frame of the map. changes: the surest first. walls: [B, 5] west,
-            south, east, north, height, m, as the session found them; drawn with truth, in whose frame they are.
+        name: of the run. run: its poses in the frame of the map. changes: the surest first. walls: [B, 5]
+            west, south, east, north, height, m, as the session found them; drawn with truth, in whose frame
+            they are.
     """
     rows = truth_rows(run)
     known = run.truth is not None and len(rows) > 0

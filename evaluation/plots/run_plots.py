@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
     """The plots of a scored run: name -> function that draws the plot.
 
-    Every run has `map`, runs with whiskers also `whiskers` and `experiences`, sessions localised in a map also
-    `changes`, runs with a grid map also `grid`.
+    Every run has `map`, runs with whiskers also `whiskers` and `experiences`, sessions localised in a map
+    also `changes`, runs with a grid map also `grid`.
 
     Raises:
         InputError: a file is missing or malformed.

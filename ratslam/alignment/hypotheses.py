@@ -29,7 +29,7 @@ reach."""
 
 
 class Recalled(NamedTuple):
-    """The pose [3] at which recall places the newest keyframe, m, m, rad, and the gain of its view there, nat."""
+    """The pose [3] at which recall places the newest keyframe, m, m, rad, and its gain there, nat."""
 
     pose: np.ndarray
     gain: float

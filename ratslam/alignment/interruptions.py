@@ -16,8 +16,8 @@ SHARE = 1e-4
 
 
 def uninterrupted(count: int) -> np.ndarray:
-    """[count, 1 + LONGEST] log-odds of poses at which all views agreed: of agreement, and of a changed stretch
-    that lasts 1, 2, ... more keyframes."""
+    """[count, 1 + LONGEST] log-odds of poses at which all views agreed: of agreement, and of a changed
+    stretch that lasts 1, 2, ... more keyframes."""
     states = np.full((count, 1 + LONGEST), -np.inf)
     states[:, 0] = 0.0
     return states
@@ -27,7 +27,7 @@ def continue_states(states: np.ndarray, odds: np.ndarray, elsewhere: np.ndarray)
     """The log-odds [n, 1 + LONGEST] after one more keyframe.
 
     Args:
-        odds: [n] log-odds of its view. elsewhere: [n] those at another place that it resembles, 0 without one.
+        odds: [n] log-odds of its view. elsewhere: [n] those at another place like it, 0 without one.
     """
     agrees, changed = states[:, 0], states[:, 1:]
     following = np.empty_like(states)

@@ -1,8 +1,9 @@
 """Places where a session that is localised in a map no longer agrees with it.
 
-Signs, each a point with evidence for a change, are summed over all passes within a radius (a scan statistic,
-Kulldorff 1997). The map's own revisits tell which sums come by chance: their largest are taken as exponentially
-distributed, as those of scan statistics are (Karlin & Altschul 1990). No constant is in units of the sensor."""
+Signs, each a point with evidence for a change, are summed over all passes within a radius (a scan
+statistic, Kulldorff 1997). The map's own revisits tell which sums come by chance: the largest are taken as
+exponentially distributed, as those of scan statistics are (Karlin & Altschul 1990). No constant is in units
+of the sensor."""
 
 from __future__ import annotations
 
@@ -58,8 +59,8 @@ class Change(NamedTuple):
 
     Attributes:
         position: [2] m, in the map, of what has changed. extent: m, along its longer axis. evidence: nat.
-        alarms: expected number of such places by chance. appears: share of the evidence for something that was
-            not there, -1 for something gone, .. 1. keyframes: [k] of the session that contradict, ascending.
+        alarms: expected number of such places by chance. appears: share of the evidence for something that
+            was not there, -1 for something gone, .. 1. keyframes: [k] of the session that contradict, ascending.
         passes: number of times the robot came by.
     """
 

@@ -1,8 +1,8 @@
 """Signs of a change from whisker images: contacts that a map does not expect, and expected ones that fail.
 
-Each pixel of an image is compared with those of the keyframes near by through the log-odds that recall learned
-(`ratslam.recall.whisker_likelihood`). The sign stands where the whisker touches, or where it touched in the map:
-at the wall, not at the robot."""
+Each pixel of an image is compared with those of the keyframes near by through the log-odds that recall
+learned (`ratslam.recall.whisker_likelihood`). The sign stands where the whisker touches, or where it touched
+in the map: at the wall, not at the robot."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def contact_map(
 def contact_points(
     poses: np.ndarray, levels: np.ndarray, head: Head, tallest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[n, D, 2] contact points (m) of images [n, D] of levels taken at poses [n, 3], and [n, D] bool, there is
-    one."""
+    """[n, D, 2] contact points (m) of images [n, D] of levels taken at poses [n, 3], and [n, D] bool,
+    there is one."""
     points, touched = image_points(head, level_heights(levels), tallest)
     body = np.concatenate([points, np.zeros((*points.shape[:-1], 1))], axis=-1)
     return compose(poses[:, None], body)[..., :2], touched
@@ -58,8 +58,8 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
     """The signs in K images of a session.
 
     Args:
-        poses: [K, 3] in the map. levels: [K, D] of the images. known: [K] number of the first keyframes of the
-            map with which each is compared.
+        poses: [K, 3] in the map. levels: [K, D] of the images. known: [K] number of the first keyframes of
+            the map with which each is compared.
     """
     points, touched = contact_points(poses, levels, made.head, made.tallest)
     found = [
@@ -111,8 +111,8 @@ def _compare(
 def compared_pixels(
     made: ContactMap, level: np.ndarray, near: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keyframes [n, 1], their pixels [n, D] that each pixel of an image of `level` [D] is compared with, and the
-    log-odds [n, D] that they show the same."""
+    """Keyframes [n, 1], their pixels [n, D] that each pixel of an image of `level` [D] is compared with,
+    and the log-odds [n, D] that they show the same."""
     shift, frame = near
     own = np.arange(len(level))
     reversed = np.cos(made.ground.turns[shift]) < 0

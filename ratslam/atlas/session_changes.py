@@ -50,8 +50,8 @@ def session_changes(place: Place, visits: Visits, touch: Touch) -> list[Change]:
 def contradicted_keyframes(
     place: Place, visits: Visits, touch: Touch, changes: Sequence[Change]
 ) -> np.ndarray:
-    """[n] keyframes of the map, numbered as they were taken, that `CONTRADICTIONS` passes of a session contradict
-    at places that have changed."""
+    """[n] keyframes of the map, numbered as they were taken, that `CONTRADICTIONS` passes of a session
+    contradict at places that have changed."""
     made = contacts_of(place, place.frames, touch)
     if made is None:
         return np.zeros(0, int)

@@ -29,6 +29,10 @@ class OutdatedKeyframes(Checkpointed):
         self._flags = self.flags(count)
         self._flags[frames] = True
 
+    def take(self, frames: np.ndarray) -> None:
+        """Keeps only keyframes [n], ascending, which are numbered anew."""
+        self._flags = self.flags(int(frames.max(initial=-1)) + 1)[frames]
+
     def arrays(self) -> dict[str, np.ndarray]:
         return {"flags": self._flags.copy()} if self._flags.any() else {}
 

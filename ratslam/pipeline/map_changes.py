@@ -1,4 +1,4 @@
-"""Changes between a map and a session that is localised in it: the file changes.csv, and outdated keyframes."""
+"""Changes between a map and a session localised in it: the file changes.csv, and outdated keyframes."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
 
 
 def outdated_by(localiser: Localiser, config: TouchConfig) -> np.ndarray:
-    """[n] keyframes of the map that a localised session contradicts, numbered as they were taken: to be marked
-    (`KeyframeMap.outdated`) when the map takes up the session."""
+    """[n] keyframes of the map that a localised session contradicts, numbered as they were taken: to be
+    marked (`KeyframeMap.outdated`) when the map takes up the session."""
     changes = changes_of(localiser, config)
     return contradicted_keyframes(localiser.place, localiser.visits(), _touch(config), changes)
 

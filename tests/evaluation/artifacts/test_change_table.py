@@ -18,7 +18,9 @@ def test_what_is_written_is_read(rows: list[ChangeRow], tmp_path: Path) -> None:
     assert read_changes(tmp_path / NAME) == rows
 
 
-@pytest.mark.parametrize("line", ["1,2", "a,0.2,0.15,new,240.5,0,7,76,402", "nan,0.2,0.15,new,240.5,0,7,76,402"])
+@pytest.mark.parametrize(
+    "line", ["1,2", "a,0.2,0.15,new,240.5,0,7,76,402", "nan,0.2,0.15,new,240.5,0,7,76,402"]
+)
 def test_a_malformed_line_is_named(line: str, tmp_path: Path) -> None:
     write_changes(tmp_path / NAME, [])
     with (tmp_path / NAME).open("a") as file:

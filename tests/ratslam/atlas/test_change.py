@@ -40,7 +40,9 @@ def test_a_change_is_named_where_it_is(appears: float, kind: str) -> None:
 def test_an_unchanged_wall_is_not_named() -> None:
     for seed in range(20):
         signs = walls(np.random.default_rng(seed))
-        assert find_changes(signs, learn_chance(walls(np.random.default_rng(seed + 100)), RADIUS), RADIUS) == []
+        assert (
+            find_changes(signs, learn_chance(walls(np.random.default_rng(seed + 100)), RADIUS), RADIUS) == []
+        )
 
 
 def test_places_are_named_by_descending_evidence() -> None:
@@ -63,7 +65,9 @@ def test_passes_are_told_apart() -> None:
     count = 30
     keyframe = np.repeat([0, 2 * PASS, 5 * PASS], count // 3)
     points = np.random.default_rng(4).normal(0.0, 0.01, (count, 2))
-    (change,) = find_changes(Signs(points, np.full(count, 3.0), np.ones(count), keyframe, 400), CHANCE, RADIUS)
+    (change,) = find_changes(
+        Signs(points, np.full(count, 3.0), np.ones(count), keyframe, 400), CHANCE, RADIUS
+    )
     assert change.passes == 3
 
 

@@ -1,4 +1,4 @@
-"""A session in a corridor whose wall is gone for a stretch: the stretch is named, its keyframes are outdated."""
+"""A session in a corridor whose wall is gone for a stretch: it is named, and its keyframes are outdated."""
 
 from __future__ import annotations
 

@@ -25,3 +25,10 @@ def test_a_checkpoint_restores_the_marks_and_has_none_without_them() -> None:
     assert np.flatnonzero(other.flags(9)).tolist() == [3]
     other.restore({})
     assert not other.flags(9).any()
+
+
+def test_a_part_of_the_keyframes_keeps_its_marks() -> None:
+    outdated = OutdatedKeyframes()
+    outdated.mark(np.array([1, 4]))
+    outdated.take(np.array([0, 4, 7]))
+    assert outdated.flags(3).tolist() == [False, True, False]
