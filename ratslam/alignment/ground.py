@@ -43,6 +43,10 @@ class Ground(NamedTuple):
         shift, row = np.nonzero(turned < reach_heading)
         return shift, close[row]
 
+    def is_near(self, pose: np.ndarray, reach: float) -> bool:
+        """Whether a robot at `pose` [3] is compared with a keyframe within `reach`, m."""
+        return bool(reach >= self.reach or len(self.near(pose, reach, self.reach_heading)[0]))
+
     def claims(self, shift: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """[n, 3] poses of a robot whose view is that of keyframes [n] at sector shifts [n]."""
         claimed = self.poses[frame].copy()

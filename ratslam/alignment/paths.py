@@ -27,18 +27,20 @@ def follow(
     at: Supposed,
     onwards: Iterable[tuple[Motion, np.ndarray | None]],
     least: float = -np.inf,
+    near: float = np.inf,
 ) -> Path:
     """The path from a supposed pose on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
         onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
-            nothing.
+            nothing. near: largest distance, m, from a keyframe of the ground at which a view counts.
     """
     poses, covariances, gained = [at.pose], [at.covariance], [0.0]
     total, inside = 0.0, True
     for moved, gains in onwards:
         at, gain = advance(ground, at, moved, gains)
-        log_odds, inside = keyframe_odds(odds, gain, inside, gains is not None)
+        shows = gains is not None and (np.isnan(gain) or ground.is_near(at.pose, near))
+        log_odds, inside = keyframe_odds(odds, gain, inside, shows)
         poses.append(at.pose)
         covariances.append(at.covariance)
         gained.append(log_odds)

@@ -27,23 +27,38 @@ class Traverse(NamedTuple):
 
     Attributes:
         views: compared with the ground. motions: [n] into each keyframe, the first one's not used.
+        near: largest distance, m, from a keyframe of the ground at which a view counts. hopeless: log-odds of
+            the way to either end below which a placement is dropped.
     """
 
     views: Comparison
     motions: list[Motion]
+    near: float = np.inf
+    hopeless: float = HOPELESS
 
-    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Path | None:
-        """The path over all n keyframes on which keyframe k is at `pose` [3]; None if it is hopeless."""
-        at, count = Supposed(pose, np.diag(ground.variance)), len(self.motions)
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path on which keyframe k is at `pose` [3], to both ends of the session unless it is hopeless."""
+        at = Supposed(pose, np.diag(ground.variance))
         views, motions = self.views, self.motions
         back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))
-        before = follow(ground, odds, at, back, HOPELESS)
-        onwards = ((motions[i], views.gains(i)) for i in range(k + 1, count))
-        after = follow(ground, odds, at, onwards, HOPELESS)
-        if len(before.poses) + len(after.poses) <= count:
-            return None
-        parts = zip(before, after, strict=True)
-        return Path(*(np.concatenate([one[:0:-1], other]) for one, other in parts))
+        before = follow(ground, odds, at, back, self.hopeless, self.near)
+        onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
+        after = follow(ground, odds, at, onwards, self.hopeless, self.near)
+        parts = (np.concatenate([one[:0:-1], other]) for one, other in zip(before, after, strict=True))
+        return Stretch(k + 1 - len(before.poses), Path(*parts))
+
+
+class Stretch(NamedTuple):
+    """The path over consecutive keyframes of a session, from keyframe `first` on."""
+
+    first: int
+    path: Path
+
+    def passes(self, ground: Ground, k: int, pose: np.ndarray) -> bool:
+        """Whether keyframe k of the session is at `pose` [3]."""
+        row = k - self.first
+        inside = 0 <= row < len(self.path.poses)
+        return inside and bool(same_pose(ground, self.path.poses[row : row + 1], pose)[0])
 
 
 def motions_between(poses: np.ndarray, variance: np.ndarray) -> list[Motion]:
@@ -57,13 +72,18 @@ def motions_between(poses: np.ndarray, variance: np.ndarray) -> list[Motion]:
 
 
 def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[Path]:
-    """The different placements of a session that recall proposes, those with the largest log-odds first."""
+    """The different placements of a session that recall proposes and that are not hopeless, those with the
+    largest log-odds first."""
+    tried: list[Stretch] = []
     found: list[Path] = []
     for k, pose in _proposals(ground, session):
-        if not any(same_pose(ground, path.poses[k : k + 1], pose)[0] for path in found):
-            path = session.follow(ground, odds, k, pose)
-            if path is not None and not any(_is_same(ground, path, other) for other in found):
-                found.append(path)
+        if any(stretch.passes(ground, k, pose) for stretch in tried):
+            continue
+        tried.append(session.follow(ground, odds, k, pose))
+        path = tried[-1].path
+        whole = len(path.poses) == len(session.motions)
+        if whole and not any(_is_same(ground, path, other) for other in found):
+            found.append(path)
     return sorted(found, key=lambda path: -path.odds.sum())
 
 

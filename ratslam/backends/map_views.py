@@ -57,12 +57,16 @@ class MapViews:
         self._compare = jax.jit(self._look_at_many)
         self._gains = jax.jit(self._gains_of_many)
 
-    def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
-        """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3]."""
+    def freeze(self, frames: np.ndarray, poses: np.ndarray, capacity: int = 0) -> Memory:
+        """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3].
+
+        Args:
+            capacity: rows; 0: as many as it takes.
+        """
         recall, graph = self.recall, self.graph
         feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
         views, labels = graph.appearance.stored(frames)
-        capacity = capacity_at(len(labels))
+        capacity = capacity or capacity_at(len(labels))
         return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
 
     def ground(self, poses: np.ndarray) -> Ground:

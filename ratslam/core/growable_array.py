@@ -26,6 +26,10 @@ class GrowableArray:
         self._buffer[self._count] = row
         self._count += 1
 
+    def extend(self, rows: np.ndarray) -> None:
+        """Appends rows [n, ...]."""
+        self.replace(np.concatenate([self.rows, rows]))
+
     def replace(self, rows: np.ndarray) -> None:
         """Replaces all rows."""
         capacity = max(16, 1 << (len(rows) - 1).bit_length())

@@ -100,6 +100,13 @@ class Appearance(Checkpointed, ABC):
         return NO_ESTIMATE
 
     @abstractmethod
+    def extend(self, other: Appearance) -> None:
+        """Adds the views of another map of the same sensor; the metric is learned anew by `relearn`."""
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        """Learns the metric anew from all views and these confirmed pairs."""
+
+    @abstractmethod
     def take(self, frames: np.ndarray) -> None:
         """Reduces the views to those of keyframes [n]; what was learned of the sensor stays."""
 
@@ -132,6 +139,10 @@ class LabelAppearance(Appearance):
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
+
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, LabelAppearance)
+        self._label.extend(other._label.rows)
 
     def take(self, frames: np.ndarray) -> None:
         self._label.replace(self._label.rows[frames])
@@ -180,6 +191,17 @@ class ViewAppearance(Appearance):
         self._view.append(self.view_of(observation))
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
+
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, ViewAppearance)
+        if self._fan and other._fan and len(other._view.rows) > len(self._view.rows):
+            self._fan = deepcopy(other._fan)  # the longer session knows the sectors better
+        self._view.extend(other._view.rows)
+        self._background.extend(other._background.rows)
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        self._scale = 0, self._scale[1]
+        self._rescale()
 
     def take(self, frames: np.ndarray) -> None:
         self._view.replace(self._view.rows[frames])
@@ -260,6 +282,16 @@ class WhiskerAppearance(Appearance):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._level.append(self.view_of(observation))
 
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, WhiskerAppearance)
+        self._level.extend(other._level.rows)
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        frame, match, reversed = pairs
+        images = self._level.rows
+        variation = estimate_variation(images[frame], self._images(match, reversed))
+        self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
+
     def take(self, frames: np.ndarray) -> None:
         self._level.replace(self._level.rows[frames])
 
@@ -268,10 +300,7 @@ class WhiskerAppearance(Appearance):
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:
-            frame, match, reversed = confirmed_pairs()
-            images = self._level.rows
-            variation = estimate_variation(images[frame], self._images(match, reversed))
-            self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
+            self.relearn(confirmed_pairs())
         return NO_ESTIMATE
 
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:

@@ -48,7 +48,8 @@ class UnmergedMap(Checkpointed):
             graph.pose.rows[:] = selected.poses
             graph.bias, graph.turn_error = selected.calibration
             selected.log.confirm(graph.config.merge_stood)
-            self.kept, self.onto, self.offset = find_merge(graph, selected.log) or no_merge(graph.count)
+            merge = find_merge(graph, selected.log, graph.config.merge_newest)
+            self.kept, self.onto, self.offset = merge or no_merge(graph.count)
         return self
 
     def replace(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Merge:

@@ -54,14 +54,22 @@ class KeyframeMerger(Checkpointed):
         if not self.merge_due or self.archive_selection.busy:
             return None
         self.merge_due = False
-        merge = find_merge(graph, log)
+        merge = self.merge_all(graph, log, selection, graph.config.merge_newest)
         if merge is None:
             return None
-        self._archive.merge(merge, graph, log)
-        _merge(merge, graph, log, selection)
         experiences.merge(merge.kept, merge.onto, merge.offset)
         views = graph.appearance.stored(graph.taken.rows)
         return MergedRows(merge.kept, *views, merge.onto, merge.offset)
+
+    def merge_all(
+        self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, newest: int
+    ) -> Merge | None:
+        """Merges the keyframes of confirmed ground but the `newest`; None without any."""
+        merge = find_merge(graph, log, newest)
+        if merge is not None:
+            self._archive.merge(merge, graph, log)
+            _merge(merge, graph, log, selection)
+        return merge
 
     def _replace(
         self,

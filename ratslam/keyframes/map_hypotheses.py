@@ -45,6 +45,12 @@ class MapHypotheses(Checkpointed):
         self._calibration = np.zeros((1, 2))  # [K, 2] heading bias and turn error
         self._followed = np.zeros(0, np.int64)  # sequences
 
+    def begin(self, fit: MapFit, sequences: int) -> None:
+        """Goes back to one map, that of a fit, which has followed the first `sequences` sequences."""
+        self.poses = fit.poses[None].copy()
+        self._calibration = np.array([[fit.bias, fit.turn_error]])
+        self._followed = np.arange(sequences)
+
     def follow(self, case: SelectionProblem, sequences: np.ndarray) -> list[MapFit]:
         """The maps, cheapest first, after the sequences that they have not followed yet.
 

@@ -50,12 +50,12 @@ def no_merge(count: int) -> Merge:
     return Merge(np.arange(count), np.arange(count), np.zeros((count, 3)))
 
 
-def find_merge(graph: KeyframeGraph, log: ClosureLog) -> Merge | None:
-    """The keyframes of confirmed ground and the older ones at the same pose in the same piece; None without
-    any."""
+def find_merge(graph: KeyframeGraph, log: ClosureLog, newest: int) -> Merge | None:
+    """The keyframes of confirmed ground and the older ones at the same pose in the same piece, the `newest`
+    left out; None without any."""
     count, guard = graph.count, graph.guard
     sure = np.flatnonzero(_confirmed_ground(graph, log))
-    sure = sure[(sure > guard) & (sure < count - graph.config.merge_newest)]
+    sure = sure[(sure > guard) & (sure < count - newest)]
     kept, onto, offset = np.ones(count, bool), np.arange(count), np.zeros((count, 3))
     pose, piece = graph.pose.rows, graph.pieces(log)
     whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too

@@ -50,6 +50,18 @@ class SignedAppearance(Appearance):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._image.append(self.view_of(observation))
 
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, SignedAppearance)
+        self._image.extend(other._image.rows)
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        images, count = self._image.rows, len(self._image.rows)
+        row = np.arange(count)
+        moved = (row + (count * APART[:, None]).astype(int)) % count
+        apart = np.column_stack([np.tile(row, len(APART)), moved.ravel()])
+        known = ImagePairs(images[pairs.frame], images[pairs.match])
+        self._likeness = pack(learn(images, known, apart))
+
     def take(self, frames: np.ndarray) -> None:
         self._image.replace(self._image.rows[frames])
 
@@ -59,11 +71,7 @@ class SignedAppearance(Appearance):
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
         count = len(self._image.rows)
         if count >= MIN_KEYFRAMES and count % LOG_ODDS_INTERVAL == 0:
-            frame, match, _ = confirmed_pairs()
-            images, row = self._image.rows, np.arange(count)
-            moved = (row + (count * APART[:, None]).astype(int)) % count
-            apart = np.column_stack([np.tile(row, len(APART)), moved.ravel()])
-            self._likeness = pack(learn(images, ImagePairs(images[frame], images[match]), apart))
+            self.relearn(confirmed_pairs())
         return NO_ESTIMATE
 
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:

@@ -61,13 +61,13 @@ def log_of(*sequences, stood=STOOD):
 
 def merged(graph, log):
     """The numbers of the merged keyframes."""
-    merge = find_merge(graph, log)
+    merge = find_merge(graph, log, NEWEST)
     return [] if merge is None else np.flatnonzero(~merge.is_kept()).tolist()
 
 
 def test_confirmed_keyframes_are_merged_with_those_of_the_lap_before():
     graph = graph_of(circle(100))
-    merge = find_merge(graph, log_of(range(45, 76)))
+    merge = find_merge(graph, log_of(range(45, 76)), NEWEST)
     assert merged(graph, log_of(range(45, 76))) == list(range(45, 76))
     assert merge.kept[merge.onto[45:76]].tolist() == list(range(5, 36))
     assert np.abs(merge.offset).max() < 1e-9
@@ -76,7 +76,7 @@ def test_confirmed_keyframes_are_merged_with_those_of_the_lap_before():
 
 def test_keyframes_of_several_laps_are_merged_with_the_first():
     graph = graph_of(circle(130))
-    merge = find_merge(graph, log_of(range(45, 110)))
+    merge = find_merge(graph, log_of(range(45, 110)), NEWEST)
     assert merge.kept[merge.onto[85:105]].tolist() == list(range(5, 25))
 
 
@@ -154,8 +154,8 @@ def test_keyframes_without_older_ones_are_not_merged():
 
 def test_nothing_is_merged_on_new_ground():
     straight = np.column_stack([STEP * np.arange(100), np.zeros(100), np.zeros(100)])
-    assert find_merge(graph_of(straight), log_of(range(45, 76))) is None
-    assert find_merge(graph_of(circle(100)), ClosureLog()) is None
+    assert find_merge(graph_of(straight), log_of(range(45, 76)), NEWEST) is None
+    assert find_merge(graph_of(circle(100)), ClosureLog(), NEWEST) is None
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_merged_keyframes_are_near_each_other_and_face_alike(aside, turn, met):
 def test_keyframes_that_face_opposite_ways_are_merged_with_whiskers_only(appearance):
     there = np.column_stack([STEP * np.arange(50), np.zeros(50), np.full(50, 0.05)])
     back = np.column_stack([STEP * np.arange(50)[::-1], np.full(50, 0.1), np.full(50, wrap(np.pi - 0.1))])
-    merge = find_merge(graph_of(np.vstack([there, back]), appearance), log_of(range(65, 85)))
+    merge = find_merge(graph_of(np.vstack([there, back]), appearance), log_of(range(65, 85)), NEWEST)
     if appearance is LabelAppearance:
         assert merge is None
     else:
@@ -191,7 +191,7 @@ def test_a_merge_is_one_of_older_kept_keyframes_at_the_same_pose(seed, whiskers,
     poses[:, 2] = wrap(np.round(poses[:, 2]) + stream.normal(0, 0.05, count))
     graph = graph_of(poses, Whiskers if whiskers else LabelAppearance, merge_newest=newest)
     log = log_of(*np.split(np.arange(LAP, count), np.sort(stream.integers(0, count - LAP, 4))))
-    merge = find_merge(graph, log)
+    merge = find_merge(graph, log, NEWEST)
     if merge is None:
         return
     kept = merge.is_kept()
