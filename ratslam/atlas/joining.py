@@ -32,6 +32,10 @@ STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 
 
+Stretches = tuple[int, ...]
+"""Numbers of the stretches of keyframes, each from one beginning of a piece to the next, that a piece has."""
+
+
 class Views(Protocol):
     """Compares the views of a map's keyframes, numbered among all ever taken."""
 
@@ -52,14 +56,14 @@ class Join(NamedTuple):
     """What joined two pieces.
 
     Attributes:
-        stretches: the stretches of keyframes (from one beginning of a piece to the next) that either had.
-        motion: [3] brings the second piece to where it is in the first one, m, m, rad; sd: [3] of it, at the
-            middle of the common ground. log_odds: of the second piece in the first and of the first in the
+        stretches: of either.
+        start: [3] pose of the second piece's first keyframe in the first piece, m, m, rad. sd: [3] of a pose
+            in the second piece against the first one, in the middle of their common ground. log_odds: of the second piece in the first and of the first in the
             second. needed: log-odds that each needed. closures: number between the two.
     """
 
-    stretches: tuple[tuple[int, ...], tuple[int, ...]]
-    motion: np.ndarray
+    stretches: tuple[Stretches, Stretches]
+    start: np.ndarray
     sd: np.ndarray
     log_odds: tuple[float, float]
     needed: tuple[float, float]
@@ -79,15 +83,20 @@ class _Found(NamedTuple):
     needed: float
 
 
-def join_all(map: KeyframeMap, views: Views, report: Callable[[str], None] = lambda _: None) -> list[Join]:
-    """Joins pieces of a map, two at a time, until nothing joins any more; then merges keyframes on common
+def join_all(
+    map: KeyframeMap,
+    views: Views,
+    tried: set[tuple[Stretches, Stretches]],
+    report: Callable[[str], None] = lambda _: None,
+) -> list[Join]:
+    """Joins pieces of a map, two at a time, until nothing joins any more, and merges keyframes on common
     ground.
 
     Args:
-        report: called with a line for each pair of pieces that is compared.
+        tried: pairs of pieces that do not join; those found now are added. report: called with a line for
+            each pair that is compared.
     """
     joins: list[Join] = []
-    tried: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
     while (join := _join_some(map, views, tried, report)) is not None:
         joins.append(join)
         _merge_keyframes(map)
@@ -97,7 +106,7 @@ def join_all(map: KeyframeMap, views: Views, report: Callable[[str], None] = lam
 def _join_some(
     map: KeyframeMap,
     views: Views,
-    tried: set[tuple[tuple[int, ...], tuple[int, ...]]],
+    tried: set[tuple[Stretches, Stretches]],
     report: Callable[[str], None],
 ) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
@@ -124,6 +133,7 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     if not found or not back or not _agree(graph, found, back):
         return None
     sequences = _closures(graph, found)
+    start = compose(found.motion, graph.pose.rows[other[0]])
     trial, log = graph.copy(), map.log.copy()
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
     first, solution = log.sequences, _solve_with(trial, log, sequences)
@@ -136,7 +146,7 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     middle = sequences[len(sequences) // 2][0]
     covariance = graph.map_covariance(map.log).relative(middle.match, middle.keyframe, 0.0)
     return Join(
-        ((), ()), found.motion, np.sqrt(np.diag(covariance)),
+        ((), ()), start, np.sqrt(np.diag(covariance)),
         (found.placement.log_odds, back.placement.log_odds), (found.needed, back.needed),
         sum(len(sequence) for sequence in sequences),
     )  # fmt: skip

@@ -20,10 +20,11 @@ from ratslam.recall.config import sector_shifts
 from ratslam.recall.frozen import first_keyframes, frozen_memory
 from ratslam.recall.memory import MapFeedback, Memory
 from ratslam.recall.observation_model import ObservationLikelihood
+from tactile.base.se2 import between, compose
 from tactile.base.types import Array
 
 if TYPE_CHECKING:
-    from ratslam.backends.recall import RecallBackend
+    from ratslam.backends.recall import RecallBackend, RecallState
 
 TOGETHER = 64
 """Number of views compared in one compiled call."""
@@ -56,6 +57,18 @@ class MapViews:
         self.shifts = sector_shifts(self.config)
         self._compare = jax.jit(self._look_at_many)
         self._gains = jax.jit(self._gains_of_many)
+
+    def remember(self, state: RecallState) -> RecallState:
+        """A state of the recall backend, with room for them, with all keyframes that are not merged; its
+        posterior is empty. Where each keyframe's packet was follows from its pose and the packet of the state,
+        which is that of the newest."""
+        graph, recall = self.graph, self.recall
+        frozen = self.freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
+        ahead = between(graph.pose.rows[-1], graph.pose.rows)
+        packet = compose(np.asarray(state.cells.pose) * recall.units, ahead) / recall.units % recall.rings
+        rows = np.zeros(frozen.packet.shape, frozen.packet.dtype)
+        rows[: len(packet)] = packet
+        return state._replace(memory=frozen._replace(packet=jnp.asarray(rows)))
 
     def freeze(self, frames: np.ndarray, poses: np.ndarray, capacity: int = 0) -> Memory:
         """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3].

@@ -16,6 +16,7 @@ from ratslam.cli import (
     localise,
     look,
     maps,
+    merge,
     path,
     reproduce,
     run,
@@ -25,7 +26,7 @@ from ratslam.cli import (
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.errors import InputError
 
-MODULES = (run, live, localise, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
+MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
 """The commands, in the order of the help."""
 GROUPS = ("run", "live", "maps", "look", "study", "papers", "files")
 """Headings of the help, in this order."""

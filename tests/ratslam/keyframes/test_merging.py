@@ -191,7 +191,7 @@ def test_a_merge_is_one_of_older_kept_keyframes_at_the_same_pose(seed, whiskers,
     poses[:, 2] = wrap(np.round(poses[:, 2]) + stream.normal(0, 0.05, count))
     graph = graph_of(poses, Whiskers if whiskers else LabelAppearance, merge_newest=newest)
     log = log_of(*np.split(np.arange(LAP, count), np.sort(stream.integers(0, count - LAP, 4))))
-    merge = find_merge(graph, log, NEWEST)
+    merge = find_merge(graph, log, newest)
     if merge is None:
         return
     kept = merge.is_kept()

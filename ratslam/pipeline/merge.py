@@ -1,0 +1,211 @@
+"""Merges saved maps into one."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.trajectory import write_tum
+from ratslam.atlas.joining import Join, Stretches, join_all
+from ratslam.atlas.union import renew_experiences, unite
+from ratslam.backends.map_views import MapViews
+from ratslam.backends.recall import RecallBackend
+from ratslam.config.strict_yaml import dump
+from ratslam.core.session import Session
+from ratslam.keyframes.map import KeyframeMap
+from ratslam.pipeline.estimate import START
+from ratslam.pipeline.saved_map import NAME, SavedMap, digest_of, read_map, write_map
+from ratslam.pipeline.sensor import check_same_sensor
+from tactile.base.errors import InputError
+
+
+class MergeReport(NamedTuple):
+    """What was merged.
+
+    Attributes:
+        maps: the inputs in the order of their steps in the merged map. joins: what joined pieces, in order,
+            with the numbers of the maps that had them. pieces: [n] for each piece of the merged map the
+            numbers of the maps with steps in it. steps: [n] of each map. keyframes: not merged, of the merged
+            map. before: the same of all maps together.
+    """
+
+    maps: tuple[Path, ...]
+    joins: tuple[tuple[Join, Stretches, Stretches], ...]
+    pieces: tuple[tuple[int, ...], ...]
+    steps: tuple[int, ...]
+    keyframes: int
+    before: int
+
+    def describe(self) -> str:
+        """Which maps were joined where, and what stayed apart, as text."""
+        lines = [f"{number + 1}  {path}, {self.steps[number]} steps" for number, path in enumerate(self.maps)]
+        for join, one, other in self.joins:
+            x, y, heading = join.start
+            sd_x, sd_y, sd_heading = join.sd
+            lines.append(
+                f"{_names(other)} joined to {_names(one)}, where it begins at {x:.2f} m, {y:.2f} m, "
+                f"{np.degrees(heading):.1f} degrees (sd {sd_x:.3f} m, {sd_y:.3f} m, "
+                f"{np.degrees(sd_heading):.1f} degrees); log-odds {join.log_odds[0]:.0f} and "
+                f"{join.log_odds[1]:.0f} (needed {join.needed[0]:.0f}); {join.closures} closures"
+            )
+        pieces = [_names(piece) for piece in self.pieces]
+        if not self.joins:
+            lines.append("Nothing in the views joins these maps: they stay pieces of the merged map.")
+        if len(pieces) > 1:
+            lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
+        lines.append(f"{self.keyframes} keyframes of {self.before}")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON."""
+        return {
+            "maps": [str(path) for path in self.maps],
+            "steps": list(self.steps),
+            "joins": [
+                {
+                    "maps": [list(one), list(other)],
+                    "start": join.start.tolist(),
+                    "sd": join.sd.tolist(),
+                    "log_odds": list(join.log_odds),
+                    "needed": list(join.needed),
+                    "closures": join.closures,
+                }
+                for join, one, other in self.joins
+            ],
+            "pieces": [list(piece) for piece in self.pieces],
+            "keyframes": self.keyframes,
+            "keyframes_before": self.before,
+        }
+
+
+def merge_maps(
+    paths: Sequence[Path], output: Path, report: Callable[[str], None] = lambda _: None
+) -> MergeReport:
+    """Writes one map of several sessions with one sensor; the order of `paths` does not matter.
+
+    Args:
+        output: a new map file (`.npz`), or a new folder for it with its trajectory and graph. It appears
+            complete, at the end. report: called with sentences about the progress.
+
+    Raises:
+        InputError: a map cannot be read or merged, or the output exists.
+    """
+    maps = sorted((read_map(path, report) for path in paths), key=lambda one: one.digest)
+    _check(maps)
+    session, made = _open(maps[0])
+    backend = session.backend
+    assert isinstance(backend, RecallBackend)
+    steps, before = [maps[0].steps], made.kept_keyframes().count
+    owner = [0] * _stretches(made)
+    tried: set[tuple[Stretches, Stretches]] = set()
+    joins = _join(made, backend, tried, owner, report)
+    for number, saved in enumerate(maps[1:], 1):
+        _, other = _open(saved)
+        steps.append(saved.steps)
+        before += other.kept_keyframes().count
+        owner += [number] * _stretches(other)
+        made = unite(made, other, backend.new_map())
+        report(f"adding {saved.path}")
+        joins += _join(made, backend, tried, owner, report)
+    renew_experiences(made)
+    session.map, views = made, MapViews(backend, made)
+    session.change_rows(made.kept_keyframes().count, sum(steps), views.remember)
+    piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
+    found = MergeReport(
+        tuple(saved.path for saved in maps),
+        tuple(joins),
+        tuple(tuple(np.unique(owners[piece == k]).tolist()) for k in range(int(piece.max()) + 1)),
+        tuple(steps),
+        made.kept_keyframes().count,
+        before,
+    )
+    _write(output, session, maps, found)
+    return found
+
+
+def _join(
+    made: KeyframeMap,
+    backend: RecallBackend,
+    tried: set[tuple[Stretches, Stretches]],
+    owner: list[int],
+    report: Callable[[str], None],
+) -> list[tuple[Join, Stretches, Stretches]]:
+    joins = join_all(made, MapViews(backend, made), tried, report)
+    return [(join, _owners(join.stretches[0], owner), _owners(join.stretches[1], owner)) for join in joins]
+
+
+def _owners(stretches: Stretches, owner: Sequence[int]) -> tuple[int, ...]:
+    return tuple(sorted({owner[stretch] for stretch in stretches}))
+
+
+def _stretches(made: KeyframeMap) -> int:
+    return int(made.kept_keyframes().begins.rows.sum()) + 1
+
+
+def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
+    session = saved.open_session()
+    if not isinstance(session.map, KeyframeMap) or not session.map.kept_keyframes().count:
+        found = f"a map of `backend: {saved.config.backend}` without keyframes"
+        raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
+    return session, session.map
+
+
+def _check(maps: Sequence[SavedMap]) -> None:
+    """Raises `InputError` if maps cannot be merged."""
+    if len(maps) < 2:
+        raise InputError("merge", "one map", "two or more maps")
+    for saved in maps:
+        if saved.config.backend != "recall":
+            reason = "has no keyframes whose views could be compared"
+            found = f"a map of `backend: {saved.config.backend}`, which {reason}"
+            raise InputError(str(saved.path), found, "maps of `backend: recall`")
+        check_same_sensor(str(maps[0].path), maps[0].sensor, saved.sensor)
+    contents: dict[str, Path] = {}
+    for saved in maps:
+        content = digest_of(saved.arrays)
+        if content in contents:
+            raise InputError(
+                str(saved.path), f"the same map as {contents[content]}", "maps of other sessions"
+            )
+        contents[content] = saved.path
+
+
+def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
+    """Writes the map file, or a folder with it, its settings, trajectory, graph and the report."""
+    made, first = session.map, maps[0]
+    name = " + ".join(dict.fromkeys(saved.source.name for saved in maps))
+    estimate = START._replace(pose=made.trajectory()[-1])
+
+    def write(file: Path) -> None:
+        source = replace(first.source, name=name)
+        write_map(file, session, first.config, source, estimate=estimate)
+
+    if output.suffix == ".npz":
+        write(output)
+        return
+    folder = Path(mkdtemp(dir=output.parent, prefix=f".{output.name}."))
+    try:
+        write(folder / NAME)
+        (folder / "config.yaml").write_text(dump(first.config), encoding="utf-8")
+        (folder / "merge.json").write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
+        path = made.trajectory()
+        write_tum(folder / "trajectory.tum", np.arange(len(path), dtype=float), path)
+        for file, write_file in made.files().items():
+            write_file(folder / file)
+        folder.chmod(0o755)
+        os.rename(folder, output)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _names(maps: Sequence[int]) -> str:
+    """Maps by their numbers from 1."""
+    return " + ".join(str(number + 1) for number in maps)
