@@ -56,10 +56,10 @@ class Join(NamedTuple):
     """What joined two pieces.
 
     Attributes:
-        stretches: of either.
-        start: [3] pose of the second piece's first keyframe in the first piece, m, m, rad. sd: [3] of a pose
-            in the second piece against the first one, in the middle of their common ground. log_odds: of the second piece in the first and of the first in the
-            second. needed: log-odds that each needed. closures: number between the two.
+        stretches: of either. start: [3] pose of the second piece's first keyframe in the first piece, m, m,
+            rad. sd: [3] of a pose in the second piece against the first one, in the middle of their common
+            ground. log_odds: of the second piece in the first and of the first in the second. needed:
+            log-odds that each needed. closures: number between the two.
     """
 
     stretches: tuple[Stretches, Stretches]
