@@ -14,20 +14,34 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ratslam.alignment.comparison import Comparison
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.following import Motion
+from ratslam.alignment.gain_odds import LEAVING, GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.atlas.placement import Placement, Traverse, find_placements, motions_between
+from ratslam.alignment.hypotheses import same_pose
+from ratslam.alignment.paths import Path
+from ratslam.atlas.cross_closures import closures_along
+from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.recall.memory import Memory
 from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
 
 LOG_ODDS = 15.0
 """Least log-odds of a placement, beyond the logarithm of the number of places."""
 LEAST = 10
 """Least number of keyframes of a piece that is joined."""
+HOPELESS = -60.0
+"""Log-odds of the way to either end of a piece below which a placement is dropped."""
+NEAR = 0.5
+"""Largest distance from a keyframe at which a view counts, as a multiple of the ground's reach: beside the
+driven way views differ, although the placement is right."""
+SOLVED = 0.1
+"""Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
+LEARNED = 3000
+"""Largest number of keyframes, the newest, from which the log-odds of gains on a piece are learned."""
 STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 
@@ -39,17 +53,17 @@ Stretches = tuple[int, ...]
 class Views(Protocol):
     """Compares the views of a map's keyframes, numbered among all ever taken."""
 
+    def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
+        """The memory of keyframes `frames` [N] at `poses` [N, 3]."""
+
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
 
     def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
         """The log-odds of gains on the ground of keyframes `frames` [N] at `poses` [N, 3]."""
 
-    def compare(
-        self, frames: np.ndarray, poses: np.ndarray, others: np.ndarray, motion: np.ndarray
-    ) -> Comparison:
-        """The views of keyframes `others` [n], moved by `motion` [n, 3] into each, on the ground of keyframes
-        `frames` [N] at `poses` [N, 3]."""
+    def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
+        """The views of keyframes `frames` [n], moved by `motion` [n, 3] into each."""
 
 
 class Join(NamedTuple):
@@ -71,16 +85,22 @@ class Join(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A placement beyond doubt: of keyframes `frames` [n] on `ground` of keyframes `onto` [N]; `motion` [3]
-    brings them there."""
+    """A placement beyond doubt: of keyframes `frames` [n] on `ground` of keyframes `onto` [N]. on: [n] bool,
+    those on it. motion: [3] brings them there."""
 
     onto: np.ndarray
     frames: np.ndarray
     ground: Ground
     views: Comparison
-    placement: Placement
+    path: Path
+    on: np.ndarray
     motion: np.ndarray
     needed: float
+
+    @property
+    def log_odds(self) -> float:
+        """Of the whole piece being there."""
+        return float(self.path.odds.sum())
 
 
 def join_all(
@@ -128,8 +148,8 @@ def _join_some(
 def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) -> Join | None:
     """Joins two pieces of keyframes `one` [N] and `other` [n] if the evidence suffices."""
     graph = map.kept_keyframes()
-    found = _place(graph, views, one, other)
-    back = found and _place(graph, views, other, one)
+    found = _place(map, views, one, other)
+    back = found and _place(map, views, other, one)
     if not found or not back or not _agree(graph, found, back):
         return None
     sequences = _closures(graph, found)
@@ -147,58 +167,62 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     covariance = graph.map_covariance(map.log).relative(middle.match, middle.keyframe, 0.0)
     return Join(
         ((), ()), start, np.sqrt(np.diag(covariance)),
-        (found.placement.log_odds, back.placement.log_odds), (found.needed, back.needed),
+        (found.log_odds, back.log_odds), (found.needed, back.needed),
         sum(len(sequence) for sequence in sequences),
     )  # fmt: skip
 
 
-def _place(graph: KeyframeGraph, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
+def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
     """The placement of keyframes `frames` [n] on those `onto` [N], if it is beyond doubt."""
+    graph, archive = map.kept_keyframes(), map.archive
     taken, pose = graph.taken.rows, graph.pose.rows
-    ground = views.ground(pose[onto])
-    own = pose[frames]
+    ground, own = views.ground(pose[onto]), pose[frames]
     motion = between(own[np.maximum(np.arange(len(own)) - 1, 0)], own)
-    variance = graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
-    compared = views.compare(taken[onto], pose[onto], taken[frames], motion)
-    odds = views.odds(taken[onto], pose[onto])
-    placements = find_placements(ground, odds, Traverse(compared, motions_between(own, variance)))
+    variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
+    motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
+    compared = views.compare(views.freeze(taken[onto], pose[onto]), taken[frames], motion)
+    every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
+    every = every[-LEARNED:]
+    odds = views.odds(every, archive.poses(pose)[every])
+    session = Traverse(compared, motions, NEAR * ground.reach, HOPELESS)
+    paths = find_placements(ground, odds, session)
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
-    if not placements or placements[0].log_odds < needed:
+    if not paths or paths[0].odds.sum() < needed:
         return None
-    best, *others = placements
-    rivals = [one.log_odds for one in others if not best.is_like(ground, one)]
-    if best.log_odds - max(rivals, default=-np.inf) < needed:
+    best, *others = paths
+    on = (best.odds != 0) & (best.odds != LEAVING)
+    rivals = [float(path.odds.sum()) for path in others if not _is_like(ground, best, path, on)]
+    if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
-    on = best.on_ground()
-    moved = fit_rigid_motion(own[on], best.path.poses[on])
-    return _Found(onto, frames, ground, compared, best, moved, needed)
+    moved = fit_rigid_motion(own[on], best.poses[on])
+    return _Found(onto, frames, ground, compared, best, on, moved, needed)
+
+
+def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
+    """Whether two paths are together at most of the keyframes `on` the ground [n]."""
+    poses = zip(path.poses[on], other.poses[on], strict=True)
+    return bool(np.mean([same_pose(ground, one[None], pose)[0] for one, pose in poses]) > 0.5)
 
 
 def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
     """Whether two placements, of either piece in the other, are the same."""
-    on = found.placement.on_ground()
-    own = graph.pose.rows[found.frames][on]
+    own = graph.pose.rows[found.frames][found.on]
     apart = between(compose(found.motion, own), compose(inverse(back.motion), own))
     far, turned = np.median(np.hypot(*apart[:, :2].T)), np.median(np.abs(wrap(apart[:, 2])))
     return bool(far < 2 * found.ground.reach and turned < found.ground.reach_heading)
 
 
 def _closures(graph: KeyframeGraph, found: _Found) -> list[list[Candidate]]:
-    """Closure sequences along a placement: of each keyframe on common ground with the one there whose view
-    fits best."""
+    """Closure sequences along a placement."""
     sequences: list[list[Candidate]] = []
-    ground, last = found.ground, -graph.config.max_gap - 1
-    for k in np.flatnonzero(found.placement.on_ground()).tolist():
-        shift, row = ground.near(found.placement.path.poses[k], ground.reach, ground.reach_heading)
-        gains = found.views.gain[k][shift, row].astype(float)
-        if not len(row) or gains.max() <= 0:
+    last = -graph.config.max_gap - 1
+    for k, row, shift, gain in closures_along(found.ground, found.views, found.path):
+        if not found.on[k]:
             continue
-        best = int(np.argmax(gains))
-        turn = float(ground.turns[shift[best]])
-        frame, match = int(found.frames[k]), int(found.onto[row[best]])
         if k - last > graph.config.max_gap:
             sequences.append([])
-        sequences[-1].append(_candidate(graph, frame, match, turn, float(gains[best])))
+        frame, match = int(found.frames[k]), int(found.onto[row])
+        sequences[-1].append(_candidate(graph, frame, match, float(found.ground.turns[shift]), gain))
         last = k
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
 

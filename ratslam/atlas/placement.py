@@ -37,7 +37,7 @@ class Traverse(NamedTuple):
     hopeless: float = HOPELESS
 
     def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
-        """The path on which keyframe k is at `pose` [3], to both ends of the session unless it is hopeless."""
+        """The path with keyframe k at `pose` [3], to both ends of the session unless it is hopeless."""
         at = Supposed(pose, np.diag(ground.variance))
         views, motions = self.views, self.motions
         back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))

@@ -60,7 +60,7 @@ class MapViews:
 
     def remember(self, state: RecallState) -> RecallState:
         """A state of the recall backend, with room for them, with all keyframes that are not merged; its
-        posterior is empty. Where each keyframe's packet was follows from its pose and the packet of the state,
+        posterior is empty. Where each packet was follows from the poses and the packet of the state,
         which is that of the newest."""
         graph, recall = self.graph, self.recall
         frozen = self.freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])

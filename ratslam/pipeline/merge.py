@@ -116,7 +116,7 @@ def merge_maps(
         report(f"adding {saved.path}")
         joins += _join(made, backend, tried, owner, report)
     renew_experiences(made)
-    session.map, views = made, MapViews(backend, made)
+    session.map, views = made, MapViews(backend, made.kept_keyframes())
     session.change_rows(made.kept_keyframes().count, sum(steps), views.remember)
     piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
     found = MergeReport(
@@ -138,7 +138,7 @@ def _join(
     owner: list[int],
     report: Callable[[str], None],
 ) -> list[tuple[Join, Stretches, Stretches]]:
-    joins = join_all(made, MapViews(backend, made), tried, report)
+    joins = join_all(made, MapViews(backend, made.kept_keyframes()), tried, report)
     return [(join, _owners(join.stretches[0], owner), _owners(join.stretches[1], owner)) for join in joins]
 
 

@@ -52,9 +52,7 @@ def test_the_odometry_of_either_is_corrected_as_by_its_own_calibration(united):
         own = made(bias)
         fit, before = own.solution().fit, own.keyframes()
         assert abs(fit.bias - bias) < abs(bias) / 2  # each has found its own
-        expected = correct_heading(
-            before.motion.rows[1:], before.length.rows[1:], fit.bias, fit.turn_error
-        )
+        expected = correct_heading(before.motion.rows[1:], before.length.rows[1:], fit.bias, fit.turn_error)
         found = graph.correct(graph.motion.rows[part], graph.length.rows[part])
         assert np.abs(found - expected).max() < 1e-12
 
