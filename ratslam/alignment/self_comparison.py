@@ -27,7 +27,7 @@ MATCHING = 1.0
 """Mean gain of the keyframes before one above which a false pose still looks right, nat."""
 
 Gains = Callable[[int, int], np.ndarray]
-"""Gains [n, S, N] of the n keyframes that follow a keyframe, against those before it; 0 at others.
+"""Gains [n, S, M] of the n keyframes that follow a keyframe, against those of the ground before it.
 Arguments: the keyframe, n."""
 
 
@@ -48,30 +48,35 @@ class Stretch(NamedTuple):
         return found
 
 
-def compare_with_itself(ground: Ground, guard: int, gains: Gains) -> GainOdds:
+def compare_with_itself(
+    ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None
+) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
-        guard: number of keyframes before a stretch that do not count as ground.
+        guard: number of keyframes before a stretch that do not count as ground. held: [N] bool, the keyframes
+            that are ground for a session; None: all.
     """
     count = len(ground.poses)
+    held = np.ones(count, bool) if held is None else held
     first = max(count // 3, 2 * guard)
     true, false = [np.zeros(0)], [np.zeros(0)]
     if count > first + LENGTH + guard:
         for begin in np.linspace(first, count - LENGTH - 1, STRETCHES).astype(int).tolist():
-            stretch = _stretch(ground, begin, guard, gains)
+            stretch = _stretch(ground, begin, guard, gains, held)
             true.append(_continued(stretch.follow(stretch.start, LENGTH)))
             for pose in _alike(stretch):
                 false.append(_continued(stretch.follow(pose, LENGTH)))
     return learn_gain_odds(np.concatenate(true), np.concatenate(false))
 
 
-def _stretch(ground: Ground, begin: int, guard: int, gains: Gains) -> Stretch:
+def _stretch(ground: Ground, begin: int, guard: int, gains: Gains, held: np.ndarray) -> Stretch:
     poses = ground.poses[begin : begin + LENGTH]
     motions = [STILL, *(Motion(step, np.zeros(3)) for step in between(poses[:-1], poses[1:]))]
     known = begin - guard
-    earlier = ground._replace(poses=ground.poses[:known])
-    return Stretch(earlier, gains(begin, LENGTH)[:, :, :known], motions, poses[0])
+    earlier = ground._replace(poses=ground.poses[:known][held[:known]])
+    found = gains(begin, LENGTH)[:, :, : len(earlier.poses)]
+    return Stretch(earlier, found, motions, poses[0])
 
 
 def _alike(stretch: Stretch) -> list[np.ndarray]:

@@ -26,6 +26,7 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.keyframes.optimizer import MapCovariance
 from ratslam.recall.memory import Memory
 from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
 
@@ -40,8 +41,6 @@ NEAR = 0.5
 driven way views differ, although the placement is right."""
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
-LEARNED = 3000
-"""Largest number of keyframes, the newest, from which the log-odds of gains on a piece are learned."""
 STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 
@@ -59,8 +58,9 @@ class Views(Protocol):
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
 
-    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
-        """The log-odds of gains on the ground of keyframes `frames` [N] at `poses` [N, 3]."""
+    def odds(self, frames: np.ndarray, poses: np.ndarray, held: np.ndarray) -> GainOdds:
+        """The log-odds of gains on the ground of those of keyframes `frames` [N] at `poses` [N, 3] that are
+        not merged, `held` [N] bool."""
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """The views of keyframes `frames` [n], moved by `motion` [n, 3] into each."""
@@ -164,12 +164,21 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
         return None
     _take_up(map, solution, sequences)
     middle = sequences[len(sequences) // 2][0]
-    covariance = graph.map_covariance(map.log).relative(middle.match, middle.keyframe, 0.0)
+    covariance = _covariance(graph, map.log).relative(middle.match, middle.keyframe, 0.0)
     return Join(
         ((), ()), start, np.sqrt(np.diag(covariance)),
         (found.log_odds, back.log_odds), (found.needed, back.needed),
         sum(len(sequence) for sequence in sequences),
     )  # fmt: skip
+
+
+def _covariance(graph: KeyframeGraph, log: ClosureLog) -> MapCovariance:
+    """The covariance of a map, the pieces of which are held together: what lies `LOOSE` apart cannot be
+    compared in the precision of a computer."""
+    problem, piece = graph.problem(log, graph.cut), graph.pieces(log)
+    apart = piece[1:] != piece[:-1]
+    variance = np.where(apart[:, None], 1.0, problem.chain.variance)
+    return MapCovariance(graph.fit(), problem._replace(chain=problem.chain._replace(variance=variance)))
 
 
 def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
@@ -182,8 +191,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
     compared = views.compare(views.freeze(taken[onto], pose[onto]), taken[frames], motion)
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
-    every = every[-LEARNED:]
-    odds = views.odds(every, archive.poses(pose)[every])
+    odds = views.odds(every, archive.poses(pose)[every], np.isin(every, taken[onto]))
     session = Traverse(compared, motions, NEAR * ground.reach, HOPELESS)
     paths = find_placements(ground, odds, session)
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))

@@ -87,17 +87,25 @@ class MapViews:
         graph = self.graph
         return ground_of(poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance())
 
-    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
+    def odds(self, frames: np.ndarray, poses: np.ndarray, held: np.ndarray | None = None) -> GainOdds:
         """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
-        with each other."""
-        whole, guard = self.freeze(frames, poses), self.recall.recall.guard
+        with each other.
+
+        Args:
+            held: [N] bool, those that a session is compared with, the others being merged with them; None:
+                all.
+        """
+        held = np.ones(len(frames), bool) if held is None else held
+        whole, guard = self.freeze(frames[held], poses[held]), self.recall.recall.guard
+        views, labels = self.graph.appearance.stored(frames)
 
         def gains(begin: int, count: int) -> np.ndarray:
-            earlier = first_keyframes(whole, begin - guard)
-            rows = jnp.arange(begin, begin + count, dtype=jnp.int32)
-            return np.asarray(self._gains(earlier, whole.view[:, rows], whole.label[rows]))
+            earlier = first_keyframes(whole, int(held[: begin - guard].sum()))
+            view = jnp.asarray(views[begin : begin + count].T.astype(whole.view.dtype))
+            label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
+            return np.asarray(self._gains(earlier, view, label))
 
-        return compare_with_itself(self.ground(poses), guard, gains)
+        return compare_with_itself(self.ground(poses), guard, gains, held)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.

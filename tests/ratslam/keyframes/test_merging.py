@@ -61,7 +61,7 @@ def log_of(*sequences, stood=STOOD):
 
 def merged(graph, log):
     """The numbers of the merged keyframes."""
-    merge = find_merge(graph, log, NEWEST)
+    merge = find_merge(graph, log, graph.config.merge_newest)
     return [] if merge is None else np.flatnonzero(~merge.is_kept()).tolist()
 
 
