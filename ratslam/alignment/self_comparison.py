@@ -48,9 +48,7 @@ class Stretch(NamedTuple):
         return found
 
 
-def compare_with_itself(
-    ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None
-) -> GainOdds:
+def compare_with_itself(ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
