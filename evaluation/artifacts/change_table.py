@@ -37,7 +37,8 @@ class ChangeRow(NamedTuple):
         what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
         return (
             f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, "
-            f"{self.passes} passes, steps {self.first_step} to {self.last_step}, evidence {self.evidence:.0f} nat"
+            f"{self.passes} passes, steps {self.first_step} to {self.last_step}, "
+            f"evidence {self.evidence:.0f} nat"
         )
 
 

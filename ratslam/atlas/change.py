@@ -60,7 +60,8 @@ class Change(NamedTuple):
     Attributes:
         position: [2] m, in the map, of what has changed. extent: m, along its longer axis. evidence: nat.
         alarms: expected number of such places by chance. appears: share of the evidence for something that
-            was not there, -1 for something gone, .. 1. keyframes: [k] of the session that contradict, ascending.
+            was not there, -1 for something gone, .. 1. keyframes: [k] of the session that contradict,
+            ascending.
         passes: number of times the robot came by.
     """
 
