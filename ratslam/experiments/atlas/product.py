@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -13,13 +12,14 @@ from ratslam.atlas.localiser import Localisation, Localiser
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.methods import Localised, Methods
 from ratslam.experiments.atlas.sessions import Recorded
-from ratslam.experiments.atlas.stored_maps import MapArrays, StoredMap
+from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, StoredMap
 from ratslam.experiments.trials.touch_trial import capacity_for
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.localise import localising
+from ratslam.pipeline.map_changes import changes_of
+from ratslam.pipeline.merge import merge_maps
 from ratslam.pipeline.saved_map import read_map
 from robot.touch_source import observation_of
-from tactile.base.errors import InputError
 
 
 def localise(made: StoredMap, recorded: Recorded) -> Localised:
@@ -52,13 +52,32 @@ def extend(made: StoredMap, recorded: Recorded) -> MapArrays:
 
 
 def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
-    """One map of several, in a new folder."""
-    _refuse("merge maps")
+    """One map of several, in a new folder; steps in the order of the arguments.
+
+    Raises:
+        InputError: the maps cannot be merged.
+    """
+    merged = merge_maps([made.path for made in maps], path)
+    own = {made.path: len(made.arrays.truth) for made in maps}
+    begins = dict(
+        zip((at.parent for at in merged.maps), np.cumsum([0, *merged.steps]).tolist(), strict=False)
+    )
+    order = np.concatenate([np.arange(begins[at], begins[at] + count) for at, count in own.items()])
+    session = read_map(path).open_session()
+    truth = np.concatenate([made.arrays.truth for made in maps])
+    whole = MapArrays.of_session(session, truth)
+    arrays = whole._replace(trajectory=whole.trajectory[order], piece=whole.piece[order])
+    np.savez(path / STEPS, **arrays._asdict())
+    return StoredMap(path, arrays)
 
 
 def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
     """Places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first."""
-    _refuse("name changes")
+    localise(made, recorded)
+    localiser = _session_in(made.path, capacity_for(recorded.log.length)).map
+    assert isinstance(localiser, Localiser)
+    found = changes_of(localiser, recorded.config.touch)
+    return np.array([change.position for change in found]).reshape(-1, 2)
 
 
 @lru_cache(maxsize=1)
@@ -68,10 +87,6 @@ def _session_in(path: Path, reserve: int) -> Session:
     config = localising(saved.config, saved)
     rows = config.session.model_copy(update={"reserve": reserve})
     return build_session(config.model_copy(update={"session": rows}), saved.source)
-
-
-def _refuse(verb: str) -> NoReturn:
-    raise InputError("reproduce maps", f"no method to {verb}", "other --rows")
 
 
 PRODUCT = Methods(localise, extend, merge, changes)
