@@ -81,7 +81,7 @@ class LocaliseBackend(Backend):
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
         frames, known = valid_keyframes(map), np.flatnonzero(~map.outdated.flags(len(poses)))
         self._memory = views.freeze(frames, poses[frames])
-        odds = views.odds(known, poses[known])
+        odds = views.odds(known, poses[known], np.isin(known, frames))
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
 
     def init(self, key: Array, capacity: int) -> LocaliseState:

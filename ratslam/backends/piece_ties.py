@@ -78,7 +78,8 @@ class PieceTies:
         key = (len(frames), int(taken[0]), int(taken[-1]))
         if key not in self._odds:
             every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
-            self._odds[key] = views.odds(every, archive.poses(graph.pose.rows)[every])
+            poses_of_every = archive.poses(graph.pose.rows)[every]
+            self._odds[key] = views.odds(every, poses_of_every, np.isin(every, taken))
         return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), self._odds[key])
 
     def _place(self, graph: KeyframeGraph, own: np.ndarray, on: PlacedOn, views: MapViews) -> list[Tie]:
