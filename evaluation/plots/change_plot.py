@@ -29,14 +29,15 @@ def draw_changes(
     """Draws the path of a session in its map, and the changes.
 
     Args:
-        name: of the run. run: its poses in the frame of the map. changes: the surest first. walls: [B, 5]
-            west, south, east, north, height, m, as the session found them; drawn with truth, in whose frame
-            they are.
+        name: of the run. run: its poses in the frame of the map; drawn where they were found. changes: the
+            surest first. walls: [B, 5] west, south, east, north, height, m, as the session found them; drawn
+            with truth, in whose frame they are.
     """
-    rows = truth_rows(run)
+    found = run.piece == 0 if (run.piece == 0).any() else np.ones(len(run.final), bool)
+    rows = truth_rows(run)[found[truth_rows(run)]]
     known = run.truth is not None and len(rows) > 0
     move = align(run.final[rows], run.truth[rows]) if known and run.truth is not None else np.zeros(3)
-    path = compose(move, run.final)[:, :2]
+    path = np.where(found[:, None], compose(move, run.final)[:, :2], np.nan)
     places = np.array([[change.x, change.y, 0.0] for change in changes]).reshape(-1, 3)
     places = compose(move, places)[:, :2]
     shown = walls if known else NO_WALLS
