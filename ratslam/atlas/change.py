@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 RADIUS = 1.5
 """Radius within which signs are summed, as a multiple of the ground's reach."""
@@ -107,6 +106,8 @@ def _peaks(signs: Signs, radius: float) -> list[tuple[int, float, np.ndarray]]:
     sign, the sum, and the signs within the radius; by descending sum."""
     if not len(signs.evidence):
         return []
+    from scipy.spatial import cKDTree  # slow to import
+
     tree = cKDTree(signs.points)
     around = tree.query_ball_point(signs.points, radius, return_sorted=True)
     sums = np.array([signs.evidence[near].sum() for near in around])
