@@ -2,7 +2,7 @@
 
 `python -m ratslam.examples.come_back` maps a maze, is set down in it somewhere else, and prints
 
-    found after 36 whisks, 0.02 m off; 1.2 m to the start
+    found after 51 whisks, 0.03 m off; 0.6 m to the start
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from tactile.base.se2 import compose, fit_rigid_motion
 
 MAZE = ["simulation.maze.seed=31001", "simulation.path.circuits=CCA"]
 LATER = ["simulation.maze.seed=31001", "simulation.seed=2", "simulation.path={circuits: AA, start: 11}"]
-MAP = Path("monday.npz")
+MAP = Path("maze.npz")
 
 
 def main() -> None:
@@ -49,11 +49,10 @@ def main() -> None:
 
 def draw(path: np.ndarray, session: np.ndarray, way: np.ndarray) -> Figure:
     """The map, where the robot was found, and the way to the start of the map."""
-    figure = new_figure(
-        5.0, "Come back", "a robot set down in a saved map finds itself and the way to its start"
-    )
+    line = "a robot set down in a saved map finds itself, and the way to its start"
+    figure = new_figure(5.0, "Come back", line)
     axes = add_axes(figure, 0.62, 1.0, 6.9, 3.1)
-    axes.plot(*path[:, :2].T, color=GREY, lw=1, label="the map of Monday")
+    axes.plot(*path[:, :2].T, color=GREY, lw=1, label="saved map")
     axes.plot(*session[-1:, :2].T, color=VERMILLION, marker="o", ms=7, ls="", label="found here")
     axes.plot(*way[:, :2].T, color=BLUE, lw=2, label="way to the start")
     axes.set_aspect("equal")
