@@ -19,7 +19,7 @@ def add_commands(commands: Commands) -> None:
     run.add_argument(
         "--continue", dest="resume", type=Path, metavar="MAP",
         help="map to continue from, a run directory or its map.npz: after its last sample if the recording "
-        "is the same, else from the first sample",
+        "is the same, else as a new piece, tied on once its views show where it lies",
     )  # fmt: skip
     run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)
