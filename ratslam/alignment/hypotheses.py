@@ -137,13 +137,16 @@ class Hypotheses(Checkpointed):
         """Adds a supposed pose [3] of the newest keyframe unless there is one like it."""
         if same_pose(ground, self.pose.rows, pose).any():
             return
-        path = views.follow_back(ground, odds, Supposed(pose, np.diag(ground.variance)), HOPELESS)
-        total = float(path.odds.sum())
-        if total < HOPELESS:
-            return
-        self.pose.append(pose)
-        self.covariance.append(np.diag(ground.variance))
-        self.log_odds.append(total)
+        at = Supposed(pose, np.diag(ground.variance))
+        total = float(views.follow_back(ground, odds, at, HOPELESS).odds.sum())
+        if total >= HOPELESS:
+            self.add(at, total)
+
+    def add(self, at: Supposed, log_odds: float) -> None:
+        """Adds a supposed pose of the newest keyframe with the log-odds of the session so far."""
+        self.pose.append(at.pose)
+        self.covariance.append(at.covariance)
+        self.log_odds.append(log_odds)
         self.states.append(uninterrupted(1)[0])
         self.best.append(0.0)
         self.inside.append(True)

@@ -102,7 +102,8 @@ class Localiser(Checkpointed, Map):
 
     Args:
         place: the finished map. log_odds: above which a pose is found, after the logarithm of the number of
-            places is subtracted.
+            places is subtracted. start: [3] pose in the map at which the session is supposed to begin; it is
+            just believed, until views contradict it. None: unknown.
     """
 
     VALUES = (
@@ -110,7 +111,7 @@ class Localiser(Checkpointed, Map):
     )  # fmt: skip
     PARTS = ("_views", "_hypotheses")
 
-    def __init__(self, place: Place, log_odds: float) -> None:
+    def __init__(self, place: Place, log_odds: float, start: np.ndarray | None = None) -> None:
         self.place = place
         self._places = float(np.log(max(place.ground.places(), 1.0)))
         self._needed = log_odds + self._places
@@ -127,8 +128,18 @@ class Localiser(Checkpointed, Map):
         self._record = GrowableArray((3,), np.float64)  # mass, log-odds, largest standard deviation
         self._frame = GrowableArray((), np.int64)  # step of each keyframe
         self._found = GrowableArray((3,), np.float64)  # its pose, NaN where that is not known
-        size = place.map.appearance.stored(place.frames[:1])[0].shape[1]
+        size = place.map.appearance.stored(place.frames[:0])[0].shape[1]
         self._view = GrowableArray((size,), np.float64)  # its view
+        if start is not None:
+            self._suppose(start)
+
+    def _suppose(self, start: np.ndarray) -> None:
+        """Believes a pose [3] at which the session begins, just enough to be found."""
+        at = Supposed(start.copy(), np.diag(self.place.ground.variance))
+        self._hypotheses.add(at, self._needed)
+        self._state = int(Localisation.FOUND)
+        self._newest, self._covariance = at
+        self._mass, self._log_odds = 0.5, self._needed - self._places
 
     # Queries
 

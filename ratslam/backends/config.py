@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, PositiveFloat
 
@@ -17,6 +17,8 @@ from ratslam.recall.config import RecallConfig
 from tactile.base.config import Settings
 
 BackendConfig = TypeVar("BackendConfig", bound=Settings)
+Start = Literal["here", "unknown"]
+"""Where a session begins in a finished map: where the map ended, or anywhere."""
 
 
 class PoseCellBackendConfig(Settings):
@@ -55,6 +57,9 @@ class LocaliseConfig(Settings):
     """The map: a file map.npz; `python -m ratslam localise` sets it."""
     log_odds: PositiveFloat = 15.0
     """Log-odds at which a pose is found, beyond the logarithm of the number of places in the map."""
+    start: Start = "unknown"
+    """Where the robot stands at first: `here`, where the map ended, which is believed until what is seen
+    contradicts it, or anywhere."""
 
 
 class LocaliseBackendConfig(RecallBackendConfig):

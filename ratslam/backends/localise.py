@@ -73,9 +73,10 @@ class LocaliseBackend(Backend):
 
     Args:
         recall: the backend that made the map. map: the finished map. log_odds: see `LocaliseConfig`.
+        here: whether the robot is supposed to stand where the map ended.
     """
 
-    def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float) -> None:
+    def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float, here: bool = False) -> None:
         self._recall, self._log_odds = recall, log_odds
         self._views = views = MapViews(recall, map.kept_keyframes())
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
@@ -83,6 +84,7 @@ class LocaliseBackend(Backend):
         self._memory = views.freeze(frames, poses[frames])
         odds = views.odds(known, poses[known], np.isin(known, frames))
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
+        self._start = map.map_trajectory()[-1] if here else None
 
     def init(self, key: Array, capacity: int) -> LocaliseState:
         """The map, and no idea where in it. `key` and `capacity` are not used."""
@@ -128,8 +130,8 @@ class LocaliseBackend(Backend):
         return LocaliseState(memory, state.seen + is_keyframe.astype(jnp.int32)), estimate, evidence
 
     def new_map(self) -> Localiser:
-        """A session of which nothing is known."""
-        return Localiser(self._place, self._log_odds)
+        """A session of which nothing is known but perhaps its start."""
+        return Localiser(self._place, self._log_odds, self._start)
 
 
 def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype: Any) -> LocaliseBackend:
@@ -142,7 +144,8 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     if settings.map is None:
         raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
     recall = RecallBackend(config, view_shape, dtype)
-    return LocaliseBackend(recall, read_keyframe_map(recall, settings.map), settings.log_odds)
+    map = read_keyframe_map(recall, settings.map)
+    return LocaliseBackend(recall, map, settings.log_odds, settings.start == "here")
 
 
 def valid_keyframes(map: KeyframeMap) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.atlas.localiser import Localisation, Localiser
+from ratslam.backends.config import Start
 from ratslam.config.run_config import RunConfig, SourceConfig
 from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.pipeline.progress import Observer
@@ -95,6 +96,17 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
     text = dump(saved.config.model_copy(update=sources))
     return validate(override(parse(text, str(saved.path)), assignments), RunConfig)
+
+
+def localising_for_goals(config: RunConfig, saved: SavedMap, start: Start) -> RunConfig:
+    """The same for a session that drives to goals and begins at `start`.
+
+    Raises:
+        InputError: as `localising`.
+    """
+    localised = localising(config, saved)
+    settings = localised.localise.model_copy(update={"start": start})
+    return localised.model_copy(update={"localise": settings})
 
 
 def localise(

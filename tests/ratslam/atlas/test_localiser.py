@@ -82,7 +82,7 @@ def drive(seed: int = 0, begin: int = 5, count: int = COUNT, views: Sequence[int
 
 
 def new_localiser(ground: Ground = LOOP.ground) -> Localiser:
-    return Localiser(Place(MAP, ground, ODDS), NEEDED)
+    return Localiser(Place(MAP, np.arange(len(ground.poses)), ground, ODDS), NEEDED)
 
 
 def follow(localiser: Localiser, driven: Drive, first: int = 0) -> list[Estimate]:
@@ -179,7 +179,7 @@ def test_what_a_map_learns_of_its_odometry_does_not_make_that_of_others_better()
     def heading_spread(factor: float) -> float:
         made, driven = new_map(), drive()
         made.kept_keyframes().heading_noise = HeadingNoise(float(np.log(factor)))
-        localiser = Localiser(Place(made, LOOP.ground, ODDS), NEEDED)
+        localiser = Localiser(Place(made, np.arange(len(LOOP.poses)), LOOP.ground, ODDS), NEEDED)
         nothing = Evidence(-1, -1, 0, 0.0, False, driven.evidence[0].gain)
         return float([localiser.update(seen, BLANK, nothing) for seen in driven.observations][-1].spread[2])
 
@@ -260,3 +260,32 @@ def test_the_file_of_a_localisation_names_states(tmp_path: Path) -> None:
     assert float(rows[-1]["log_odds"]) == last.log_odds
     deviation = np.sqrt(np.linalg.eigvalsh(last.covariance[:2, :2]).max())
     assert float(rows[-1]["sd"]) == pytest.approx(deviation)
+
+
+def begun_at(start: np.ndarray, driven: Drive) -> Localiser:
+    """A session that is supposed to begin at `start` [3] in the map."""
+    localiser = Localiser(Place(MAP, np.arange(len(LOOP.poses)), LOOP.ground, ODDS), NEEDED, start)
+    assert localiser.localisation().state == FOUND
+    follow(localiser, driven)
+    return localiser
+
+
+@settings(max_examples=10)
+@given(SEEDS)
+def test_a_supposed_start_is_believed_from_the_first_step(seed: int) -> None:
+    driven = drive(seed)
+    localiser = begun_at(driven.truth[0], driven)
+    assert (localiser.states() == FOUND).all()
+    assert (errors(localiser, driven) < REACH).all()
+
+
+@settings(max_examples=10)
+@given(SEEDS)
+def test_views_that_contradict_a_supposed_start_remove_it(seed: int) -> None:
+    driven = drive(seed)
+    elsewhere = LOOP.poses[int(np.hypot(*(LOOP.poses - driven.truth[0])[:, :2].T).argmax())]
+    localiser = begun_at(elsewhere, driven)
+    wrong = np.hypot(*(localiser.trajectory() - driven.truth)[:, :2].T) > REACH
+    assert wrong[0]
+    assert not wrong[COUNT // 2 :].any()
+    assert localiser.states()[-1] == FOUND
