@@ -7,10 +7,12 @@ Censi 2008), give the lateral position and the heading that steering in a corrid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tactile.base.se2 import compose
+from tactile.base.se2 import between, compose
 
 THINNED = 0.008
 """Spacing of the remembered points, m."""
@@ -18,10 +20,14 @@ AROUND = 0.035
 """Distance within which neighbours give the direction of a wall, m."""
 GATE = 0.04
 """Largest distance between a contact and its remembered neighbour, m."""
+NEAR = 0.015
+"""Distance within which a contact and a remembered one are of the same wall, m."""
 SCATTER = 0.006
 """Standard deviation of a contact across a wall, m: half its thickness."""
 TRUST = np.array([0.02, 0.02, 0.05])
 """Standard deviation of the pose before (m, m, rad)."""
+WORST = 0.05
+"""Share of the map's own revisits that agree worse than what still fits."""
 FEWEST = 6
 """Least number of contacts with a neighbour."""
 ITERATIONS = 8
@@ -52,7 +58,7 @@ class ContactCloud:
         """
         if len(points) < FEWEST or len(self.points) < FEWEST:
             return pose
-        body = np.column_stack([points, np.zeros(len(points))])
+        body = _flat(points)
         moved = np.zeros(3)
         prior = np.diag((SCATTER / TRUST) ** 2)
         for _ in range(ITERATIONS):
@@ -74,8 +80,60 @@ class ContactCloud:
                 break
         return compose(pose + moved, np.zeros(3))
 
+    def agreement(self, pose: np.ndarray, points: np.ndarray) -> float:
+        """Share of points [m, 2] in base_link (m), seen from a pose [3], within `NEAR` of a remembered one;
+        NaN with fewer than `FEWEST` points."""
+        if len(points) < FEWEST or len(self.points) < FEWEST:
+            return float("nan")
+        placed = compose(pose, _flat(points))[:, :2]
+        return float((self._tree.query(placed)[0] <= NEAR).mean())
+
     def _normal(self, k: int) -> np.ndarray:
         """Unit vector across the points around a point."""
         near = self.points[self._tree.query_ball_point(self.points[k], AROUND)]
         _, vectors = np.linalg.eigh(np.cov(near.T) if len(near) > 2 else np.eye(2))
         return vectors[:, 0]
+
+
+class RememberedContacts:
+    """The contacts of a map, and how well its later contacts agree with its earlier ones.
+
+    Args:
+        poses: [n, 3] of keyframes in order of time, m, m, rad. points: [m, 2] contacts of each in
+            base_link, m. window: number of keyframes whose contacts are compared together.
+
+    Attributes:
+        least: agreement below which contacts do not fit: that of the worst `WORST` of the later windows.
+    """
+
+    def __init__(self, poses: np.ndarray, points: Sequence[np.ndarray], window: int) -> None:
+        self.cloud = ContactCloud(placed_points(poses, points))
+        known = len(points) * 2 // 3
+        earlier = ContactCloud(placed_points(poses[:known], points[:known]))
+        found = []
+        for k in range(known + window, len(points), window):
+            rows = range(k - window, k)
+            seen = [between(poses[k - 1], compose(poses[i], _flat(points[i])))[:, :2] for i in rows]
+            together = np.concatenate(seen)
+            found.append(earlier.agreement(earlier.align(poses[k - 1], together), together))
+        known_ones = np.array(found)[np.isfinite(found)]
+        self.least = float(np.quantile(known_ones, WORST)) if len(known_ones) else 0.0
+
+    def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """See `ContactCloud.align`."""
+        return self.cloud.align(pose, points)
+
+    def agrees(self, pose: np.ndarray, points: np.ndarray) -> bool:
+        """Whether points [m, 2] in base_link (m), seen from a pose [3], fit the map as well as its revisits;
+        too few points deny nothing."""
+        return not self.cloud.agreement(pose, points) < self.least
+
+
+def _flat(points: np.ndarray) -> np.ndarray:
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def placed_points(poses: np.ndarray, points: Sequence[np.ndarray]) -> np.ndarray:
+    """[n, 2] points of all poses in the map, m."""
+    parts = [compose(pose, _flat(seen))[:, :2] for pose, seen in zip(poses, points, strict=True)]
+    return np.concatenate([np.zeros((0, 2)), *parts])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ratslam.atlas.contact_alignment import ContactCloud
+from ratslam.atlas.contact_alignment import RememberedContacts, placed_points
 from ratslam.atlas.route import (
     NoWay,
     Travel,
@@ -23,10 +23,9 @@ from ratslam.keyframes.map import KeyframeMap
 from ratslam.recall.whisker_likelihood import level_heights
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, PlannedWay
-from robot.live.goal_route import Aligner, keep_pose
+from robot.live.goal_route import RECENT, ContactMap, NoContacts
 from robot.world.head_trajectory import MotionConfig
 from tactile.base.errors import InputError
-from tactile.base.se2 import compose
 from tactile.base.types import Observation
 from tactile.features.whisker_image import ImageConfig
 from tactile.whiskers.contact_points import image_points
@@ -77,23 +76,27 @@ class GoalPlanner:
             return PlannedWay(None, DriveState.BLOCKED, str(error))
 
 
-def contact_aligner(made: Map, image: ImageConfig, head: Head) -> Aligner:
-    """Aligns contacts with those of the keyframes of a map; none if the map has no whisker images."""
-    points = felt_walls(made, image, head)
-    return ContactCloud(points).align if len(points) else keep_pose
+def contact_map(made: Map, image: ImageConfig, head: Head) -> ContactMap:
+    """The contacts of the keyframes of a map; those of none if it has no whisker images of this head."""
+    found = _keyframe_contacts(made, image, head)
+    return RememberedContacts(*found, RECENT) if len(found[1]) else NoContacts()
 
 
 def felt_walls(made: Map, image: ImageConfig, head: Head) -> np.ndarray:
     """[n, 2] contact points of the keyframes of a map, m; none if it has no whisker images of this head."""
+    return placed_points(*_keyframe_contacts(made, image, head))
+
+
+def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Poses [n, 3] of the keyframes, and the contacts [m, 2] of each in base_link, m."""
     if not isinstance(made, KeyframeMap) or not isinstance(made.keyframes().appearance, WhiskerAppearance):
-        return np.zeros((0, 2))
+        return np.zeros((0, 3)), []
     poses = made.solution().fit.poses
     levels, _ = made.keyframes().appearance.stored(np.arange(len(poses)))
     if levels.shape[1] < len(head.length):
-        return np.zeros((0, 2))
+        return np.zeros((0, 3)), []
     points, there = image_points(head, level_heights(levels[:, : len(head.length)]), image.tallest)
-    placed = compose(poses[:, None], np.concatenate([points, np.zeros((*there.shape, 1))], axis=-1))
-    return placed[there][:, :2]
+    return poses, [seen[touched] for seen, touched in zip(points, there, strict=True)]
 
 
 def felt_points(observation: Observation, image: ImageConfig, head: Head) -> np.ndarray:

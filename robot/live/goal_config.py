@@ -19,6 +19,8 @@ class GoalConfig(Settings):
     """The map: a run directory or its `map.npz`."""
     to: Annotated[tuple[Point | NonNegativeInt, ...], Field(min_length=1)]
     """Goals in order: x, y in the map (m), or the number of an experience."""
+    start: Literal["here", "unknown"] = "here"
+    """Where the robot stands at first: where the map ended, or anywhere; then it searches for its place."""
     mode: Literal["time", "temporal"] = "time"
     """The way: `time` by least expected time, `temporal` by RatSLAM's goal temporal map."""
     farthest: PositiveFloat = 0.1
@@ -33,11 +35,18 @@ class GoalConfig(Settings):
     first one on."""
     off_way: PositiveFloat = 1.2
     """Distance of the estimate from the way above which a new way is planned, pose cells."""
-    coast: NonNegativeFloat = 0.3
-    """Way that the arm drives by its own motion while the method is lost, m; then the head rests."""
+    coast: NonNegativeFloat = 1.0
+    """Way that the arm drives by its own motion while the method is lost and the contacts of the last whisks
+    agree with the map, m; then the head rests."""
+    search: NonNegativeFloat = 2.0
+    """Way of a cautious search along free directions while the place on the map is not known, m; then the
+    head rests."""
     patience: PositiveInt = 20
     """Consecutive whisks at rest without an estimate, or with one away from all experiences, after which the
     session is lost."""
+    returns: NonNegativeInt = 2
+    """Number of times that some of the way is driven back and again while the pose at a goal is not sure;
+    then the session is lost."""
     replans: NonNegativeInt = 5
     """Number of new ways for a goal, after which it counts as blocked."""
 

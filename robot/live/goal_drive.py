@@ -22,6 +22,10 @@ STEADY = 0.2
 """Difference in heading from that of a leg above which the robot turns, rad."""
 JOINED = 0.15
 """Length of the beginning of a way in which the robot may join it, m."""
+UNSURE = 5
+"""Whisks at a goal with a pose that is not sure after which some of the way is driven back."""
+RETURNED = 0.4
+"""Length of that part, m: enough for about as many keyframes as a lost robot needs to be found."""
 NEAR_WAY = 0.3
 """Length of the way ahead that contacts can block, m: more than the reach of the whiskers."""
 
@@ -45,10 +49,12 @@ class Sighting(NamedTuple):
 
     Attributes:
         pose: [3] in the map (m, m, rad); None without an estimate. points: [n, 2] contacts in the map, m.
+            sure: whether the method knows the pose and the contacts agree with the map.
     """
 
     pose: np.ndarray | None
     points: np.ndarray
+    sure: bool = True
 
 
 class PlannedWay(NamedTuple):
@@ -80,7 +86,7 @@ class GoalDrive:
         state: of the present goal, or the end. reason: of the last change. goal: number of the present goal.
         replans: new ways for it so far. target: [3] pose in the map to move to, None: rest. way: [K, 3] the
             present way. obstacles: [n, 2] contacts found on ways, in the map, m. off_way: largest distance
-        from the way, m.
+            from the way, m. search: way of a search for the place on the map, m.
     """
 
     def __init__(self, config: GoalConfig, planner: Planner, cell: float, count: int) -> None:
@@ -90,8 +96,9 @@ class GoalDrive:
         self.way: np.ndarray | None = None
         self.obstacles = np.zeros((0, 2))
         self._config, self._planner, self._count = config, planner, count
-        self.off_way = config.off_way * cell
+        self.off_way, self.search = config.off_way * cell, config.search
         self._missing = self._touched = 0
+        self._returning, self._returns, self._unsure = False, 0, 0
         self._legs: list[Leg] = []  # that are left
 
     @property
@@ -105,6 +112,7 @@ class GoalDrive:
     def next_goal(self) -> None:
         """Turns to the next goal; obstacles stay known."""
         self.goal, self.replans, self.way = self.goal + 1, 0, None
+        self._returning, self._returns, self._unsure = False, 0, 0
         self.state, self.target = DriveState.WAITING, None
 
     def observe(self, sighting: Sighting) -> DriveState:
@@ -116,6 +124,8 @@ class GoalDrive:
             return self._wait("no estimate")
         if self.way is None and not self._plan(sighting.pose):
             return self.state
+        if not self._legs:
+            return self._end(sighting)
         if self._distance_to_way(sighting.pose) > self.off_way:
             self.reason = "the estimate is off the way"
             if not self._replan(sighting.pose):
@@ -128,7 +138,13 @@ class GoalDrive:
             if not self._replan(sighting.pose):
                 return self.state
         self._missing = 0
-        return self._advance(sighting.pose)
+        return self._advance(sighting)
+
+    def wait(self, reason: str) -> DriveState:
+        """The robot is busy with something else than the way; a new one is planned thereafter."""
+        if not self.state.ended:
+            self.state, self.reason, self.way, self.target = DriveState.WAITING, reason, None, None
+        return self.state
 
     def refuse(self, pose: np.ndarray) -> DriveState:
         """Takes note that the robot cannot move to the target, seen from its estimate [3]: plans anew."""
@@ -164,15 +180,38 @@ class GoalDrive:
             self.state, self.reason = made.state, made.reason
         return False
 
-    def _advance(self, pose: np.ndarray) -> DriveState:
+    def _end(self, sighting: Sighting) -> DriveState:
+        """At the end of a way: the goal is reached if the pose is sure; otherwise some of the way is driven
+        back, to be driven again."""
+        assert self.way is not None
+        assert sighting.pose is not None
+        self.target = None
+        away = float(np.hypot(*(sighting.pose - self.way[-1])[:2]))
+        if self._returning or away > self.off_way:
+            self._returning, self.way = False, None
+            self.state, self.reason = DriveState.WAITING, "on the way again"
+        elif sighting.sure:
+            self.state, self.reason = DriveState.REACHED, ""
+        elif self._returns == self._config.returns:
+            self.state, self.reason = DriveState.LOST, "the goal's surroundings do not fit the map"
+        elif self._unsure < UNSURE:
+            self._unsure += 1
+            self.state, self.reason = DriveState.WAITING, "the pose is not sure"
+        else:
+            self._returning, self._unsure, self._returns = True, 0, self._returns + 1
+            self._legs = legs_of(beginning(self.way[::-1], RETURNED))
+        return self.state
+
+    def _advance(self, sighting: Sighting) -> DriveState:
+        assert sighting.pose is not None
+        pose = sighting.pose
         while self._legs and is_passed(
             self._legs[0], pose, CORNER if len(self._legs) > 1 else self._config.tolerance
         ):
             self._legs.pop(0)
-        self.state, self.reason = DriveState.DRIVING, ""
         if not self._legs:
-            self.state = DriveState.REACHED
-            return self.state
+            return self._end(sighting)
+        self.state, self.reason = DriveState.DRIVING, ""
         leg = self._legs[0]
         if abs(wrap(leg.heading - pose[2])) > STEADY:
             self.target = np.array([*pose[:2], leg.heading])
@@ -213,6 +252,12 @@ def join_way(way: np.ndarray, pose: np.ndarray) -> np.ndarray:
     off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
     first = int(np.argmin(off)) + 1
     return np.vstack([[*pose[:2], way[first, 2]], way[first:]])
+
+
+def beginning(way: np.ndarray, length: float) -> np.ndarray:
+    """The first poses of a way [K, 3], up to a length (m); at least two, if there are."""
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
+    return way[: max(2, int(np.searchsorted(far, length, side="right")))]
 
 
 def points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -10,10 +10,11 @@ from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.config import LiveConfig
 from robot.live.goal_drive import DriveState, GoalDrive, Sighting, points_in_map
+from robot.live.goal_search import GoalSearch
 from robot.live.route import MovableArm, route_speed
 from tactile.base.se2 import between, compose, wrap
 
-GAIN = 0.05
+GAIN = 0.1
 """Least share of the difference between estimate and expected pose that a whisk takes up."""
 OUTLIER = np.array([0.03, 0.03, 0.1])
 """Largest difference (m, m, rad) that is taken up; what exceeds it is an outlier (Huber 1964). Odometry with
@@ -24,18 +25,34 @@ RECENT = 8
 """Whisks whose contacts are aligned with those of the map."""
 MOVED = 5
 """Consecutive whisks elsewhere after which the robot has been moved."""
+NEW = 0.04
+"""Distance from an obstacle within which contacts are its own, m."""
 SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
 
 
-Aligner = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""The pose near a pose [3] in the map from which contacts [n, 2] in base_link fit those of the map."""
+class ContactMap(Protocol):
+    """Contacts remembered in a map."""
+
+    def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """The pose near a pose [3] in the map from which contacts [n, 2] in base_link (m) fit best."""
+        ...
+
+    def agrees(self, pose: np.ndarray, points: np.ndarray) -> bool:
+        """Whether contacts [n, 2] in base_link (m), seen from a pose [3] in the map, fit the map."""
+        ...
 
 
-def keep_pose(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The aligner of a map without contacts."""
-    del points
-    return pose
+class NoContacts(ContactMap):
+    """Those of a map without contacts: nothing is aligned or denied."""
+
+    def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        del points
+        return pose
+
+    def agrees(self, pose: np.ndarray, points: np.ndarray) -> bool:
+        del pose, points
+        return True
 
 
 class GoalRoute:
@@ -44,23 +61,32 @@ class GoalRoute:
     The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
     the pose to steer by moves with the arm and takes up a share of its difference to each estimate: 1 / n in
     the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in
-    `MOVED` whisks is taken up at once: the robot is elsewhere. Without estimates the arm's motion alone leads
-    on for `coast` (m).
+    `MOVED` whisks is taken up at once: the robot is elsewhere; but contacts that agree with the map at the
+    pose and not at the estimate deny it. Without estimates the arm's motion alone leads
+    on for `coast` (m), as long as the contacts of the last whisks agree with the map; then the robot searches
+    for its place for `drive.search` (m). A pose is sure if the
+    estimate is within `jump` of it and the contacts agree.
 
     Args:
-        align: aligns contacts of the last whisks with those of the map, which recall does not do.
+        contacts: those of the map, with which the last ones are aligned; recall does not do so.
 
     Attributes:
         drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
     """
 
     def __init__(
-        self, drive: GoalDrive, config: LiveConfig, jump: float, coast: float, align: Aligner = keep_pose
+        self,
+        drive: GoalDrive,
+        config: LiveConfig,
+        jump: float,
+        coast: float,
+        contacts: ContactMap | None = None,
     ) -> None:
         self.drive = drive
         self.pose: np.ndarray | None = None
         self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
-        self._align = align
+        self._contacts = contacts or NoContacts()
+        self._search: GoalSearch | None = None  # while the pose is not known
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []  # arm's pose and contacts of the last whisks
         self._coast, self._unseen = coast, 0.0  # way without an estimate, m
         self._count = self._elsewhere = 0  # whisks since the last jump; of them in a row elsewhere
@@ -81,22 +107,52 @@ class GoalRoute:
             self.drive.next_goal()
         self._target = None
         self._move_with_arm(arm_pose)
-        if estimate is not None:
-            self._correct(estimate)
         self._recent = [*self._recent, (arm_pose, points)][-RECENT:]
-        if self.pose is not None:
-            self.pose = self._align(self.pose, self._recent_points(arm_pose))
-        if self.pose is None or self._unseen > self._coast:
-            return self.drive.observe(Sighting(None, np.zeros((0, 2))))
+        if estimate is not None and not self._correct(estimate, self._recent_points(arm_pose)):
+            estimate = None
+        sure = self.pose is not None and self._align(estimate, arm_pose)
+        if self.pose is None or (estimate is None and self._unseen > self._coast):
+            return self._find_place(arm_pose, arm_now)
+        self._search = None
         now = compose(self.pose, between(arm_pose, arm_now))
-        state = self.drive.observe(Sighting(now, points_in_map(self.pose, points)))
+        state = self.drive.observe(Sighting(now, points_in_map(self.pose, points), sure))
         if self.drive.target is not None:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
 
-    def forget(self) -> None:
-        """Coasting ends: without any result the arm rests."""
-        self._unseen = np.inf
+    def rest(self) -> DriveState:
+        """A whisk stays without any result: the arm rests."""
+        self._target = None
+        return self.drive.observe(Sighting(None, np.zeros((0, 2))))
+
+    def _find_place(self, arm_pose: np.ndarray, arm_now: np.ndarray) -> DriveState:
+        """Without a pose: moves the arm along free directions for a while, then lets it rest."""
+        self.pose = None
+        self._search = self._search or GoalSearch(self.drive.search)
+        move = self._search.next_move(self._recent_points(arm_pose))
+        if move is None:
+            return self.rest()
+        self._target = compose(arm_now, move)
+        return self.drive.wait("searching for the place on the map")
+
+    def _align(self, estimate: np.ndarray | None, arm_pose: np.ndarray) -> bool:
+        """Aligns the last contacts with those of the map; returns whether the pose is sure then."""
+        assert self.pose is not None
+        points = self._recent_points(arm_pose)
+        self.pose = self._contacts.align(self.pose, points)
+        agrees = self._contacts.agrees(self.pose, self._without_obstacles(points))
+        if estimate is None:
+            self._unseen = self._unseen if agrees else np.inf
+            return False
+        return agrees and bool(np.hypot(*(self.pose - estimate)[:2]) <= self._jump)
+
+    def _without_obstacles(self, points: np.ndarray) -> np.ndarray:
+        """The points [n, 2] in base_link that are not at obstacles found on the way, which the map does not
+        have."""
+        assert self.pose is not None
+        found = self.drive.obstacles
+        away = np.linalg.norm(points_in_map(self.pose, points)[:, None] - found, axis=-1)
+        return points[(away > NEW).all(axis=1)]
 
     def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
@@ -110,17 +166,27 @@ class GoalRoute:
             self._unseen += float(np.hypot(step[0], step[1]))
         self._arm_pose = arm_pose
 
-    def _correct(self, estimate: np.ndarray) -> None:
-        """Moves the pose towards the estimate."""
-        self._unseen, self._count = 0.0, self._count + 1
+    def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
+        """Moves the pose towards the estimate, unless only the pose as it is agrees with the last contacts
+        [n, 2] in base_link, m; returns whether it did."""
         apart = np.zeros(3) if self.pose is None else between(self.pose, estimate)
         self._elsewhere = self._elsewhere + 1 if np.hypot(apart[0], apart[1]) > self._jump else 0
-        if self.pose is None or self._elsewhere == MOVED:
+        if self.pose is not None and self._elsewhere and self._denies(estimate, points):
+            return False
+        self._unseen, self._count = 0.0, self._count + 1
+        if self.pose is None or self._elsewhere >= MOVED:
             self.pose, self._count, self._elsewhere = estimate, 1, 0
-            return
+            return True
         share = max(GAIN, 1 / self._count)
         most = OUTLIER if self._count > SETTLED else np.full(3, np.inf)
         self.pose = compose(self.pose, share * np.clip(apart, -most, most))
+        return True
+
+    def _denies(self, estimate: np.ndarray, points: np.ndarray) -> bool:
+        """Whether contacts agree with the map at the pose and not at the estimate."""
+        assert self.pose is not None
+        here, there = (self._contacts.align(pose, points) for pose in (self.pose, estimate))
+        return self._contacts.agrees(here, points) and not self._contacts.agrees(there, points)
 
     def advance(self, arm: MovableArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.
@@ -142,10 +208,15 @@ class GoalRoute:
             except TargetRefused:
                 if arm.fault is not None:
                     raise
-                assert self.pose is not None
-                self.drive.refuse(self.pose)
-                self._target = None
+                self._refuse()
         return False
+
+    def _refuse(self) -> None:
+        self._target = None
+        if self.pose is not None:
+            self.drive.refuse(self.pose)
+        elif self._search is not None:
+            self._search.refuse()
 
     def resend_last(self) -> None:
         """Sends the target again with the next `advance`, after a stop."""

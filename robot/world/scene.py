@@ -156,7 +156,7 @@ def make_scene(
     if kidnaps.count:
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
         path, jumps = add_kidnaps(path, when.tolist(), kidnaps.ahead)
-    boxes = wall_boxes(maze, stream(_maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
+    boxes = wall_boxes(maze, stream(maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
     surroundings = check_surroundings(boxes, head, path)
     return Scene(maze, loop, path, duration, jumps, surroundings)
 
@@ -164,7 +164,7 @@ def make_scene(
 def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
     """Walls of another maze of the same size, checked along the same path."""
     columns, rows = scene.maze.columns, scene.maze.rows
-    seed = _maze_seed(config, seed)
+    seed = maze_seed(config, seed)
     maze = _draw_walls(config, columns, rows, scene.loop, stream(seed, "later.walls"))
     boxes = wall_boxes(maze, stream(seed, "later.heights"), config.heights)
     return check_surroundings(boxes, head, scene.path)
@@ -199,10 +199,10 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
 
 def maze_info(maze: Maze, config: MazeConfig, seed: int) -> MazeInfo:
     """The maze of a session with this seed, for the `SourceInfo` of its source."""
-    return MazeInfo(text=maze_text(maze), heights=config.heights, seed=_maze_seed(config, seed))
+    return MazeInfo(text=maze_text(maze), heights=config.heights, seed=maze_seed(config, seed))
 
 
-def _maze_seed(config: MazeConfig, seed: int) -> int:
+def maze_seed(config: MazeConfig, seed: int) -> int:
     return seed if config.seed is None else config.seed
 
 
@@ -218,7 +218,7 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
 
 def _make_first_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
     """The maze before walls were added and removed, and its loop."""
-    seed = _maze_seed(config, seed)
+    seed = maze_seed(config, seed)
     loop: list[Cell] = []
     maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
     if path.loop:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.atlas.contact_alignment import ContactCloud
+from ratslam.atlas.contact_alignment import ContactCloud, RememberedContacts
 from tactile.base.se2 import between, compose
 
 RANDOM = np.random.default_rng(3)
@@ -48,3 +48,16 @@ def test_few_or_unknown_contacts_change_nothing():
     assert np.array_equal(cloud.align(pose, np.zeros((0, 2))), pose)
     assert np.array_equal(cloud.align(pose, RANDOM.normal(0, 0.01, (30, 2))), pose)
     assert np.array_equal(ContactCloud(np.zeros((0, 2))).align(pose, np.ones((9, 2))), pose)
+
+
+def test_contacts_agree_at_their_pose_and_not_elsewhere():
+    points = corridor(corner=True)
+    poses = np.column_stack([np.tile(np.linspace(0.2, 0.9, 40), 3), np.zeros((120, 2))])
+    known = RememberedContacts(poses, [seen_from(pose, points, 12) for pose in poses], 5)
+    assert 0.5 < known.least <= 1.0
+    true = np.array([0.9, 0.0, 0.0])
+    seen = seen_from(true, points)
+    assert known.agrees(true, seen)
+    assert not known.agrees(true + [0.0, 0.04, 0.0], seen)
+    assert not known.agrees(true + [0.0, 0.0, 0.8], seen)
+    assert known.agrees(true + [0.0, 0.04, 0.0], seen[:3]), "too few deny nothing"

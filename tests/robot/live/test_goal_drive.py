@@ -11,7 +11,8 @@ from robot.drivers.ur10.safety import TargetRefused
 from robot.live.config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive, PlannedWay, Sighting
-from robot.live.goal_route import MOVED, GoalRoute
+from robot.live.goal_route import MOVED, ContactMap, GoalRoute
+from robot.live.goal_search import STEP
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE = np.zeros((0, 2))
@@ -128,8 +129,7 @@ def test_the_arm_is_moved_and_halted_as_the_drive_decides():
     assert not route.advance(arm)
     assert not route.advance(arm)
     assert len(arm.told) == 1, "an unchanged target is sent once"
-    route.forget()
-    route.see(None, FREE, pose, pose)
+    route.rest()
     route.advance(arm)
     route.advance(arm)
     assert arm.told[1:] == ["halt"]
@@ -165,3 +165,64 @@ def test_a_refused_target_blocks_the_way_there():
     route.advance(StubArm(refuses=True))
     assert drive.state is DriveState.BLOCKED
     assert np.allclose(planner.asked[-1][2], [[0.2, 0.0]])
+
+
+def test_a_goal_is_reached_only_by_a_sure_pose():
+    drive, _ = drive_on()
+    here = at(0.2, 0.2, np.pi / 2)._replace(sure=False)
+    drive.observe(here)
+    ends = []
+    for _ in range(200):
+        pose = drive.target if drive.target is not None else here.pose
+        ends.append(drive.observe(Sighting(pose, FREE, sure=False)))
+        if drive.finished:
+            break
+    assert drive.state is DriveState.LOST
+    assert DriveState.REACHED not in ends
+    assert DriveState.DRIVING in ends, "some of the way is driven again before"
+
+
+class Known(ContactMap):
+    """A map with which contacts agree near one pose."""
+
+    def __init__(self, x: float) -> None:
+        self.x = x
+
+    def align(self, pose, points):
+        return pose
+
+    def agrees(self, pose, points):
+        return abs(pose[0] - self.x) < 0.05
+
+
+@pytest.mark.parametrize(("truth", "believed"), [(0.0, False), (0.5, True)])
+def test_contacts_decide_between_the_pose_and_an_estimate_elsewhere(truth, believed):
+    drive, _ = drive_on()
+    route = GoalRoute(drive, LiveConfig(), drive.off_way, 0.1, Known(truth))
+    here, there = np.zeros(3), np.array([0.5, 0.0, 0.0])
+    for estimate in [here] * 3 + [there] * (MOVED + 1):
+        route.see(estimate, FREE, here, here)
+    assert (route.pose[0] > 0.4) == believed
+
+
+def test_a_robot_without_a_place_searches_for_it():
+    drive, _ = drive_on()
+    route, arm, pose = route_of(drive), StubArm(), np.zeros(3)
+    assert route.see(None, FREE, pose, pose) is DriveState.WAITING
+    route.advance(arm)
+    assert len(arm.told) == 1
+    assert route.see(pose, FREE, pose, pose) is DriveState.DRIVING, "found"
+    drive, _ = drive_on()
+    route = route_of(drive)
+    for _ in range(CONFIG.patience + int(CONFIG.search / STEP) + 3):
+        route.see(None, FREE, pose, pose)
+    assert drive.state is DriveState.LOST
+
+
+def test_contacts_that_do_not_fit_are_not_a_goal():
+    end = np.array([0.2, 0.2, np.pi / 2])
+    for truth, states in ((5.0, False), (0.2, True)):
+        drive, _ = drive_on(PlannedWay(WAY[-1:]))
+        route = GoalRoute(drive, LiveConfig(), drive.off_way, 0.1, Known(truth))
+        found = [route.see(end, FREE, end, end) for _ in range(4)]
+        assert (DriveState.REACHED in found) == states
