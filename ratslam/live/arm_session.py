@@ -46,7 +46,9 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
     assert config.live is not None
     path = plan_path(config.live, ur10_head(config.touch.head))
     check_targets(config.live, path)
-    goals = None if config.live.plan.goal is None else plan_goals(config)
+    if config.live.plan.goal is None:
+        return lambda stopped: ArmSession(config, path, directory, stopped)
+    config, goals = plan_goals(config)
     return lambda stopped: ArmSession(config, path, directory, stopped, goals)
 
 
@@ -155,15 +157,7 @@ def mapping_job(config: RunConfig, directory: Path) -> MappingJob:
         len(head.length),
         rate,
         float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
-        start=continued_map(config),
     )
-
-
-def continued_map(config: RunConfig) -> Path | None:
-    """The map that the mapper goes on from: that of the goals, unless the method only localises in it."""
-    assert config.live is not None
-    goal = config.live.plan.goal
-    return None if goal is None or config.backend == "localise" else goal.map
 
 
 def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ratslam.config.run_config import RunConfig
 from ratslam.live.mapper_process import Mapper
-from ratslam.pipeline.goal_planner import GoalPlanner, contact_aligner
+from ratslam.pipeline.goal_planner import GoalPlanner, contact_map
+from ratslam.pipeline.localise import localising_for_goals
 from ratslam.pipeline.saved_map import read_map
 from robot.drivers.outcome import SessionOutcome
 from robot.live.goal_drive import DriveState, GoalDrive
@@ -26,8 +27,8 @@ STALE = 3
 ENDS = {DriveState.BLOCKED: SessionOutcome.BLOCKED, DriveState.LOST: SessionOutcome.LOST}
 
 
-def plan_goals(config: RunConfig) -> GoalRoute:
-    """The route of a session with goals, on the map that its settings name.
+def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
+    """The configuration of a session with goals, which localises in the map of the goals, and its route.
 
     Raises:
         InputError: the map cannot be read, or a goal is not on it.
@@ -39,8 +40,9 @@ def plan_goals(config: RunConfig) -> GoalRoute:
     made = saved.open_session().map
     planner = GoalPlanner(made.graph(), goal, config.live.plan.motion)
     drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
-    align = contact_aligner(made, config.touch.image, ur10_head(config.touch.head))
-    return GoalRoute(drive, config.live, drive.off_way, goal.coast, align)
+    contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
+    route = GoalRoute(drive, config.live, drive.off_way, goal.coast, contacts)
+    return localising_for_goals(config, saved, goal.start), route
 
 
 class GoalSteering:
@@ -89,13 +91,16 @@ class GoalSteering:
             self._see(pose, result.points, self._whisks[result.number].pose)
         elif count > self._told and count - len(mapped) > STALE:
             self._told = count
-            self.route.forget()
-            self._see(None, np.zeros((0, 2)), self._whisks[-1].pose)
+            self._note(self.route.rest())
 
     def _see(self, pose: np.ndarray | None, points: np.ndarray, arm_pose: np.ndarray) -> None:
-        drive = self.route.drive
         now = self._rig.odometer.pose(time.monotonic())
-        if self.route.see(pose, points, arm_pose, now).ended:
+        self._note(self.route.see(pose, points, arm_pose, now))
+
+    def _note(self, state: DriveState) -> None:
+        """Notes the end of a goal."""
+        drive = self.route.drive
+        if state.ended:
             end = {"goal": drive.goal + 1, "state": drive.state.name.lower(), "reason": drive.reason}
             self.ends.append(end | {"replans": drive.replans, "whisk": len(self._whisks)})
             self._rig.record_event(

@@ -49,7 +49,7 @@ class MappingJob(NamedTuple):
             the calibration, which follows.
         directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
         extent_m: largest distance from the start along x or y on the planned path, m.
-        view: target of a live view, or None. start: map to go on from, or None.
+        view: target of a live view, or None.
     """
 
     config: RunConfig
@@ -60,7 +60,6 @@ class MappingJob(NamedTuple):
     rate_hz: float
     extent_m: float
     view: str | None = None
-    start: Path | None = None
 
 
 class MappedSample(NamedTuple):
@@ -277,7 +276,6 @@ def _map(line: Connection) -> None:
     from ratslam.config.completion import complete
     from ratslam.pipeline.build_session import build_session
     from ratslam.pipeline.runner import check_finished_map, open_runner
-    from ratslam.pipeline.saved_map import read_map
     from ratslam.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
@@ -291,8 +289,6 @@ def _map(line: Connection) -> None:
         blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
         )
-        if job.start is not None:
-            read_map(job.start).restore(session)
         session.warm(blank)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
