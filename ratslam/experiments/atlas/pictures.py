@@ -28,7 +28,7 @@ class PathPanel(NamedTuple):
     """Paths [.., 2] (m) by label, over the walls of a maze if there is one; rows of NaN interrupt a path.
 
     Attributes:
-        changed, named: [n, 2] places that truly changed, and places that were named, m.
+        changed, named, goals: [n, 2] places that truly changed, that were named, and that were driven to, m.
     """
 
     title: str
@@ -36,6 +36,7 @@ class PathPanel(NamedTuple):
     paths: Mapping[str, np.ndarray]
     changed: np.ndarray = NOWHERE
     named: np.ndarray = NOWHERE
+    goals: np.ndarray = NOWHERE
 
 
 class Panel(NamedTuple):
@@ -85,6 +86,8 @@ def _draw_paths(figure: style.Figure, panel: PathPanel, box: tuple[float, float,
         )
     if len(panel.named):
         axes.plot(*panel.named.T, "x", ms=8, mew=2, color=style.BLUE, label="named", zorder=9)
+    if len(panel.goals):
+        axes.plot(*panel.goals.T, "o", ms=6, mfc=style.VERMILLION, mec="white", label="goals", zorder=9)
     axes.set_title(panel.title, fontsize=9.5, color=style.INK, loc="left")
     axes.set_xticks([])
     axes.set_yticks([])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ratslam.experiments.atlas import changing, continuing, halves, localising, merging
+from ratslam.experiments.atlas import changing, continuing, goals, halves, localising, merging
 from ratslam.experiments.atlas.methods import Methods
 from ratslam.experiments.atlas.row import MapRow, MapTask
 from ratslam.experiments.studies.executor import run_tasks
@@ -21,6 +21,7 @@ ROWS: dict[str, MapRow] = {
     "merge": merging.OVERLAP,
     "merge mazes": merging.DIFFERENT,
     "ten sessions": merging.TEN,
+    "goals": goals.GOALS,
     "wall moved": changing.WALL,
     "door closed": changing.DOOR,
     "buildings": halves.HALVES,
