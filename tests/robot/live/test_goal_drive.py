@@ -16,7 +16,7 @@ from robot.live.goal_search import STEP
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE = np.zeros((0, 2))
-CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2)
+CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2, search=0.5)
 
 
 class StubPlanner:
