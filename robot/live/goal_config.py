@@ -20,7 +20,8 @@ class GoalConfig(Settings):
     to: Annotated[tuple[Point | NonNegativeInt, ...], Field(min_length=1)]
     """Goals in order: x, y in the map (m), or the number of an experience."""
     start: Literal["here", "unknown"] = "here"
-    """Where the robot stands at first: where the map ended, or anywhere; see `search`."""
+    """Where the robot stands at first: where the map ended, or anywhere: then the head rests until its
+    place is found, and if it is not, the session ends as lost."""
     mode: Literal["time", "temporal"] = "time"
     """The way: `time` by least expected time, `temporal` by RatSLAM's goal temporal map."""
     farthest: PositiveFloat = 0.1
@@ -38,10 +39,6 @@ class GoalConfig(Settings):
     coast: NonNegativeFloat = 1.0
     """Way that the arm drives by its own motion while the method is lost and the contacts of the last whisks
     agree with the map, m; then the head rests."""
-    search: NonNegativeFloat = 0.0
-    """Way of a search along free directions while the place on the map is not known, m; then the head rests.
-    In simulated mazes it brought the head's axis up to walls and did not find the place in 2 m: not for a
-    head that hangs as low as the walls."""
     patience: PositiveInt = 20
     """Consecutive whisks at rest without an estimate, or with one away from all experiences, after which the
     session is lost."""

@@ -86,7 +86,7 @@ class GoalDrive:
         state: of the present goal, or the end. reason: of the last change. goal: number of the present goal.
         replans: new ways for it so far. target: [3] pose in the map to move to, None: rest. way: [K, 3] the
             present way. obstacles: [n, 2] contacts found on ways, in the map, m. off_way: largest distance
-            from the way, m. search: way of a search for the place on the map, m.
+            from the way, m.
     """
 
     def __init__(self, config: GoalConfig, planner: Planner, cell: float, count: int) -> None:
@@ -96,7 +96,7 @@ class GoalDrive:
         self.way: np.ndarray | None = None
         self.obstacles = np.zeros((0, 2))
         self._config, self._planner, self._count = config, planner, count
-        self.off_way, self.search = config.off_way * cell, config.search
+        self.off_way = config.off_way * cell
         self._missing = self._touched = 0
         self._returning, self._returns, self._unsure = False, 0, 0
         self._legs: list[Leg] = []  # that are left
@@ -139,12 +139,6 @@ class GoalDrive:
                 return self.state
         self._missing = 0
         return self._advance(sighting)
-
-    def wait(self, reason: str) -> DriveState:
-        """The robot is busy with something else than the way; a new one is planned thereafter."""
-        if not self.state.ended:
-            self.state, self.reason, self.way, self.target = DriveState.WAITING, reason, None, None
-        return self.state
 
     def refuse(self, pose: np.ndarray) -> DriveState:
         """Takes note that the robot cannot move to the target, seen from its estimate [3]: plans anew."""

@@ -10,7 +10,6 @@ from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.config import LiveConfig
 from robot.live.goal_drive import DriveState, GoalDrive, Sighting, points_in_map
-from robot.live.goal_search import GoalSearch
 from robot.live.route import MovableArm, route_speed
 from tactile.base.se2 import between, compose, wrap
 
@@ -63,9 +62,8 @@ class GoalRoute:
     the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in
     `MOVED` whisks is taken up at once: the robot is elsewhere; but contacts that agree with the map at the
     pose and not at the estimate deny it. Without estimates the arm's motion alone leads
-    on for `coast` (m), as long as the contacts of the last whisks agree with the map; then the robot searches
-    for its place for `drive.search` (m). A pose is sure if the
-    estimate is within `jump` of it and the contacts agree.
+    on for `coast` (m), as long as the contacts of the last whisks agree with the map; then the head rests. A
+    pose is sure if the estimate is within `jump` of it and the contacts agree.
 
     Args:
         contacts: those of the map, with which the last ones are aligned; recall does not do so.
@@ -86,7 +84,6 @@ class GoalRoute:
         self.pose: np.ndarray | None = None
         self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
         self._contacts = contacts or NoContacts()
-        self._search: GoalSearch | None = None  # while the pose is not known
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []  # arm's pose and contacts of the last whisks
         self._coast, self._unseen = coast, 0.0  # way without an estimate, m
         self._count = self._elsewhere = 0  # whisks since the last jump; of them in a row elsewhere
@@ -112,8 +109,8 @@ class GoalRoute:
             estimate = None
         sure = self.pose is not None and self._align(estimate, arm_pose)
         if self.pose is None or (estimate is None and self._unseen > self._coast):
-            return self._find_place(arm_pose, arm_now)
-        self._search = None
+            self.pose = None
+            return self.rest()
         now = compose(self.pose, between(arm_pose, arm_now))
         state = self.drive.observe(Sighting(now, points_in_map(self.pose, points), sure))
         if self.drive.target is not None:
@@ -124,16 +121,6 @@ class GoalRoute:
         """A whisk stays without any result: the arm rests."""
         self._target = None
         return self.drive.observe(Sighting(None, np.zeros((0, 2))))
-
-    def _find_place(self, arm_pose: np.ndarray, arm_now: np.ndarray) -> DriveState:
-        """Without a pose: moves the arm along free directions for a while, then lets it rest."""
-        self.pose = None
-        self._search = self._search or GoalSearch(self.drive.search)
-        move = self._search.next_move(self._recent_points(arm_pose))
-        if move is None:
-            return self.rest()
-        self._target = compose(arm_now, move)
-        return self.drive.wait("searching for the place on the map")
 
     def _align(self, estimate: np.ndarray | None, arm_pose: np.ndarray) -> bool:
         """Aligns the last contacts with those of the map; returns whether the pose is sure then."""
@@ -215,8 +202,6 @@ class GoalRoute:
         self._target = None
         if self.pose is not None:
             self.drive.refuse(self.pose)
-        elif self._search is not None:
-            self._search.refuse()
 
     def resend_last(self) -> None:
         """Sends the target again with the next `advance`, after a stop."""

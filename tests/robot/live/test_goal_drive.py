@@ -12,11 +12,10 @@ from robot.live.config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive, PlannedWay, Sighting
 from robot.live.goal_route import MOVED, ContactMap, GoalRoute
-from robot.live.goal_search import STEP
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE = np.zeros((0, 2))
-CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2, search=0.5)
+CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2)
 
 
 class StubPlanner:
@@ -205,16 +204,16 @@ def test_contacts_decide_between_the_pose_and_an_estimate_elsewhere(truth, belie
     assert (route.pose[0] > 0.4) == believed
 
 
-def test_a_robot_without_a_place_searches_for_it():
+def test_a_robot_without_a_place_rests_until_it_is_found_or_lost():
     drive, _ = drive_on()
     route, arm, pose = route_of(drive), StubArm(), np.zeros(3)
     assert route.see(None, FREE, pose, pose) is DriveState.WAITING
     route.advance(arm)
-    assert len(arm.told) == 1
+    assert len(arm.told) == 0
     assert route.see(pose, FREE, pose, pose) is DriveState.DRIVING, "found"
     drive, _ = drive_on()
     route = route_of(drive)
-    for _ in range(CONFIG.patience + int(CONFIG.search / STEP) + 3):
+    for _ in range(CONFIG.patience + 3):
         route.see(None, FREE, pose, pose)
     assert drive.state is DriveState.LOST
 
