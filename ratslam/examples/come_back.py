@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, add_legend, metre_grid, new_figure
-from ratslam.atlas.localiser import Localisation
 from ratslam.atlas.route import Travel, find_way, nearest_experience, travel_graph
 from tactile.base.se2 import compose, fit_rigid_motion
 
@@ -34,15 +33,17 @@ def main() -> None:
     slam = ratslam.Slam.load(MAP, mode="localise")
     with ratslam.open_source(ratslam.load_config("whisker_maze", LATER)) as source:
         for sample in source:
-            pose = slam.step(sample).pose
-            if slam.map.localisation().state == Localisation.FOUND:
+            estimate = slam.step(sample)
+            if not estimate.lost:  # found
                 break
     true = compose(fit_rigid_motion(np.array(truth), path), sample.truth)
 
     graph = travel_graph(slam.map.graph(), Travel(speed=0.02))
-    here, start = (nearest_experience(graph, place, 0.1) for place in (pose, path[0]))
+    here, start = (nearest_experience(graph, place, 0.1) for place in (estimate.pose, path[0]))
+    assert here is not None
+    assert start is not None
     way = find_way(graph, here, [start])
-    off = np.hypot(*(pose - true)[:2])
+    off = np.hypot(*(estimate.pose - true)[:2])
     print(f"found after {slam.steps} whisks, {off:.2f} m off; {way.length:.1f} m to the start")
     draw(path, slam.trajectory(), way.poses).savefig("come_back.png")
 
