@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from robot.sources.source import Sample
+from robot.sources.source_info import SourceInfo
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
@@ -60,7 +61,7 @@ class Moment(NamedTuple):
 class Circuit:
     """A `robot.sources.source.Source` that goes round and round, and measures the memory of its process."""
 
-    rate_hz, view_shape, whiskers, digest = 10.0, VIEW, 0, ""
+    rate_hz, view_shape, whiskers, digest, info = 10.0, VIEW, 0, "", SourceInfo()
 
     def __init__(self, kind: str, steps: int) -> None:
         self.name, self.kind, self.length = kind, kind, steps

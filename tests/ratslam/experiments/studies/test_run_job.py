@@ -85,7 +85,8 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
     result = run_job(job._replace(config=config, reference_tier="kinematic"))
     assert result.error is None
     maps = {name for name in METRICS if name.startswith("map_")}
-    assert set(result.quantities) | maps | {metric.name for metric in MEASURED} == set(METRICS)
+    pieces = {metric.name for metric in METRICS.values() if metric.section == "Pieces"}
+    assert set(result.quantities) | maps | pieces | {metric.name for metric in MEASURED} == set(METRICS)
     assert maps - {"map_error", "map_doubt"} == {metric.name for metric in GRID_METRICS}
 
 
