@@ -41,6 +41,9 @@ NEAR = 0.5
 driven way views differ, although the placement is right."""
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
+COMMON = 1 / 3
+"""Least share of the keyframes of one of the pieces that lies on the ground of the other: a part of another
+place that is alike counts as often as it is driven."""
 STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 
@@ -151,6 +154,8 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     found = _place(map, views, one, other)
     back = found and _place(map, views, other, one)
     if not found or not back or not _agree(graph, found, back):
+        return None
+    if max(found.on.mean(), back.on.mean()) < COMMON:
         return None
     sequences = _closures(graph, found)
     start = compose(found.motion, graph.pose.rows[other[0]])
