@@ -14,6 +14,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
 from ratslam.alignment.interruptions import LONGEST
+from ratslam.atlas.placement import CONFIRMING
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -27,8 +28,6 @@ from tactile.base.types import Observation
 if TYPE_CHECKING:
     import networkx
 
-CONFIRMING = 3
-"""Number of recalled poses in a row that have to agree with odometry before one is proposed."""
 UNEXPLAINED = 4.0
 """The session is not in the map if its views, were it there, would have given this multiple of the log-odds
 needed to be found, and the best supposed pose has less than half of these."""

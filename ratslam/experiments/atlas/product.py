@@ -59,10 +59,9 @@ def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
     """
     merged = merge_maps([made.path for made in maps], path)
     own = {made.path: len(made.arrays.truth) for made in maps}
-    begins = dict(
-        zip((at.parent for at in merged.maps), np.cumsum([0, *merged.steps]).tolist(), strict=False)
-    )
-    order = np.concatenate([np.arange(begins[at], begins[at] + count) for at, count in own.items()])
+    ends = np.cumsum(merged.steps).tolist()
+    end = {at.parent: last for at, last in zip(merged.maps, ends, strict=True)}
+    order = np.concatenate([np.arange(end[at] - count, end[at]) for at, count in own.items()])
     session = read_map(path).open_session()
     truth = np.concatenate([made.arrays.truth for made in maps])
     whole = MapArrays.of_session(session, truth)
