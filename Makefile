@@ -55,8 +55,10 @@ $(BASE): pyproject.toml constraints.txt
 	@touch $@
 
 # Installs the dependencies of the tests. Only one test needs gtsam, which has no wheel for some platforms.
+# opexebo asks for an OpenCV with windows; it works with the one without, which is installed.
 $(DEV): $(BASE)
 	@echo "Installing the dependencies of the tests ..."
 	@$(INSTALL) -e '.[dev]'
+	@$(INSTALL) --no-deps 'opexebo>=0.7'
 	@$(INSTALL) --only-binary gtsam -e '.[anchor]' || echo "gtsam has no wheel here; its test is skipped."
 	@touch $@

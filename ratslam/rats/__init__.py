@@ -1,0 +1,1 @@
+"""Pose cells as a neuroscientist uses them: spikes, RatInABox."""

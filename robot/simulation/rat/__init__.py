@@ -1,0 +1,1 @@
+"""Simulated sessions of a rat in a box with cues."""
