@@ -1,0 +1,1 @@
+"""Pose cells measured as neurons: figures, scores, cost."""
