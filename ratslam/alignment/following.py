@@ -22,6 +22,21 @@ class Supposed(NamedTuple):
     pose: np.ndarray
     covariance: np.ndarray
 
+    def is_comparable(self, ground: Ground) -> bool:
+        """Whether the pose is so well known that all keyframes it may be at are compared with it."""
+        position, heading = self.deviations()
+        reach_heading = MOST_REACH_HEADING * ground.reach_heading
+        return DEVIATIONS * position <= MOST_REACH * ground.reach and DEVIATIONS * heading <= reach_heading
+
+    def log_share(self, ground: Ground, pose: np.ndarray) -> float:
+        """Logarithm of the probability that the robot is at `pose` [3], as far as views can tell it from
+        others."""
+        error = pose - self.pose
+        error[2] = wrap(error[2])
+        spread = self.covariance + np.diag(ground.variance)
+        _, volume = np.linalg.slogdet(spread)
+        return float(np.log(ground.variance).sum() - volume - error @ np.linalg.solve(spread, error)) / 2
+
     def deviations(self) -> tuple[float, float]:
         """Standard deviations: of the position in the direction where it is largest, m; of the heading,
         rad."""

@@ -134,11 +134,18 @@ class Hypotheses(Checkpointed):
         self._drop(ground)
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
-        """Adds a supposed pose [3] of the newest keyframe unless there is one like it."""
+        """Adds a supposed pose [3] of the newest keyframe unless there is one like it.
+
+        It has the log-odds of its own way back to the start of the session; or, of another supposed pose that
+        odometry has made uncertain, those of being right and here.
+        """
         if same_pose(ground, self.pose.rows, pose).any():
             return
         at = Supposed(pose, np.diag(ground.variance))
         total = float(views.follow_back(ground, odds, at, HOPELESS).odds.sum())
+        for k in range(self.count):
+            if not self.at(k).is_comparable(ground):
+                total = max(total, float(self.log_odds.rows[k]) + self.at(k).log_share(ground, pose))
         if total >= HOPELESS:
             self.add(at, total)
 

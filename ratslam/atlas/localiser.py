@@ -45,7 +45,7 @@ class Localisation(IntEnum):
     FOUND = 1
     """The pose is known."""
     LOST = 2
-    """It was known, but the views since do not fit it."""
+    """It was known, but the views since do not fit it, or none showed known ground for too long."""
     NOT_THIS_MAP = 3
     """So many views fit nowhere that the session is most likely not in this map, or in a part that was never
     driven."""
@@ -274,7 +274,10 @@ class Localiser(Checkpointed, Map):
         self._log_odds = float(odds[best] - self._places)
         rival = odds[order[1]] if known.count > 1 else -np.inf
         fell = known.fall(best) > self._needed
-        if odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
+        if not fell and not known.at(best).is_comparable(self.place.ground):
+            if self._state == Localisation.FOUND:
+                self._state = int(Localisation.LOST)
+        elif odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
             self._state = int(Localisation.FOUND)
         elif self._state != Localisation.FOUND:
             self._judge_unknown(float(odds[best]))

@@ -148,3 +148,20 @@ def test_moving_the_ground_moves_its_claims() -> None:
     shift, frame = np.zeros(3, int), np.array([0, 20, 41])
     moved = moved_by(change, loop.ground).claims(shift, frame)
     assert_same_pose(moved, compose(change, loop.ground.claims(shift, frame)))
+
+
+@given(POSES, POSES)
+def test_the_probability_of_a_pose_is_largest_at_the_supposed_one(pose: np.ndarray, known: np.ndarray) -> None:
+    ground, at = ground_at(np.zeros((1, 3))), supposed(known)
+    assert at.log_share(ground, pose) <= at.log_share(ground, at.pose) + 1e-9
+    assert at.log_share(ground, at.pose) < 0
+
+
+def test_a_supposed_pose_is_comparable_while_its_ground_is_within_reach() -> None:
+    ground = ground_at(np.zeros((1, 3)))
+    narrow, wide = ((REACH * factor) ** 2 for factor in (1.4, 1.6))
+    for variance, expected in ((narrow, True), (wide, False)):
+        at = Supposed(np.zeros(3), np.diag([variance, 1e-6, 1e-6]))
+        assert at.is_comparable(ground) is expected
+    turned = Supposed(np.zeros(3), np.diag([1e-6, 1e-6, (1.1 * REACH_HEADING) ** 2]))
+    assert not turned.is_comparable(ground)

@@ -155,6 +155,25 @@ def test_a_carried_robot_is_lost_and_found_where_it_is() -> None:
     assert (pieces[0], pieces[lost - 1], pieces[lost], pieces[-1]) == (0, 1, 2, 1)
 
 
+def test_a_pose_that_odometry_alone_has_made_uncertain_is_lost_and_found_again() -> None:
+    there, back = drive(begin=5), drive(seed=1, begin=5 + COUNT)
+    localiser = new_localiser()
+    follow(localiser, there)
+    assert localiser.states()[-1] == FOUND
+    nothing = Evidence(-1, -1, 0, 0.0, False, there.evidence[0].gain)
+    away = [np.array([4.0, 0.0, 0.0])] * 100 + [np.array([-4.0, 0.0, 0.0])] * 100
+    for odometry in away:  # far beyond the map and back, without a view
+        localiser.update(step(odometry), BLANK, nothing)
+    # The state and the pose are those of the newest keyframe.
+    blank = there.evidence[-1]._replace(match=-1, posterior=0.0, shows=False)
+    localiser.update(step(np.zeros(3)), BLANK, blank)
+    assert localiser.states()[-1] == LOST
+    assert localiser.visits().step[-1] < COUNT
+    follow(localiser, back, first=1)
+    assert localiser.states()[-1] == FOUND
+    assert np.hypot(*(localiser.pose(BLANK) - back.truth[-1])[:2]) < REACH
+
+
 def test_while_lost_nothing_is_claimed() -> None:
     localiser = new_localiser()
     follow(localiser, drive(begin=5))
