@@ -151,7 +151,7 @@ def test_moving_the_ground_moves_its_claims() -> None:
 
 
 @given(POSES, POSES)
-def test_the_probability_of_a_pose_is_largest_at_the_supposed_one(pose: np.ndarray, known: np.ndarray) -> None:
+def test_the_probability_of_a_pose_is_largest_at_it(pose: np.ndarray, known: np.ndarray) -> None:
     ground, at = ground_at(np.zeros((1, 3))), supposed(known)
     assert at.log_share(ground, pose) <= at.log_share(ground, at.pose) + 1e-9
     assert at.log_share(ground, at.pose) < 0
