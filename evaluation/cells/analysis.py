@@ -1,0 +1,171 @@
+"""All scores of cells: a table with one row for each cell.
+
+Activity has no unit: that of all cells sums to 1. Here a cell with the mean activity of the network fires at
+`AnalysisSettings.mean_rate`, 1 Hz by default, so rates are in Hz; scores in bits/spike and lengths do not
+depend on it, bits/s and the Rayleigh test do.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from evaluation.cells.border import border_score
+from evaluation.cells.coherence import coherence
+from evaluation.cells.conjunctive import conjunctive_information, joint_maps
+from evaluation.cells.fields import FieldSettings, bin_area, count_by_cell, find_fields, largest_by_cell
+from evaluation.cells.head_direction import (
+    mean_vector_length,
+    peak_rate,
+    preferred_direction,
+    rayleigh_p,
+    rayleigh_z,
+)
+from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
+from evaluation.cells.rate_map import (
+    MapSettings,
+    arena_edges,
+    bin_activity,
+    rate_maps,
+    tuning_curves,
+)
+from evaluation.cells.recording import BinnedSums, CellRecording
+from tactile.base.atomic_write import write_atomically
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+
+
+class AnalysisSettings(Settings):
+    """How recorded cells are scored."""
+
+    maps: MapSettings = MapSettings()
+    """Bins and smoothing; the bins of sums are those of the recording."""
+    fields: FieldSettings = FieldSettings()
+    """What counts as a field."""
+    mean_rate: float = Field(default=1.0, gt=0)
+    """Rate of a cell with the mean activity of the network, Hz."""
+    joint_bins: int = Field(default=10, ge=3)
+    """Bins along each side of the box in joint maps of place and heading."""
+    joint_headings: int = Field(default=8, ge=3)
+    """Headings in joint maps."""
+
+
+class CellScores(NamedTuple):
+    """Scores of n cells, each [n]; NaN where undefined, as for a cell without activity.
+
+    Attributes:
+        cell: index in the flattened network. sheet_x, sheet_y: place on the torus, m. sheet_heading: rad.
+        mean_rate: in the box, Hz. peak_rate: of the rate map, Hz. information: bits/spike.
+        information_rate: bits/s. sparsity: (0, 1]. selectivity: peak over mean. coherence: of the map
+            without smoothing, z. fields: number. field_area: of the largest, m^2. border: border score.
+        vector_length: of the tuning curve, [0, 1]. direction: preferred, rad. heading_peak: Hz.
+        rayleigh_z, rayleigh_p: Rayleigh test. heading_information: of the tuning curve, bits/spike.
+        conjunctive: information of place and heading beyond the better of the two, bits/spike; NaN from sums.
+    """
+
+    cell: np.ndarray
+    sheet_x: np.ndarray
+    sheet_y: np.ndarray
+    sheet_heading: np.ndarray
+    mean_rate: np.ndarray
+    peak_rate: np.ndarray
+    information: np.ndarray
+    information_rate: np.ndarray
+    sparsity: np.ndarray
+    selectivity: np.ndarray
+    coherence: np.ndarray
+    fields: np.ndarray
+    field_area: np.ndarray
+    border: np.ndarray
+    vector_length: np.ndarray
+    direction: np.ndarray
+    heading_peak: np.ndarray
+    rayleigh_z: np.ndarray
+    rayleigh_p: np.ndarray
+    heading_information: np.ndarray
+    conjunctive: np.ndarray
+
+
+def analyse_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
+    """Scores of the chosen cells, from their time series, in bins over the box that the path fills.
+
+    Raises:
+        InputError: no cells were chosen, lengths differ, no pose is known or the path has no area.
+    """
+    settings = settings or AnalysisSettings()
+    if len(recording.cell) == 0 or recording.activity.shape[1:] != recording.cell.shape:
+        found = f"activity of {recording.activity.shape} for {len(recording.cell)} cells"
+        raise InputError("recording", found, "one column for each chosen cell", "choose cells to record")
+    series = recording.time, recording.truth, recording.activity
+    edges = arena_edges(recording.truth, settings.maps.place_bins)
+    sums = bin_activity(*series, *edges, settings.maps.heading_bins)
+    scores = score_sums(sums, recording.cell, recording, settings)
+    wide = arena_edges(recording.truth, settings.joint_bins)
+    joint = joint_maps(*series, *wide, settings.joint_headings)
+    return scores._replace(conjunctive=conjunctive_information(*joint))
+
+
+def analyse_all_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
+    """Scores of all cells of the network, from the sums of the recording; without `conjunctive`.
+
+    Raises:
+        InputError: the recording has no sums, or nothing was visited.
+    """
+    cells = math.prod(recording.shape)
+    if recording.sums is None or len(recording.sums.place) != cells:
+        raise InputError("recording.sums", "not of all cells", f"sums of {cells} cells", "record the sums")
+    return score_sums(recording.sums, np.arange(cells), recording, settings or AnalysisSettings())
+
+
+def score_sums(
+    sums: BinnedSums, cell: np.ndarray, recording: CellRecording, settings: AnalysisSettings
+) -> CellScores:
+    """Scores of `cell` [n], indices in the network of the recording, from their sums."""
+    hz, maps = math.prod(recording.shape) * settings.mean_rate, settings.maps
+    rates = rate_maps(sums, maps.smoothing, maps.least_seconds) * hz
+    raw = rate_maps(sums, 0.0, maps.least_seconds)
+    curves = tuning_curves(sums, maps.heading_smoothing, maps.least_seconds) * hz
+    place, turn = (rates, sums.seconds), (curves, sums.heading_seconds)
+    fields = find_fields(rates, settings.fields.share, settings.fields.least_bins)
+    heading, row, column = np.unravel_index(cell, recording.shape)
+    return CellScores(
+        cell=np.asarray(cell),
+        sheet_x=column * recording.cell_size,
+        sheet_y=row * recording.cell_size,
+        sheet_heading=heading * 2 * np.pi / recording.shape[0],
+        mean_rate=mean_rate(*place),
+        peak_rate=peak_rate(*place),
+        information=information(*place),
+        information_rate=information_rate(*place),
+        sparsity=sparsity(*place),
+        selectivity=selectivity(*place),
+        coherence=coherence(raw, sums.seconds),
+        fields=count_by_cell(fields, len(rates)),
+        field_area=largest_by_cell(fields, len(rates)) * bin_area(sums.x_edges, sums.y_edges),
+        border=border_score(*place),
+        vector_length=mean_vector_length(*turn),
+        direction=preferred_direction(*turn),
+        heading_peak=peak_rate(*turn),
+        rayleigh_z=rayleigh_z(*turn),
+        rayleigh_p=rayleigh_p(*turn),
+        heading_information=information(*turn),
+        conjunctive=np.full(len(rates), np.nan),
+    )
+
+
+def write_scores(path: Path, scores: CellScores) -> None:
+    """Writes a CSV file: a header with the names of `CellScores`, then a line for each cell; floats exactly
+    (repr)."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(CellScores._fields)
+            writer.writerows(zip(*(column.tolist() for column in scores), strict=True))
+
+    write_atomically(path, write)

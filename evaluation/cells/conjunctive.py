@@ -1,0 +1,78 @@
+"""Tuning to place and heading at once.
+
+Sargolini et al. 2006 call a cell conjunctive if its grid score and its mean vector length both lie above the
+95th percentile of shuffles. That test needs no map of its own: apply `exceeds_both`.
+`conjunctive_information` asks of
+any cell, with a grid or without: is its activity better told by place and heading together than by either
+alone?
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evaluation.cells.information import information
+from evaluation.cells.rate_map import box_samples, sum_into
+
+
+def joint_maps(
+    time: np.ndarray,
+    truth: np.ndarray,
+    activity: np.ndarray,
+    x_edges: np.ndarray,
+    y_edges: np.ndarray,
+    heading_bins: int = 8,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rates [C, B, H, W] over heading and place, NaN where the rat was not, and seconds [B, H, W].
+
+    Use few bins: 10 x 10 places and 8 headings are 800 bins for the path to fill.
+
+    Args:
+        time: [T] s. truth: [T, 3] m, m, rad. activity: [T, C]. x_edges: [W + 1] m. y_edges: [H + 1] m.
+
+    Raises:
+        InputError: lengths differ, no pose is known or no time is spent inside the edges.
+    """
+    samples = box_samples(time, truth, activity, x_edges, y_edges, heading_bins)
+    shape = (heading_bins, len(y_edges) - 1, len(x_edges) - 1)
+    flat = np.ravel_multi_index((samples.heading, samples.row, samples.column), shape)
+    seconds, sums = sum_into(flat, samples.seconds, samples.activity, shape)
+    return sums / np.where(seconds > 0, seconds, np.nan), seconds
+
+
+def conjunctive_information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] information of the joint map less that of the better of its place map and its tuning curve, bits
+    per unit of activity (Skaggs et al. 1993, each).
+
+    0 for a cell tuned to place alone or to heading alone; for a product of a place map and a tuning curve,
+    with headings alike at all places, it is the smaller of their two informations. Never negative; a short
+    path makes it
+    larger, because few visits to a bin look like tuning: compare with shuffles.
+
+    Args:
+        rates: [n, B, H, W], NaN where unknown. seconds: [B, H, W] s.
+    """
+    sums = np.nan_to_num(rates) * seconds
+    alone = [_marginal(sums, seconds, (1,)), _marginal(sums, seconds, (2, 3))]
+    return information(rates, seconds) - np.maximum(*alone)
+
+
+def exceeds_both(
+    grid: np.ndarray,
+    vector: np.ndarray,
+    grid_threshold: np.ndarray | float,
+    vector_threshold: np.ndarray | float,
+) -> np.ndarray:
+    """[n] bool, conjunctive cells of Sargolini et al. 2006.
+
+    Args:
+        grid: [n] grid scores. vector: [n] mean vector lengths. grid_threshold, vector_threshold: the 95th
+            percentile of their shuffles, of each cell [n] or of all.
+    """
+    return (grid > grid_threshold) & (vector > vector_threshold)
+
+
+def _marginal(sums: np.ndarray, seconds: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """[n] information of the map that remains after summing over axes of `sums` [n, B, H, W]."""
+    time = seconds.sum(axis=tuple(axis - 1 for axis in axes))
+    return information(sums.sum(axis=axes) / np.where(time > 0, time, np.nan), time)

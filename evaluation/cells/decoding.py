@@ -1,0 +1,146 @@
+"""Decoding of position from the activity of recorded cells, with the error of the decoded position."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from evaluation.cells.rate_map import (
+    BoxSamples,
+    arena_edges,
+    box_samples,
+    rate_maps,
+    sum_samples,
+)
+from evaluation.cells.recording import CellRecording
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+
+
+class DecodingSettings(Settings):
+    """How position is decoded."""
+
+    window: float = Field(default=0.5, gt=0)
+    """Time over which activity is averaged, s."""
+    block: float = Field(default=20.0, gt=0)
+    """Time of the blocks that by turns make the maps and test them, s."""
+    place_bins: int = Field(default=20, ge=3)
+    """Bins along each side of the box."""
+    smoothing: float = Field(default=1.5, ge=0)
+    """Standard deviation of the Gaussian over the maps, bins."""
+    least_seconds: float = Field(default=0.1, gt=0)
+    """A bin visited for less time in a half is never decoded from its maps, s."""
+    shifts: int = Field(default=100, ge=1)
+    """Circular shifts of the control."""
+
+
+class Decoding(NamedTuple):
+    """Decoded positions in M windows.
+
+    Attributes:
+        time: [M] s, middle of the window. truth, decoded: [M, 2] m. error: [M] distance between them, m.
+        median: of the error, m. control: [shifts] median errors of circularly shifted activity, m.
+    """
+
+    time: np.ndarray
+    truth: np.ndarray
+    decoded: np.ndarray
+    error: np.ndarray
+    median: float
+    control: np.ndarray
+
+
+def decode_positions(
+    recording: CellRecording, settings: DecodingSettings | None = None, seed: int = 0
+) -> Decoding:
+    """Decodes the position of the rat from the chosen cells (Zhang et al. 1998: Bayes, independent Poisson
+    cells, flat prior), cross-validated: odd blocks of time with the maps of the even ones and the other way
+    round.
+
+    With a flat prior the most probable place does not depend on the spikes/s per unit of activity, so no
+    rate is needed; activity is decoded without the noise of spikes. Control: the decoded positions, shifted
+    round the session by at least a tenth of it against the true ones.
+
+    Raises:
+        InputError: lengths differ, no pose is known, the path has no area or is shorter than four blocks.
+    """
+    settings = settings or DecodingSettings()
+    x_edges, y_edges = arena_edges(recording.truth, settings.place_bins)
+    samples = box_samples(recording.time, recording.truth, recording.activity, x_edges, y_edges, 1)
+    block = ((samples.time - samples.time[0]) // settings.block).astype(int)
+    if block[-1] < 3:
+        raise InputError(
+            "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {settings.block} s"
+        )
+    halves = [_decode_half(samples, block % 2 == half, (x_edges, y_edges), settings) for half in (0, 1)]
+    time, truth, decoded = (np.concatenate(parts) for parts in zip(*halves, strict=True))
+    order = np.argsort(time, kind="stable")
+    time, truth, decoded = time[order], truth[order], decoded[order]
+    error = np.linalg.norm(decoded - truth, axis=1)
+    control = _shifted_errors(truth, decoded, settings.shifts, seed)
+    return Decoding(time, truth, decoded, error, float(np.median(error)), control)
+
+
+def log_posterior(
+    counts: np.ndarray, seconds: np.ndarray, rates: np.ndarray, log_prior: np.ndarray
+) -> np.ndarray:
+    """[M, H, W] logarithm of the posterior of each place, up to a constant of the window (Zhang et al. 1998,
+    eq. 36).
+
+    sum_i n_i log f_i(x) - t sum_i f_i(x) + log prior(x); -inf at places without a rate. A rate below a
+    thousandth of the cell's mean over places counts as that, so that one spike excludes no place.
+
+    Args:
+        counts: [M, n] spikes. seconds: [M] length of each window, s. rates: [n, H, W] spikes/s, NaN where
+            unknown.
+        log_prior: [H, W], zeros for a flat one; `log_occupancy` for the time spent at each place.
+    """
+    places = rates.shape[1:]
+    flat = rates.reshape(len(rates), -1)
+    known = np.isfinite(flat).all(axis=0)
+    level = flat[:, known]
+    floor = np.maximum(1e-3 * level.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    level = np.maximum(level, floor)
+    posterior = np.full((len(counts), flat.shape[1]), -np.inf)
+    posterior[:, known] = counts @ np.log(level) - np.multiply.outer(seconds, level.sum(axis=0))
+    return posterior.reshape(-1, *places) + log_prior
+
+
+def log_occupancy(seconds: np.ndarray) -> np.ndarray:
+    """[H, W] logarithm of the share of time at each place, -inf where none was spent."""
+    share = seconds / seconds.sum()
+    return np.where(share > 0, np.log(np.where(share > 0, share, 1.0)), -np.inf)
+
+
+def _decode_half(
+    samples: BoxSamples, train: np.ndarray, edges: tuple[np.ndarray, np.ndarray], settings: DecodingSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [M] s, true and decoded places [M, 2] m of the windows outside `train` [samples] bool."""
+    maps = sum_samples(BoxSamples(*(each[train] for each in samples)), *edges, 1)
+    rates = rate_maps(maps, settings.smoothing, settings.least_seconds)
+    test = BoxSamples(*(each[~train] for each in samples))
+    _, window = np.unique((test.time - samples.time[0]) // settings.window, return_inverse=True)
+    seconds = np.bincount(window, test.seconds)
+    counts = _sum_windows(window, test.activity * test.seconds[:, None])
+    time, truth = (
+        _sum_windows(window, each) / np.bincount(window)[:, None] for each in (test.time[:, None], test.place)
+    )
+    posterior = log_posterior(counts, seconds, rates, np.zeros(rates.shape[1:]))
+    row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])
+    x, y = ((each[1:] + each[:-1]) / 2 for each in edges)
+    return time[:, 0], truth, np.stack([x[column], y[row]], axis=1)
+
+
+def _sum_windows(window: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """[M, k] sums of values [T, k], whose windows [T] come in order."""
+    return np.add.reduceat(values, np.flatnonzero(np.diff(window, prepend=-1)), axis=0)
+
+
+def _shifted_errors(truth: np.ndarray, decoded: np.ndarray, shifts: int, seed: int) -> np.ndarray:
+    """[shifts] median error, m."""
+    least = max(len(truth) // 10, 1)
+    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, shifts)
+    return np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])

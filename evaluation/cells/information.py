@@ -1,0 +1,67 @@
+"""Spatial information, sparsity and selectivity of rate maps, tuning curves and joint maps.
+
+All functions take rates [n, bins...], NaN where unknown, and seconds [bins...], the time in each bin, and
+return [n]; a cell without activity has NaN. Bins may be places [H, W], headings [B] or both [B, H, W]. With
+p the share of time in a bin, r the rate there and m = sum p r the mean rate:
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import xlogy
+
+from evaluation.cells.rate_map import weigh_bins
+
+
+def information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] sum p r/m log2(r/m), bits per unit of activity: bits/spike for any scale of the rates.
+
+    Skaggs et al. 1993; pynapple computes the same. opexebo leaves out bins below the mean rate:
+    `information_above_mean`.
+    """
+    relative, share = _relative(rates, seconds)
+    return _total(share * xlogy(relative, relative)) / np.log(2)
+
+
+def information_above_mean(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] `information`, summed over the bins above the mean rate alone; the convention of opexebo."""
+    relative, share = _relative(rates, seconds)
+    return _total(share * xlogy(relative, np.maximum(relative, 1.0))) / np.log(2)
+
+
+def information_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] sum p r log2(r/m), bits times the unit of the rates: bits/s for rates in spikes/s. Skaggs et al.
+    1993."""
+    return information(rates, seconds) * mean_rate(rates, seconds)
+
+
+def sparsity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] m^2 / sum p r^2, the share of the box in which the cell is active, in (0, 1]; 1 for a flat map.
+
+    Skaggs et al. 1996.
+    """
+    relative, share = _relative(rates, seconds)
+    return 1 / _total(share * relative**2)
+
+
+def selectivity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] highest rate over mean rate, at least 1. Skaggs et al. 1996."""
+    relative, _ = _relative(rates, seconds)
+    return relative.max(axis=1)
+
+
+def mean_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[n] sum p r, in the unit of the rates."""
+    rates, share = weigh_bins(rates, seconds)
+    return _total(share * rates)
+
+
+def _relative(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates over their mean [n, bins], NaN for a cell without activity, and the share of time [n, bins]."""
+    rates, share = weigh_bins(rates, seconds)
+    mean = _total(share * rates)
+    return rates / np.where(mean > 0, mean, np.nan)[:, None], share
+
+
+def _total(values: np.ndarray) -> np.ndarray:
+    return values.sum(axis=1)

@@ -1,0 +1,274 @@
+"""Rate maps: mean activity in each bin of the box, from time series or from sums.
+
+A rate map [cells, H, W] is the activity summed over time in each bin divided by the time there. Both are
+smoothed first, by the same Gaussian, so a bin visited for a long time weighs more than a short visit beside
+it (as in Skaggs et al. 1996). opexebo smooths the finished map instead:
+`smooth_plane` of the map with 0 for bins without a rate. The map has the unit of the activity: multiply by
+spikes/s per unit of activity for Hz.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import csr_array
+
+from evaluation.cells.recording import BinnedSums
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+
+
+class MapSettings(Settings):
+    """Bins and smoothing of rate maps and tuning curves."""
+
+    place_bins: int = Field(default=20, ge=3)
+    """Bins along each side of the box."""
+    heading_bins: int = Field(default=36, ge=3)
+    """Bins of the heading; bin b is centred on 2 pi b / heading_bins rad."""
+    smoothing: float = Field(default=1.5, ge=0)
+    """Standard deviation of the Gaussian over place, bins."""
+    heading_smoothing: float = Field(default=0.0, ge=0)
+    """Standard deviation of the Gaussian over heading, bins."""
+    least_seconds: float = Field(default=0.1, gt=0)
+    """A bin visited for less time has no rate (NaN), s."""
+
+
+def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0.1) -> np.ndarray:
+    """[cells, H, W] mean activity, NaN in bins visited for less than `least_seconds`.
+
+    Args:
+        smoothing: standard deviation of the Gaussian, bins; 0 for none.
+
+    Raises:
+        InputError: the sums do not fit each other, or no bin was visited long enough.
+    """
+    if sums.place.shape[1:] != sums.seconds.shape:
+        raise InputError(
+            "sums.place", f"bins {sums.place.shape[1:]}", f"the bins of sums.seconds, {sums.seconds.shape}"
+        )
+    visited = _visited(sums.seconds, least_seconds)
+    rates = smooth_plane(sums.place, smoothing)
+    rates *= np.where(visited, 1 / np.where(visited, smooth_plane(sums.seconds, smoothing), 1.0), np.nan)
+    return rates
+
+
+def tuning_curves(sums: BinnedSums, smoothing: float = 0.0, least_seconds: float = 0.1) -> np.ndarray:
+    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`.
+
+    Args:
+        smoothing: standard deviation of the Gaussian round the circle, bins; 0 for none.
+
+    Raises:
+        InputError: the sums do not fit each other, or no heading was held long enough.
+    """
+    if sums.heading.shape[1:] != sums.heading_seconds.shape:
+        found, expected = f"{sums.heading.shape[1]} bins", f"{len(sums.heading_seconds)} of heading_seconds"
+        raise InputError("sums.heading", found, expected)
+    visited = _visited(sums.heading_seconds, least_seconds)
+    kernel = _kernel(len(visited), smoothing, "wrap").T
+    seconds = np.where(visited, sums.heading_seconds @ kernel, np.nan)
+    return (sums.heading @ kernel) / seconds
+
+
+def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Values [..., H, W] smoothed by a Gaussian of `sigma` bins, cut off at 4 sigma, mirrored at the walls.
+
+    The value beside a wall is repeated outside (d c b a | a b c d), so no activity leaves the box. NaN
+    spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
+    """
+    height, width = values.shape[-2:]
+    return _kernel(height, sigma, "reflect") @ values @ _kernel(width, sigma, "reflect").T
+
+
+class BoxSamples(NamedTuple):
+    """The M samples of a path whose pose is known and inside the box.
+
+    Attributes:
+        time, seconds: [M] s. place: [M, 2] m. row, column, heading: [M] int bins. activity: [M, C].
+    """
+
+    time: np.ndarray
+    seconds: np.ndarray
+    place: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    heading: np.ndarray
+    activity: np.ndarray
+
+
+def bin_activity(
+    time: np.ndarray,
+    truth: np.ndarray,
+    activity: np.ndarray,
+    x_edges: np.ndarray,
+    y_edges: np.ndarray,
+    heading_bins: int = 36,
+) -> BinnedSums:
+    """Sums activity times time into bins of place and heading; arguments and errors are those of
+    `box_samples`."""
+    samples = box_samples(time, truth, activity, x_edges, y_edges, heading_bins)
+    return sum_samples(samples, x_edges, y_edges, heading_bins)
+
+
+def box_samples(
+    time: np.ndarray,
+    truth: np.ndarray,
+    activity: np.ndarray,
+    x_edges: np.ndarray,
+    y_edges: np.ndarray,
+    heading_bins: int = 36,
+) -> BoxSamples:
+    """The samples inside the box with their bins.
+
+    A sample stands for the time since the sample before, the first for the median of these. Samples of
+    unknown pose and outside the edges do not count; the last edges belong to the last bins.
+
+    Args:
+        time: [T] s. truth: [T, 3] m, m, rad, NaN where unknown. activity: [T, C].
+        x_edges: [W + 1] m. y_edges: [H + 1] m.
+
+    Raises:
+        InputError: lengths differ, time runs backwards, no pose is known or no time is spent inside the
+            edges.
+    """
+    check_lengths(time, truth, activity)
+    seconds = sample_seconds(time)
+    row, column = _place_bin(truth[:, 1], y_edges), _place_bin(truth[:, 0], x_edges)
+    inside = np.flatnonzero(known_poses(truth) & (row >= 0) & (column >= 0))
+    if not seconds[inside].sum() > 0:
+        raise InputError("truth", "no time is spent in any bin", "a path inside the edges", "check the edges")
+    return BoxSamples(
+        np.asarray(time)[inside],
+        seconds[inside],
+        truth[inside, :2],
+        row[inside],
+        column[inside],
+        circle_bin(truth[inside, 2], heading_bins),
+        activity[inside],
+    )
+
+
+def sum_samples(
+    samples: BoxSamples, x_edges: np.ndarray, y_edges: np.ndarray, heading_bins: int
+) -> BinnedSums:
+    """The sums over samples that `box_samples` placed in these bins."""
+    height, width = len(y_edges) - 1, len(x_edges) - 1
+    seconds, place = sum_into(
+        samples.row * width + samples.column, samples.seconds, samples.activity, (height, width)
+    )
+    heading_seconds, heading = sum_into(samples.heading, samples.seconds, samples.activity, (heading_bins,))
+    return BinnedSums(np.asarray(x_edges), np.asarray(y_edges), seconds, place, heading_seconds, heading)
+
+
+def sum_into(
+    bins: np.ndarray, seconds: np.ndarray, activity: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds [*shape] in each bin, and activity times seconds [C, *shape].
+
+    Args:
+        bins: [M] int flat index of the bin of each sample. seconds: [M] s. activity: [M, C].
+    """
+    count, samples = math.prod(shape), np.arange(len(bins))
+    weights = csr_array((seconds, (bins, samples)), shape=(count, len(bins)))
+    sums = (weights @ np.asarray(activity, np.float64)).T
+    return np.bincount(bins, seconds, count).reshape(shape), np.ascontiguousarray(sums).reshape(-1, *shape)
+
+
+def sample_seconds(time: np.ndarray) -> np.ndarray:
+    """[T] s since the sample before; the first takes the median of the others.
+
+    Raises:
+        InputError: fewer than two samples, an unknown time or time that runs backwards.
+    """
+    steps = np.diff(np.asarray(time, np.float64))
+    if len(steps) == 0 or not np.isfinite(time).all() or (steps < 0).any():
+        raise InputError("time", f"{len(time)} samples, not all in order", "two or more rising times, s")
+    return np.concatenate([[np.median(steps)], steps])
+
+
+def arena_edges(truth: np.ndarray, bins: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """x_edges and y_edges, [bins + 1] m each, of equal bins over the box that the path [T, 3] fills.
+
+    Raises:
+        InputError: no pose is known, or the path has no width or no height.
+    """
+    place = truth[known_poses(truth), :2]
+    low, high = place.min(axis=0), place.max(axis=0)
+    if not (high > low).all():
+        raise InputError("truth", "a path without width or height", "a path that fills a box")
+    x, y = np.linspace(low, high, bins + 1).T
+    return x, y
+
+
+def known_poses(truth: np.ndarray) -> np.ndarray:
+    """[T] bool, the pose [T, 3] is known.
+
+    Raises:
+        InputError: no pose is known.
+    """
+    known = np.isfinite(truth).all(axis=1)
+    if not known.any():
+        raise InputError("truth", "no known pose: the path is NaN throughout", "m, m, rad", "record a truth")
+    return known
+
+
+def check_lengths(time: np.ndarray, *series: np.ndarray) -> None:
+    """Raises an InputError unless every series has a row for each time."""
+    lengths = [len(each) for each in (time, *series)]
+    if len(set(lengths)) > 1:
+        raise InputError("recording", f"series of {' and '.join(map(str, lengths))} rows", "equal lengths")
+
+
+def circle_bin(angle: np.ndarray, bins: int) -> np.ndarray:
+    """[T] int bin of each angle, rad; bin b is centred on 2 pi b / bins."""
+    return np.round(angle * bins / (2 * np.pi)).astype(int) % bins
+
+
+def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates [n, bins] with 0 for NaN, and the share of time [n, bins] among the bins that have a rate.
+
+    Args:
+        rates: [n, ...] over any bins, NaN where unknown. seconds: [...] time in each bin, s.
+
+    Raises:
+        InputError: the bins differ, or no bin has both a rate and time.
+    """
+    if rates.shape[1:] != seconds.shape:
+        raise InputError("seconds", f"bins {seconds.shape}", f"the bins of the rates, {rates.shape[1:]}")
+    flat = rates.reshape(len(rates), -1)
+    known = np.isfinite(flat)
+    share = known * seconds.reshape(-1)
+    total = share.sum(axis=1, keepdims=True)
+    if len(rates) and not total.any():
+        raise InputError("seconds", "no time in any bin", "time in bins that have a rate", "check the edges")
+    share /= np.where(total > 0, total, np.nan)
+    return np.where(known, flat, 0.0), share
+
+
+def _place_bin(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """[T] int bin of each value, -1 outside or unknown; the last edge belongs to the last bin."""
+    at = np.searchsorted(edges, values, side="right") - 1
+    at = np.where(values == edges[-1], len(edges) - 2, at)
+    return np.where(at < len(edges) - 1, at, -1)
+
+
+def _visited(seconds: np.ndarray, least_seconds: float) -> np.ndarray:
+    visited = seconds >= least_seconds
+    if not visited.any():
+        raise InputError(
+            "sums",
+            f"no bin with {least_seconds} s of time",
+            "a visited arena",
+            "check edges and least_seconds",
+        )
+    return visited
+
+
+def _kernel(bins: int, sigma: float, mode: str) -> np.ndarray:
+    """[bins, bins] matrix that smooths a column of `bins` values."""
+    eye = np.eye(bins)
+    return gaussian_filter1d(eye, sigma, axis=0, mode=mode, truncate=4.0) if sigma > 0 else eye
