@@ -58,11 +58,11 @@ def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> F
     large[0] = False
     number = np.where(large, np.cumsum(large), 0).astype(np.int32)
     label_ = number[label_]
-    at = np.nonzero(label_)
-    field = label_[at] - 1
+    at = np.flatnonzero(label_)
+    field = label_.ravel()[at] - 1
     cell, highest = np.zeros(large.sum(), int), np.zeros(large.sum())
-    cell[field] = at[0]
-    np.maximum.at(highest, field, filled[at])
+    cell[field] = at // label_[0].size
+    np.maximum.at(highest, field, filled.ravel()[at])
     return Fields(label_, cell, bins[large], highest)
 
 

@@ -68,7 +68,7 @@ def _mean_vector(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     total = filled.sum(axis=1)
     bins = filled.shape[1]
     unit = np.exp(2j * np.pi * np.arange(bins) / bins)
-    return filled @ unit / np.where(total > 0, total, np.nan)
+    return filled @ unit * (1 / np.where(total > 0, total, np.nan))
 
 
 def _spikes(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

@@ -241,7 +241,7 @@ def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.n
         raise InputError("seconds", f"bins {seconds.shape}", f"the bins of the rates, {rates.shape[1:]}")
     flat = rates.reshape(len(rates), -1)
     known = np.isfinite(flat)
-    share = known * seconds.reshape(-1)
+    share = known * np.asarray(seconds, np.float64).reshape(-1)
     total = share.sum(axis=1, keepdims=True)
     if len(rates) and not total.any():
         raise InputError("seconds", "no time in any bin", "time in bins that have a rate", "check the edges")

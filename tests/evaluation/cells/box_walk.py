@@ -43,7 +43,7 @@ def direction_cells(heading: np.ndarray, preferred: np.ndarray, sharpness: float
 
 
 def mixed_cells(walk: Walk) -> np.ndarray:
-    """[T, 10]: six place cells, two direction cells, a cell along the left wall and one that is always active."""
+    """[T, 10]: six place cells, two direction cells, a cell along the left wall and one always active."""
     centres = np.array([[0.2, 0.3], [0.5, 0.5], [0.8, 0.2], [0.7, 0.8], [0.35, 0.7], [0.9, 0.9]])
     along = np.exp(-walk.truth[:, :1] / 0.05)
     return np.concatenate(
