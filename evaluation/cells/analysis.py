@@ -1,8 +1,8 @@
 """All scores of cells: a table with one row for each cell.
 
-Activity has no unit: that of all cells sums to 1. Here a cell with the mean activity of the network fires at
-`AnalysisSettings.mean_rate`, 1 Hz by default, so rates are in Hz; scores in bits/spike and lengths do not
-depend on it, bits/s and the Rayleigh test do.
+Activity has no unit: that of all cells sums to 1. `AnalysisSettings.gain` turns it into spikes/s; without
+one, a cell with the mean activity of the network fires at 1 Hz. Scores in bits/spike and lengths do not
+depend on it; rates, bits/s and the Rayleigh test do.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class AnalysisSettings(Settings):
     """Bins and smoothing; the bins of sums are those of the recording."""
     fields: FieldSettings = FieldSettings()
     """What counts as a field."""
-    mean_rate: float = Field(default=1.0, gt=0)
-    """Rate of a cell with the mean activity of the network, Hz."""
+    gain: float | None = Field(default=None, gt=0)
+    """Spikes/s for each unit of activity; None: the number of cells of the network."""
     joint_bins: int = Field(default=10, ge=3)
     """Bins along each side of the box in joint maps of place and heading."""
     joint_headings: int = Field(default=8, ge=3)
@@ -126,7 +126,7 @@ def score_sums(
     sums: BinnedSums, cell: np.ndarray, recording: CellRecording, settings: AnalysisSettings
 ) -> CellScores:
     """Scores of `cell` [n], indices in the network of the recording, from their sums."""
-    hz, maps = math.prod(recording.shape) * settings.mean_rate, settings.maps
+    hz, maps = settings.gain or math.prod(recording.shape), settings.maps
     rates = rate_maps(sums, maps.smoothing, maps.least_seconds) * hz
     raw = rate_maps(sums, 0.0, maps.least_seconds)
     curves = tuning_curves(sums, maps.heading_smoothing, maps.least_seconds) * hz

@@ -38,10 +38,10 @@ class Fields(NamedTuple):
 def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> Fields:
     """Finds the fields of each map: bins joined by their sides whose rate is at least `share` of the peak.
 
-    No field crosses a wall, and bins without a rate belong to none. opexebo lowers a threshold for each peak
-    until the field merges with another, at the lowest to 0.2 of the peak of the map opened by a disk of
-    radius 1 (which rounds off the summit); for separate fields of equal peaks `share` = 0.2 times that peak
-    over the plain one gives the same fields.
+    No field crosses a wall, and bins without a rate belong to none. opexebo instead lowers a threshold for
+    each peak until the field jumps in size or joins another, at the lowest to 0.2 of the peak of the map
+    opened by a disk of radius 1, which flattens the summit. Where its search ends there, `share` = 0.2 times
+    that peak over the plain one gives the same fields.
 
     Args:
         rates: [n, H, W] smoothed rates, NaN where unknown. least_bins: smaller fields are dropped, bins.

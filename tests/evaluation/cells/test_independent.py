@@ -173,20 +173,20 @@ def test_border_score_is_that_of_opexebo(opexebo: ModuleType, sums: BinnedSums, 
         assert_allclose(score, other, atol=1e-6)
 
 
-def test_separate_fields_are_those_of_opexebo(opexebo: ModuleType) -> None:
-    """Its threshold sinks to 0.2 of the peak of the map opened by a disk of radius 1."""
+@pytest.mark.parametrize("spots", [[(5, 5)], [(4, 14), (14, 5)], [(3, 3), (16, 3), (9, 16)]])
+def test_separate_fields_are_those_of_opexebo(opexebo: ModuleType, spots: list[tuple[int, int]]) -> None:
+    """Its search, given the peaks, ends at 0.2 of the peak of the map opened by a disk of radius 1."""
     morphology = _import("skimage.morphology")
-    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
-    spots = [[(5, 5)], [(4, 14), (14, 5)], [(10, 10)], [(3, 3), (16, 3), (9, 16)]]
-    for spot in spots:
-        rates = 20 * sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * 2.0**2)) for a, b in spot)
-        other, label = _quietly(opexebo.analysis.place_field, rates, min_peak=0.0, min_mean=0.0)
-        opened = morphology.reconstruction(morphology.erosion(rates, morphology.disk(1)), rates)
-        fields = find_fields(rates[None], 0.2 * opened.max() / rates.max())
-        assert len(fields.cell) == len(other) == len(spot)
-        assert ((fields.label[0] > 0) == (label > 0)).all()
-        assert sorted(fields.bins) == sorted(each["area"] for each in other)
-        assert_allclose(sorted(fields.peak), sorted(each["peak_rate"] for each in other), atol=1e-6)
+    y, x = np.mgrid[:20, :20]
+    rates = np.stack([20 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 8) for b, a in spots]).sum(axis=0)
+    keys = {"min_peak": 0.0, "min_mean": 0.0, "peak_coords": np.array(spots)}
+    other, label = _quietly(opexebo.analysis.place_field, rates, **keys)
+    opened = morphology.reconstruction(morphology.erosion(rates, morphology.disk(1)), rates)
+    fields = find_fields(rates[None], 0.2 * opened.max() / rates.max())
+    assert len(fields.cell) == len(other) == len(spots)
+    assert ((fields.label[0] > 0) == (label > 0)).all()
+    assert sorted(fields.bins) == sorted(each["area"] for each in other)
+    assert_allclose(sorted(fields.peak), sorted(each["peak_rate"] for each in other), atol=1e-6)
 
 
 def test_information_is_that_of_pynapple(sums: BinnedSums) -> None:
@@ -201,13 +201,3 @@ def test_information_is_that_of_pynapple(sums: BinnedSums) -> None:
         found = _quietly(nap.compute_mutual_information, table)
         assert_allclose(information(rates, seconds), found["bits/spike"], atol=1e-6)
         assert_allclose(information_rate(rates, seconds), found["bits/sec"], atol=1e-6)
-
-
-def test_tuning_curves_are_those_of_pynapple(sums: BinnedSums, spikes: np.ndarray) -> None:
-    nap = _import("pynapple")
-    place = nap.TsdFrame(t=WALK.time, d=WALK.truth[:, :2], columns=["x", "y"])
-    cells = {k: nap.Ts(np.repeat(WALK.time, spikes[:, k])) for k in (0, 8)}
-    group = _quietly(nap.TsGroup, cells, time_support=place.time_support)
-    table = _quietly(nap.compute_tuning_curves, group, place, bins=[EDGES, EDGES], fs=20.0)
-    mine = rate_maps(sums, 0.0, 1e-3)[[0, 8]]
-    assert_allclose(np.nan_to_num(mine), np.nan_to_num(table.values.transpose(0, 2, 1)), atol=1e-6)
