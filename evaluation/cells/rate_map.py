@@ -74,6 +74,21 @@ def tuning_curves(sums: BinnedSums, smoothing: float = 0.0, least_seconds: float
     return (sums.heading @ kernel) / seconds
 
 
+def smooth_rates(rates: np.ndarray, seconds: np.ndarray, sigma: float) -> np.ndarray:
+    """[n, H, W] maps that were not smoothed, smoothed as `rate_maps` does; NaN stay NaN and do not spread.
+
+    Weights are the times in the bins; with weights of 1 this is `opexebo.general.smooth(mask_fill=nan)`. A
+    score of smoothed maps for `shuffling`: `lambda rates, seconds: score(smooth_rates(rates, seconds, 1.5),
+    seconds)`.
+
+    Args:
+        rates: [n, H, W], NaN where unknown. seconds: [H, W] s. sigma: of the Gaussian, bins.
+    """
+    weight = np.isfinite(rates) & (seconds > 0)
+    sums = smooth_plane(np.where(weight, rates, 0.0) * seconds, sigma)
+    return sums / np.where(weight, smooth_plane(weight * seconds, sigma), np.nan)
+
+
 def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
     """Values [..., H, W] smoothed by a Gaussian of `sigma` bins, cut off at 4 sigma, mirrored at the walls.
 

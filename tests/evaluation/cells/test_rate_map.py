@@ -15,6 +15,7 @@ from evaluation.cells.rate_map import (
     rate_maps,
     sample_seconds,
     smooth_plane,
+    smooth_rates,
     tuning_curves,
     weigh_bins,
 )
@@ -63,6 +64,12 @@ def test_bins_with_too_little_time_have_no_rate() -> None:
 def test_smoothing_keeps_the_sum(height: int, width: int, sigma: float) -> None:
     values = stream(height * 100 + width, "smoothing").random((2, height, width))
     assert_allclose(smooth_plane(values, sigma).sum(axis=(1, 2)), values.sum(axis=(1, 2)), rtol=1e-12)
+
+
+def test_finished_maps_are_smoothed_as_sums_are() -> None:
+    sums = mixed_sums(WALK)
+    rates = smooth_rates(rate_maps(sums, 0.0, 1e-3), sums.seconds, 1.5)
+    assert_allclose(rates, rate_maps(sums, 1.5, 1e-3), rtol=1e-9)
 
 
 def test_unknown_poses_do_not_count() -> None:
