@@ -35,7 +35,7 @@ def joint_maps(
     """
     samples = box_samples(time, truth, activity, x_edges, y_edges, heading_bins)
     shape = (heading_bins, len(y_edges) - 1, len(x_edges) - 1)
-    flat = np.ravel_multi_index((samples.heading, samples.row, samples.column), shape)
+    flat = samples.heading * (shape[1] * shape[2]) + samples.place
     seconds, sums = sum_into(flat, samples.seconds, samples.activity, shape)
     return sums / np.where(seconds > 0, seconds, np.nan), seconds
 

@@ -126,7 +126,8 @@ def _decode_half(
     seconds = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
     time, truth = (
-        _sum_windows(window, each) / np.bincount(window)[:, None] for each in (test.time[:, None], test.place)
+        _sum_windows(window, each) / np.bincount(window)[:, None]
+        for each in (test.time[:, None], test.position)
     )
     posterior = log_posterior(counts, seconds, rates, np.zeros(rates.shape[1:]))
     row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])

@@ -103,14 +103,14 @@ class BoxSamples(NamedTuple):
     """The M samples of a path whose pose is known and inside the box.
 
     Attributes:
-        time, seconds: [M] s. place: [M, 2] m. row, column, heading: [M] int bins. activity: [M, C].
+        time, seconds: [M] s. position: [M, 2] m. place: [M] int bin in the flattened [H, W]. heading: [M] int
+            bin. activity: [M, C].
     """
 
     time: np.ndarray
     seconds: np.ndarray
+    position: np.ndarray
     place: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
     heading: np.ndarray
     activity: np.ndarray
 
@@ -152,17 +152,16 @@ def box_samples(
     """
     check_lengths(time, truth, activity)
     seconds = sample_seconds(time)
-    row, column = _place_bin(truth[:, 1], y_edges), _place_bin(truth[:, 0], x_edges)
-    inside = np.flatnonzero(known_poses(truth) & (row >= 0) & (column >= 0))
+    place, heading = place_index(truth, x_edges, y_edges), heading_index(truth, heading_bins)
+    inside = np.flatnonzero((place >= 0) & (heading >= 0))
     if not seconds[inside].sum() > 0:
         raise InputError("truth", "no time is spent in any bin", "a path inside the edges", "check the edges")
     return BoxSamples(
         np.asarray(time)[inside],
         seconds[inside],
         truth[inside, :2],
-        row[inside],
-        column[inside],
-        circle_bin(truth[inside, 2], heading_bins),
+        place[inside],
+        heading[inside],
         activity[inside],
     )
 
@@ -171,10 +170,8 @@ def sum_samples(
     samples: BoxSamples, x_edges: np.ndarray, y_edges: np.ndarray, heading_bins: int
 ) -> BinnedSums:
     """The sums over samples that `box_samples` placed in these bins."""
-    height, width = len(y_edges) - 1, len(x_edges) - 1
-    seconds, place = sum_into(
-        samples.row * width + samples.column, samples.seconds, samples.activity, (height, width)
-    )
+    shape = len(y_edges) - 1, len(x_edges) - 1
+    seconds, place = sum_into(samples.place, samples.seconds, samples.activity, shape)
     heading_seconds, heading = sum_into(samples.heading, samples.seconds, samples.activity, (heading_bins,))
     return BinnedSums(np.asarray(x_edges), np.asarray(y_edges), seconds, place, heading_seconds, heading)
 
@@ -238,6 +235,31 @@ def check_lengths(time: np.ndarray, *series: np.ndarray) -> None:
         raise InputError("recording", f"series of {' and '.join(map(str, lengths))} rows", "equal lengths")
 
 
+def place_index(truth: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> np.ndarray:
+    """[T] int bin of each pose [T, 3] in the flattened [H, W], -1 outside and where the position is unknown.
+
+    The last edges belong to the last bins.
+
+    Raises:
+        InputError: no pose is known.
+    """
+    known_poses(truth)
+    row, column = _interval(truth[:, 1], y_edges), _interval(truth[:, 0], x_edges)
+    return np.where((row >= 0) & (column >= 0), row * (len(x_edges) - 1) + column, -1)
+
+
+def heading_index(truth: np.ndarray, bins: int) -> np.ndarray:
+    """[T] int bin of the heading of each pose [T, 3], -1 where it is unknown; bin b is centred on 2 pi b /
+    bins.
+
+    Raises:
+        InputError: no pose is known.
+    """
+    known_poses(truth)
+    known = np.isfinite(truth[:, 2])
+    return np.where(known, circle_bin(np.where(known, truth[:, 2], 0.0), bins), -1)
+
+
 def circle_bin(angle: np.ndarray, bins: int) -> np.ndarray:
     """[T] int bin of each angle, rad; bin b is centred on 2 pi b / bins."""
     return np.round(angle * bins / (2 * np.pi)).astype(int) % bins
@@ -264,8 +286,8 @@ def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.n
     return np.where(known, flat, 0.0), share
 
 
-def _place_bin(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """[T] int bin of each value, -1 outside or unknown; the last edge belongs to the last bin."""
+def _interval(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """[T] int index of the interval of each value, -1 outside or unknown."""
     at = np.searchsorted(edges, values, side="right") - 1
     at = np.where(values == edges[-1], len(edges) - 2, at)
     return np.where(at < len(edges) - 1, at, -1)

@@ -12,6 +12,8 @@ from evaluation.cells.rate_map import (
     arena_edges,
     bin_activity,
     circle_bin,
+    heading_index,
+    place_index,
     rate_maps,
     sample_seconds,
     smooth_plane,
@@ -91,6 +93,17 @@ def test_last_edge_belongs_to_the_last_bin() -> None:
 def test_headings_lie_round_the_centre_of_their_bin() -> None:
     angle = np.array([0.0, 0.08, -0.08, 2 * np.pi - 0.08, np.pi])
     assert circle_bin(angle, 36).tolist() == [0, 0, 0, 0, 18]
+
+
+def test_indices_are_those_of_the_sums() -> None:
+    truth = WALK.truth.copy()
+    truth[:100, 0], truth[100:200, 2] = np.nan, np.nan
+    sums, place, heading = mixed_sums(WALK), place_index(truth, EDGES, EDGES), heading_index(truth, 36)
+    assert (place[:100] == -1).all()
+    assert (heading[100:200] == -1).all()
+    whole = place_index(WALK.truth, EDGES, EDGES), heading_index(WALK.truth, 36)
+    assert_allclose(np.bincount(whole[0], minlength=400) * 0.05, sums.seconds.ravel(), atol=1e-9)
+    assert_allclose(np.bincount(whole[1], minlength=36) * 0.05, sums.heading_seconds, atol=1e-9)
 
 
 def _bin(time: np.ndarray, truth: np.ndarray, activity: np.ndarray) -> None:
