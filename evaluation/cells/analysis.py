@@ -17,7 +17,6 @@ from pydantic import Field
 
 from evaluation.cells.border import border_score
 from evaluation.cells.coherence import coherence
-from evaluation.cells.conjunctive import conjunctive_information, joint_maps
 from evaluation.cells.fields import FieldSettings, bin_area, count_by_cell, find_fields, largest_by_cell
 from evaluation.cells.head_direction import (
     mean_vector_length,
@@ -49,10 +48,6 @@ class AnalysisSettings(Settings):
     """What counts as a field."""
     gain: float | None = Field(default=None, gt=0)
     """Spikes/s for each unit of activity; None: the number of cells of the network."""
-    joint_bins: int = Field(default=10, ge=3)
-    """Bins along each side of the box in joint maps of place and heading."""
-    joint_headings: int = Field(default=8, ge=3)
-    """Headings in joint maps."""
 
 
 class CellScores(NamedTuple):
@@ -65,7 +60,7 @@ class CellScores(NamedTuple):
             without smoothing, z. fields: number. field_area: of the largest, m^2. border: border score.
         vector_length: of the tuning curve, [0, 1]. direction: preferred, rad. heading_peak: Hz.
         rayleigh_z, rayleigh_p: Rayleigh test. heading_information: of the tuning curve, bits/spike.
-        conjunctive: information of place and heading beyond the better of the two, bits/spike; NaN from sums.
+        conjunctive: the smaller of `information` and `heading_information`, bits/spike.
     """
 
     cell: np.ndarray
@@ -101,17 +96,15 @@ def analyse_cells(recording: CellRecording, settings: AnalysisSettings | None = 
     if len(recording.cell) == 0 or recording.activity.shape[1:] != recording.cell.shape:
         found = f"activity of {recording.activity.shape} for {len(recording.cell)} cells"
         raise InputError("recording", found, "one column for each chosen cell", "choose cells to record")
-    series = recording.time, recording.truth, recording.activity
     edges = arena_edges(recording.truth, settings.maps.place_bins)
-    sums = bin_activity(*series, *edges, settings.maps.heading_bins)
-    scores = score_sums(sums, recording.cell, recording, settings)
-    wide = arena_edges(recording.truth, settings.joint_bins)
-    joint = joint_maps(*series, *wide, settings.joint_headings)
-    return scores._replace(conjunctive=conjunctive_information(*joint))
+    sums = bin_activity(
+        recording.time, recording.truth, recording.activity, *edges, settings.maps.heading_bins
+    )
+    return score_sums(sums, recording.cell, recording, settings)
 
 
 def analyse_all_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
-    """Scores of all cells of the network, from the sums of the recording; without `conjunctive`.
+    """Scores of all cells of the network, from the sums of the recording.
 
     Raises:
         InputError: the recording has no sums, or nothing was visited.
@@ -132,6 +125,7 @@ def score_sums(
     curves = tuning_curves(sums, maps.heading_smoothing, maps.least_seconds) * hz
     place, turn = (rates, sums.seconds), (curves, sums.heading_seconds)
     fields = find_fields(rates, settings.fields.share, settings.fields.least_bins)
+    about_place, about_heading = information(*place), information(*turn)
     heading, row, column = np.unravel_index(cell, recording.shape)
     return CellScores(
         cell=np.asarray(cell),
@@ -140,7 +134,7 @@ def score_sums(
         sheet_heading=heading * 2 * np.pi / recording.shape[0],
         mean_rate=mean_rate(*place),
         peak_rate=peak_rate(*place),
-        information=information(*place),
+        information=about_place,
         information_rate=information_rate(*place),
         sparsity=sparsity(*place),
         selectivity=selectivity(*place),
@@ -153,8 +147,8 @@ def score_sums(
         heading_peak=peak_rate(*turn),
         rayleigh_z=rayleigh_z(*turn),
         rayleigh_p=rayleigh_p(*turn),
-        heading_information=information(*turn),
-        conjunctive=np.full(len(rates), np.nan),
+        heading_information=about_heading,
+        conjunctive=np.minimum(about_place, about_heading),
     )
 
 

@@ -110,11 +110,12 @@ def test_conjunctive_information_of_products() -> None:
 
 @settings(derandomize=True, max_examples=30, deadline=None)
 @given(SEEDS)
-def test_joint_map_never_tells_less(seed: int) -> None:
+def test_joint_map_tells_more_than_either_part(seed: int) -> None:
     draw = stream(seed, "joint")
     seconds = draw.exponential(1.0, (4, 3, 5)) * (draw.random((4, 3, 5)) < 0.8)
     rates = np.where(seconds > 0, draw.exponential(1.0, (3, 4, 3, 5)), np.nan)
     assert (conjunctive_information(rates, seconds) >= -1e-12).all()
+    assert (conjunctive_information(rates, seconds) <= information(rates, seconds) + 1e-12).all()
 
 
 def test_product_cells_are_conjunctive_and_others_are_not() -> None:
@@ -125,8 +126,8 @@ def test_product_cells_are_conjunctive_and_others_are_not() -> None:
     joint = joint_maps(*walk, np.concatenate([place * turn, place, turn], axis=1), edges, edges)
     both, place_only, turn_only = conjunctive_information(*joint)
     assert both > 0.5
-    assert place_only < 0.05
-    assert turn_only < 0.1
+    assert place_only < 0.1
+    assert turn_only < 0.15
 
 
 def test_sargolini_cells_exceed_both_thresholds() -> None:
