@@ -1,10 +1,8 @@
 """Tuning to place and heading at once.
 
 Sargolini et al. 2006 call a cell conjunctive if its grid score and its mean vector length both lie above the
-95th
-percentile of shuffles: `exceeds_both`. `conjunctive_information` asks the same of any cell, with a grid or
-without,
-in one number: its information about place or about heading, whichever is smaller.
+95th percentile of shuffles: `exceeds_both`. `conjunctive_information` asks the same of any cell, with a grid
+or without, in one number: its information about place or about heading, whichever is smaller.
 
 The information of a joint map beyond the two would be the other measure; it fails its control. A path fills
 800 joint bins so thinly that shuffled cells have more of it than cells that are tuned to both.
