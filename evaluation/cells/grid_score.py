@@ -1,0 +1,192 @@
+"""Lattice scores of autocorrelograms: hexagonal (the grid score) and square.
+
+An annulus of the autocorrelogram is correlated with itself after a rotation. The score is the lowest correlation at
+the angles that map the lattice onto itself, less the highest at the angles between (Sargolini et al. 2006, Science
+312:758). The annulus starts outside the central field and its outer radius grows; the score is the best mean
+over three successive radii (Langston et al. 2010, Science 328:1576; Stensola et al. 2012, Nature 492:72; the
+definition of opexebo, `analysis.grid_score`, MIT).
+
+The rotated maps of a batch are one product with a sparse matrix, and the sums over all annuli are cumulative sums over
+bins in the order of their radius. A rotated autocorrelogram is symmetric about its centre, so half of it suffices.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from evaluation.cells.centre_field import centre_radii
+from tactile.base.errors import InputError
+
+_BATCH = 128
+"""Maps of one batch: its arrays fit the cache."""
+_FLAT = 1e-12
+"""A variance below this share of the mean square is rounding: the annulus is flat."""
+
+
+class Lattice(NamedTuple):
+    """The symmetry of a lattice.
+
+    Attributes:
+        onto: angles that map it onto itself, degrees. between: angles that move its points farthest, degrees.
+    """
+
+    onto: tuple[float, ...]
+    between: tuple[float, ...]
+
+
+HEXAGONAL = Lattice((60.0, 120.0), (30.0, 90.0, 150.0))
+SQUARE = Lattice((90.0,), (45.0, 135.0))
+
+
+class _Annuli(NamedTuple):
+    """Bins of half an autocorrelogram in the order of their radius.
+
+    Attributes:
+        half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
+        starts: [S] where the distinct sums start. below, within: [R + 1] how many of these sums have a radius
+            < r, <= r, for r = 0 .. R bins. count: [S + 1] bins of the first sums.
+    """
+
+    half: np.ndarray
+    rotation: sparse.csr_array
+    starts: np.ndarray
+    below: np.ndarray
+    within: np.ndarray
+    count: np.ndarray
+
+
+def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:
+    """Lattice scores of autocorrelograms: [n], between -2 and 2.
+
+    The score is NaN where a map is flat, has no central field of at least 5 bins, or has no annulus between this
+    field and the edge. Lags that are NaN inside the annuli count as 0, no correlation.
+
+    Args:
+        autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattice: its symmetry.
+
+    Raises:
+        InputError: the array is no batch of maps with odd sides.
+    """
+    maps = np.asarray(autocorrelograms, float)
+    if maps.ndim != 3 or any(side % 2 == 0 for side in maps.shape[1:]):
+        raise InputError(
+            "autocorrelograms", f"array of shape {list(maps.shape)}", "maps [n, h, w] with odd sides"
+        )
+    batches = [maps[i : i + _BATCH] for i in range(0, len(maps), _BATCH)]
+    return np.concatenate([_score_batch(batch, lattice) for batch in batches] or [np.empty(0)])
+
+
+def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
+    """Scores [n] of a batch [n, h, w] that fits the cache."""
+    scores = np.full(len(maps), np.nan)
+    height, width = maps.shape[1:]
+    (valid,) = np.nonzero(maps[:, height // 2, width // 2] > 0)
+    stacked = np.ascontiguousarray(np.nan_to_num(maps[valid]).transpose(1, 2, 0))
+    stacked /= stacked.max(axis=(0, 1)) if valid.size else 1.0
+    inner = centre_radii(stacked)
+    outer = min(height, width) // 2
+    found = (inner > 0) & (inner < outer)
+    curves = _curves(stacked[..., found].reshape(height * width, -1), inner[found], lattice, height, width)
+    scores[valid[found]] = _best(curves, inner[found])
+    return scores
+
+
+def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, width: int) -> np.ndarray:
+    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins, of maps [h * w, n]."""
+    annuli = _annuli(lattice, height, width)
+    base = maps[annuli.half]
+    turned = (annuli.rotation @ maps).reshape(-1, *base.shape)
+
+    def add(values: np.ndarray) -> np.ndarray:
+        sums = np.add.reduceat(values, annuli.starts, axis=-2).cumsum(axis=-2)
+        sums = np.concatenate([np.zeros_like(sums[..., :1, :]), sums], axis=-2)
+        start = np.take_along_axis(sums, _like(annuli.within[inner], sums), axis=-2)
+        return sums[..., annuli.below, :] - start
+
+    count = annuli.count[annuli.below][:, None] - annuli.count[annuli.within[inner]]
+    count = np.maximum(count, 1)
+    mean, turned_mean = add(base) / count, add(turned) / count
+    square, turned_square = add(base * base) / count, add(turned * turned) / count
+    covariance = add(turned * base) / count - mean * turned_mean
+    variance, turned_variance = square - mean**2, turned_square - turned_mean**2
+    flat = (variance <= _FLAT * square) | (turned_variance <= _FLAT * turned_square)
+    product = np.where(flat, np.nan, variance * turned_variance)
+    correlation = np.clip(covariance / np.sqrt(product), -1.0, 1.0)
+    onto = len(lattice.onto)
+    return correlation[:onto].min(axis=0) - correlation[onto:].max(axis=0)
+
+
+def _like(index: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Indices [n] into the second last axis of sums [..., S, n], with as many axes."""
+    return index.reshape((1,) * (sums.ndim - 1) + (-1,))
+
+
+def _best(curves: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """The best mean score [n] over three successive outer radii, of curves [R + 1, n].
+
+    As in opexebo: the last window of three is left out, flat annuli are left out of a window, and the
+    mean over all radii is taken where they are four or fewer.
+    """
+    scores = np.full(len(inner), np.nan)
+    outer = len(curves) - 1
+    for radius in np.unique(inner):
+        of_radius = inner == radius
+        radii = np.linspace(max(3, radius + 1), outer, outer - radius).astype(int)
+        curve = curves[radii][:, of_radius]
+        if len(radii) <= 4:
+            scores[of_radius] = curve.mean(axis=0)
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(curve, 3, axis=0)[:-1]
+        known = np.isfinite(windows).sum(axis=2)
+        mean = np.nansum(windows, axis=2) / np.where(known > 0, known, np.nan)
+        scores[of_radius] = mean.max(axis=0)
+    return scores
+
+
+@lru_cache(maxsize=16)
+def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
+    """The annuli and rotations of autocorrelograms of odd height and width."""
+    outer = min(height, width) // 2
+    y, x = np.mgrid[:height, :width]
+    y, x = (y - height // 2).ravel(), (x - width // 2).ravel()
+    radius = np.hypot(y, x)
+    (half,) = np.nonzero(((y > 0) | ((y == 0) & (x > 0))) & (radius < outer))
+    half = half[np.argsort(radius[half], kind="stable")]
+    whole = np.arange(outer + 1)
+    below = np.searchsorted(radius[half], whole, side="left")
+    within = np.searchsorted(radius[half], whole, side="right")
+    count = np.unique(np.concatenate([below, within, [0]]))
+    angles = np.deg2rad(lattice.onto + lattice.between)
+    rotation = [_rotation(angle, y[half], x[half], height, width) for angle in angles]
+    return _Annuli(
+        half=half,
+        rotation=sparse.csr_array(sparse.vstack(rotation)),
+        starts=count[:-1],
+        below=np.searchsorted(count, below),
+        within=np.searchsorted(count, within),
+        count=count,
+    )
+
+
+def _rotation(angle: float, y: np.ndarray, x: np.ndarray, height: int, width: int) -> sparse.csr_array:
+    """Bilinear rotation about the centre by an angle, rad: [P, h * w] for the bins at offsets y, x [P].
+
+    The sense of rotation is that of `skimage.transform.rotate`.
+    """
+    column = np.cos(angle) * x - np.sin(angle) * y + width // 2
+    row = np.sin(angle) * x + np.cos(angle) * y + height // 2
+    low_row = np.clip(np.floor(row).astype(int), 0, height - 2)
+    low_column = np.clip(np.floor(column).astype(int), 0, width - 2)
+    part_row, part_column = row - low_row, column - low_column
+    rows, columns, weights = [], [], []
+    for up in (0, 1):
+        for right in (0, 1):
+            rows.append(np.arange(len(x)))
+            columns.append((low_row + up) * width + low_column + right)
+            weights.append(abs(1 - up - part_row) * abs(1 - right - part_column))
+    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_array(entries, shape=(len(x), height * width))
