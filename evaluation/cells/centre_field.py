@@ -1,10 +1,10 @@
 """The radius of the central field of autocorrelograms, by the adaptive threshold of opexebo.
 
-opexebo (`analysis.place_field`, MIT) grows a field round the centre: the threshold falls from 0.95 to 0.2 of the
-peak, and the growth ends where the connected region has a hole, jumps in area, shrinks three times or keeps its area
-for ten steps. Here the same rule runs on a batch of maps: each map is reduced to its levels between all thresholds in
-use, one flood from the centre gives every region, one flood from the border every hole (grey-scale
-reconstruction, Vincent 1993, IEEE Trans. Image Processing 2:176).
+opexebo (`analysis.place_field`, MIT) grows a field round the centre: the threshold falls from 0.95 to 0.2 of
+the peak, and the growth ends where the connected region has a hole, jumps in area, shrinks three times or
+keeps its area for ten steps. Here the same rule runs on a batch of maps: each map is reduced to its levels
+between all thresholds in use, one flood from the centre gives every region, one flood from the border every
+hole (grey-scale reconstruction, Vincent 1993, IEEE Trans. Image Processing 2:176).
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class _Schedule(NamedTuple):
 def centre_radii(autocorrelograms: np.ndarray) -> np.ndarray:
     """Radii of the central fields: [n] bins, whole numbers.
 
-    The radius is that of a disc of the area of the field, rounded down; 0 where no field of at least 5 bins is
-    found or the centre is no peak.
+    The radius is that of a disc of the area of the field, rounded down; 0 where no field of at least 5 bins
+    is found or the centre is no peak.
 
     Args:
         autocorrelograms: [h, w, n] finite, odd sides; maps last, so that the floods run over contiguous maps.
@@ -85,8 +85,8 @@ def _grow(areas: np.ndarray, thresholds: np.ndarray, schedule: _Schedule) -> np.
 
 
 def _areas(regions: np.ndarray, count: int) -> np.ndarray:
-    """Bins of the central region at each of `count` thresholds: [count, n]; NaN where it is empty or has a hole."""
-    height, width, maps = regions.shape
+    """Bins of the central region at each of `count` thresholds: [count, n]; NaN if empty or with a hole."""
+    maps = regions.shape[2]
     slots = regions + (count + 1) * np.arange(maps)
     bins = np.bincount(slots.ravel(), minlength=maps * (count + 1)).reshape(maps, count + 1).T
     areas = bins[::-1].cumsum(axis=0)[-2::-1].astype(float)
@@ -117,7 +117,7 @@ def _flood_from_centre(levels: np.ndarray) -> np.ndarray:
 
 
 def _flood_from_border(levels: np.ndarray) -> np.ndarray:
-    """The lowest wall [h, w, n] on the way by sides from each bin to the border: above its level in a hole."""
+    """The lowest wall [h, w, n] on the way by sides from each bin to the border; above its level in holes."""
     depth = _TOP - levels
     seed = depth.copy()
     seed[1:-1, 1:-1] = 0

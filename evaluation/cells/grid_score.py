@@ -1,13 +1,14 @@
 """Lattice scores of autocorrelograms: hexagonal (the grid score) and square.
 
-An annulus of the autocorrelogram is correlated with itself after a rotation. The score is the lowest correlation at
-the angles that map the lattice onto itself, less the highest at the angles between (Sargolini et al. 2006, Science
-312:758). The annulus starts outside the central field and its outer radius grows; the score is the best mean
-over three successive radii (Langston et al. 2010, Science 328:1576; Stensola et al. 2012, Nature 492:72; the
-definition of opexebo, `analysis.grid_score`, MIT).
+An annulus of the autocorrelogram is correlated with itself after a rotation. The score is the lowest
+correlation at the angles that map the lattice onto itself, less the highest at the angles between (Sargolini
+et al. 2006, Science 312:758). The annulus starts outside the central field and its outer radius grows; the
+score is the best mean over three successive radii (Langston et al. 2010, Science 328:1576; Stensola et al.
+2012, Nature 492:72; the definition of opexebo, `analysis.grid_score`, MIT).
 
-The rotated maps of a batch are one product with a sparse matrix, and the sums over all annuli are cumulative sums over
-bins in the order of their radius. A rotated autocorrelogram is symmetric about its centre, so half of it suffices.
+The rotated maps of a batch are one product with a sparse matrix, and the sums over all annuli are cumulative
+sums over bins in the order of their radius. An autocorrelogram is symmetric about its centre: half of it
+suffices.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class _Annuli(NamedTuple):
     Attributes:
         half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
         starts: [S] where the distinct sums start. below, within: [R + 1] how many of these sums have a radius
-            < r, <= r, for r = 0 .. R bins. count: [S + 1] bins of the first sums.
+            < r, <= r, for r = 0 .. R bins. bins: [S + 1] in the first sums.
     """
 
     half: np.ndarray
@@ -56,14 +57,14 @@ class _Annuli(NamedTuple):
     starts: np.ndarray
     below: np.ndarray
     within: np.ndarray
-    count: np.ndarray
+    bins: np.ndarray
 
 
 def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:
     """Lattice scores of autocorrelograms: [n], between -2 and 2.
 
-    The score is NaN where a map is flat, has no central field of at least 5 bins, or has no annulus between this
-    field and the edge. Lags that are NaN inside the annuli count as 0, no correlation.
+    The score is NaN where a map is flat, has no central field of at least 5 bins, or has no annulus between
+    this field and the edge. Lags that are NaN inside the annuli count as 0, no correlation.
 
     Args:
         autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattice: its symmetry.
@@ -96,7 +97,7 @@ def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
 
 
 def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, width: int) -> np.ndarray:
-    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins, of maps [h * w, n]."""
+    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins; maps [h * w, n]."""
     annuli = _annuli(lattice, height, width)
     base = maps[annuli.half]
     turned = (annuli.rotation @ maps).reshape(-1, *base.shape)
@@ -107,7 +108,7 @@ def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, 
         start = np.take_along_axis(sums, _like(annuli.within[inner], sums), axis=-2)
         return sums[..., annuli.below, :] - start
 
-    count = annuli.count[annuli.below][:, None] - annuli.count[annuli.within[inner]]
+    count = annuli.bins[annuli.below][:, None] - annuli.bins[annuli.within[inner]]
     count = np.maximum(count, 1)
     mean, turned_mean = add(base) / count, add(turned) / count
     square, turned_square = add(base * base) / count, add(turned * turned) / count
@@ -168,7 +169,7 @@ def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
         starts=count[:-1],
         below=np.searchsorted(count, below),
         within=np.searchsorted(count, within),
-        count=count,
+        bins=count,
     )
 
 
