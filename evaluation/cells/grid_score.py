@@ -91,6 +91,8 @@ def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
     inner = centre_radii(stacked)
     outer = min(height, width) // 2
     found = (inner > 0) & (inner < outer)
+    if not found.any():
+        return scores
     curves = _curves(stacked[..., found].reshape(height * width, -1), inner[found], lattice, height, width)
     scores[valid[found]] = _best(curves, inner[found])
     return scores

@@ -55,8 +55,12 @@ def measure_lattice(
     count = round(np.pi / period)
     vectors = [_nearest_peaks(image, radius, count) for image, radius in zip(maps, inner, strict=True)]
     spacing = [bin_size * np.abs(peaks).mean() for peaks in vectors]
-    turns = [np.angle(np.mean((peaks / np.abs(peaks)) ** (2 * np.pi / period))) for peaks in vectors]
+    turns = [_mean_angle(np.angle(peaks) * 2 * np.pi / period) for peaks in vectors]
     return LatticeShape(np.array(spacing), np.array(turns) / (2 * np.pi) * period % period)
+
+
+def _mean_angle(angles: np.ndarray) -> float:
+    return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean()))
 
 
 def _nearest_peaks(image: np.ndarray, inner: int, count: int) -> np.ndarray:

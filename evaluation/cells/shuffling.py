@@ -6,9 +6,8 @@ time course of the activity and the occupancy, and removes their relation. Each 
 with shifts common to all cells, the errors of cells that fire together would be one error.
 
 The 95th percentile of S shuffles is their value at rank 0.95 (S + 1) (Hyndman and Fan 1996, type 6). A score
-that has the distribution of its shuffles exceeds it in 5 % of cells. The usual linear rule, rank 0.95 (S - 1)
-+ 1, lies
-lower: 5.9 % exceed it with 100 shuffles.
+with the distribution of its shuffles exceeds it in 5 % of cells. The usual linear rule, rank
+1 + 0.95 (S - 1), lies lower: with 100 shuffles, 5.9 % exceed it.
 """
 
 from __future__ import annotations
@@ -74,9 +73,8 @@ class ShuffledScores(NamedTuple):
     def mean(self) -> np.ndarray:
         """Mean score of the shuffles of each cell: [C], over those that have one; NaN where none has."""
         known = np.isfinite(self.shuffled)
-        return np.where(known, self.shuffled, 0.0).sum(axis=0) / np.where(
-            known.any(axis=0), known.sum(axis=0), np.nan
-        )
+        count = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+        return np.where(known, self.shuffled, 0.0).sum(axis=0) / count
 
     @property
     def above(self) -> np.ndarray:
@@ -134,8 +132,8 @@ def calibrate(
     """
     _check_path(activity, bins)
     own = stream(seed, "calibration").integers(0, len(activity), activity.shape[1])
-    time = (np.arange(len(activity))[:, None] - own) % len(activity)
-    result = shuffled_scores(np.take_along_axis(activity, time, axis=0), bins, score, shuffles, seed)
+    moved = np.stack([np.roll(cell, shift) for cell, shift in zip(activity.T, own, strict=True)], axis=1)
+    result = shuffled_scores(moved, bins, score, shuffles, seed)
     valid = np.isfinite(result.score) & np.isfinite(result.percentile)
     cells = int(valid.sum())
     low, high = binom.interval(0.95, cells, 1 - PERCENTILE) if cells else (np.nan, np.nan)
@@ -164,21 +162,25 @@ def _draw_shifts(shape: tuple[int, int], bins: PathBins, seed: int) -> np.ndarra
 
 
 def _score_shifts(activity: np.ndarray, bins: PathBins, score: Score, shifts: np.ndarray) -> ShuffledScores:
-    """Scores of the cells, and at the shifts [S, C]."""
-    size, samples = math.prod(bins.shape), len(activity)
+    """Scores of the cells, and at the shifts [S, C].
+
+    A path stays in a bin for several samples; they are summed first, which is faster.
+    """
+    size = math.prod(bins.shape)
     flat = np.where(bins.flat < 0, size, bins.flat).astype(int)
     seconds = np.bincount(flat, bins.seconds, size + 1)[:size]
-    twice = np.concatenate([activity, activity]).T.astype(float, order="C")
+    stays = np.flatnonzero(np.diff(flat, prepend=-1))
+    cells = activity.T.astype(float, order="C")
 
     def score_at(shift: np.ndarray) -> np.ndarray:
-        sums = np.empty((len(twice), size))
-        for cell, start in enumerate(samples - shift):
-            moved = twice[cell, start : start + samples] * bins.seconds
-            sums[cell] = np.bincount(flat, moved, size + 1)[:size]
+        sums = np.empty((len(cells), size))
+        for cell, steps in enumerate(shift):
+            stay_sums = np.add.reduceat(np.roll(cells[cell], steps) * bins.seconds, stays)
+            sums[cell] = np.bincount(flat[stays], stay_sums, size + 1)[:size]
         rates = sums / np.where(seconds > 0, seconds, np.nan)
         return score(rates.reshape(-1, *bins.shape), seconds.reshape(bins.shape))
 
-    recorded = score_at(np.zeros(len(twice), int))
+    recorded = score_at(np.zeros(len(cells), int))
     return ShuffledScores(recorded, np.array([score_at(shift) for shift in shifts]))
 
 
