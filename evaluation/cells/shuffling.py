@@ -131,7 +131,7 @@ def calibrate(
         InputError: as in `shuffled_scores`.
     """
     _check_path(activity, bins)
-    own = stream(seed, "calibration").integers(0, len(activity), activity.shape[1])
+    own = stream(seed, "calibration").integers(0, len(activity), (activity.shape[1],))
     moved = np.stack([np.roll(cell, shift) for cell, shift in zip(activity.T, own, strict=True)], axis=1)
     result = shuffled_scores(moved, bins, score, shuffles, seed)
     valid = np.isfinite(result.score) & np.isfinite(result.percentile)
@@ -141,8 +141,8 @@ def calibrate(
     return Calibration(
         cells=cells,
         share=float(result.above[valid].mean()) if cells else np.nan,
-        low=low / max(cells, 1),
-        high=high / max(cells, 1),
+        low=float(low) / max(cells, 1),
+        high=float(high) / max(cells, 1),
         shuffled_mean=float(known.mean()) if known.size else np.nan,
     )
 
