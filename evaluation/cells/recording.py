@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from tactile.base.atomic_write import write_atomically
+from tactile.base.npz import read_npz
+
+NAME = "cells.npz"
+"""The file in a run directory."""
+FORMAT = "ratslam-cells-1"
+"""Text `format` in the file."""
 
 
 class BinnedSums(NamedTuple):
@@ -48,3 +57,63 @@ class CellRecording(NamedTuple):
     cell: np.ndarray
     activity: np.ndarray
     sums: BinnedSums | None
+
+
+_SUMS = "sums/"
+_STEPS = ("time", "truth", "packet", "energy", "place", "activity")
+
+
+def write_recording(path: str | Path, recording: CellRecording) -> None:
+    """Writes a recording as .npz, atomically; equal recordings give equal bytes.
+
+    The arrays have the names of the fields; those of `sums` follow `sums/` and are empty without sums. Arrays
+    that are memory-mapped are written piece by piece.
+    """
+    sums = recording.sums or BinnedSums(*(np.zeros(0) for _ in BinnedSums._fields))
+    arrays: dict[str, Any] = {name: value for name, value in recording._asdict().items() if name != "sums"}
+    arrays |= {_SUMS + name: value for name, value in sums._asdict().items()}
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, format=np.array(FORMAT), **arrays)
+
+    write_atomically(Path(path), write)
+
+
+def read_recording(path: str | Path) -> CellRecording:
+    """The inverse of `write_recording`.
+
+    Raises:
+        InputError: the file is missing, broken or of another kind.
+    """
+    own = [name for name in CellRecording._fields if name != "sums"]
+    names = ["format", *own, *(_SUMS + name for name in BinnedSums._fields)]
+
+    def parse(
+        kind: np.ndarray, shape: np.ndarray, cell_size: np.ndarray, *arrays: np.ndarray
+    ) -> CellRecording:
+        if kind.shape or str(kind) != FORMAT:
+            raise ValueError(f"the format {str(kind)[:40]!r}")
+        steps, sums = arrays[: len(own) - 2], BinnedSums(*arrays[len(own) - 2 :])
+        heading, y, x = (int(count) for count in shape)
+        made = CellRecording((heading, y, x), float(cell_size), *steps, sums if sums.x_edges.size else None)
+        _check(made)
+        return made
+
+    return read_npz(path, names, parse, f"recorded cells ({FORMAT})")
+
+
+def _check(made: CellRecording) -> None:
+    """Raises ValueError for arrays that do not fit each other."""
+    steps, cells = len(made.time), int(np.prod(made.shape))
+    expected: dict[str, tuple[int, ...]] = {name: (steps,) for name in _STEPS}
+    expected |= {"truth": (steps, 3), "packet": (steps, 3), "activity": (steps, len(made.cell))}
+    fits = all(getattr(made, name).shape == shape for name, shape in expected.items())
+    fits &= made.cell.ndim == 1 and not ((made.cell < 0) | (made.cell >= cells)).any()
+    sums = made.sums
+    if sums is not None:
+        grid, headings = (len(sums.y_edges) - 1, len(sums.x_edges) - 1), len(sums.heading_seconds)
+        fits &= sums.seconds.shape == grid and sums.place.shape == (cells, *grid)
+        fits &= sums.heading.shape == (cells, headings)
+    if not fits:
+        raise ValueError("arrays that do not fit each other")

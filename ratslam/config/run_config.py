@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
+from ratslam.attractor.recording_config import CellsConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.config.includes import merge_includes
 from ratslam.config.packaged import find_config
@@ -100,6 +101,8 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
     """Precision, seed and memory."""
     score: ScoreConfig = ScoreConfig()
     """How the result is scored."""
+    cells: CellsConfig | None = None
+    """Recording of the pose cells to `cells.npz`, for methods that have them; null: none."""
 
     def with_absolute_paths(self, folder: Path) -> RunConfig:
         """The configuration with relative paths taken from `folder`, independent of the working folder."""

@@ -25,6 +25,9 @@ from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
 from tactile.base.types import Observation
 
+Probe = Callable[[State, Any], Any]
+"""A pure function of the state after a step and of the number of the step (int32, from 0 in the map) to a
+NamedTuple of arrays, which is compiled with the kernel."""
 CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
 
@@ -34,13 +37,14 @@ class Step(NamedTuple):
 
     Attributes:
         estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame at that time, m, m, rad.
-        doubt: `Map.doubt` at that time.
+        doubt: `Map.doubt` at that time. probed: record of the session's probe, host NumPy; None without one.
     """
 
     estimate: Estimate
     evidence: Evidence
     pose: np.ndarray
     doubt: float
+    probed: Any = None
 
 
 class Session:
@@ -49,6 +53,8 @@ class Session:
     Args:
         seed: of the backend's random stream. reserve: rows of memory allocated at the start, so that a live
             session does not recompile while it runs. precision: dtype of the kernel's floating state.
+        probe: looks at the state after every step, for `Step.probed`; the results are the same with and
+            without it, and without it nothing else is computed.
 
     Raises:
         ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
@@ -61,14 +67,16 @@ class Session:
         seed: int = 0,
         reserve: int = 0,
         precision: Precision = "float64",
+        probe: Probe | None = None,
     ) -> None:
         check_precision(precision)
-        self.backend = backend
+        self.backend, self._probe = backend, probe
         self.reserve = reserve
         self._layout: Layout | None = None
         # Compiled as one: each operation by itself would be compiled too.
         self._init = jax.jit(backend.init, static_argnums=1)
-        self._run_chunk = jax.jit(partial(run_chunk, backend.kernel), donate_argnums=0)
+        kernel = backend.kernel if probe is None else with_probe(backend.kernel, probe)
+        self._run_chunk = jax.jit(partial(run_chunk, kernel), donate_argnums=0)
         self.restart(seed)
 
     def restart(self, seed: int = 0) -> None:
@@ -105,7 +113,7 @@ class Session:
         """Compiles for observations like this one; results of later steps do not change."""
         self._layout = self._layout or layout_of(observation)
         self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
-        self.state, _ = self._run_chunk(self.state, allocate(self._layout, CHUNK), np.int32(0))
+        self._compute(allocate(self._layout, CHUNK), 0)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole session for a checkpoint; a restored session continues bit for bit."""
@@ -170,13 +178,23 @@ class Session:
         chunk = allocate(self._layout, CHUNK)
         for k, observation in enumerate(observations):
             chunk.write(k, observation)
-        self.state, results = self._run_chunk(self.state, chunk, np.int32(count))
-        steps = []
-        for observation, (estimate, evidence) in zip(observations, results.records(count), strict=True):
+        results, steps = self._compute(chunk, count), []
+        for observation, (estimate, evidence, *probed) in zip(
+            observations, results.records(count), strict=True
+        ):
             estimate = self.map.update(observation, estimate, evidence)
-            steps.append(Step(estimate, evidence, self.map.pose(estimate), self.map.doubt()))
+            steps.append(Step(estimate, evidence, self.map.pose(estimate), self.map.doubt(), *probed))
         self.steps += count
         return steps
+
+    def _compute(self, chunk: PackedRecords, count: int) -> PackedRecords:
+        """Replaces the state by that after the first `count` observations; returns the results of each."""
+        if self._probe is None:
+            self.state, results = self._run_chunk(self.state, chunk, np.int32(count))
+        else:
+            carry = self.state, np.int32(self.steps)
+            (self.state, _), results = self._run_chunk(carry, chunk, np.int32(count))
+        return results
 
 
 def capacity_at(row: int, reserve: int = 0) -> int:
@@ -185,11 +203,23 @@ def capacity_at(row: int, reserve: int = 0) -> int:
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 
+def with_probe(kernel: Any, probe: Probe) -> Any:
+    """The kernel with the number of the step beside its state and the probe's record after its results."""
+
+    def step(carry: Any, observation: Observation) -> Any:
+        state, number = carry
+        state, *results = kernel(state, observation)
+        # The barrier keeps the probe out of the kernel's loops, which would round otherwise with it.
+        return (state, number + 1), *results, probe(lax.optimization_barrier(state), number)
+
+    return step
+
+
 def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tuple[Any, PackedRecords]:
     """The kernel over the first `count` observations of a chunk.
 
     Returns:
-        the state after them, and (estimate, evidence) of each step; further rows are zero.
+        the state after them, and what the kernel returns beside it for each step; further rows are zero.
     """
     kernel = jax.jit(kernel, inline=True)  # traced once for both uses below
 

@@ -7,6 +7,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session
 from ratslam.keyframes.config import FULL, Ablation
+from ratslam.pipeline.cell_plan import plan_recording, probe_of
 from robot.sources.source import Source
 from robot.touch_source import planar_whiskers_of
 
@@ -22,15 +23,22 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
         ablation: parts of the keyframe map to switch off.
 
     A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
-    configurations give equal capacities, and so equal bits.
+    configurations give equal capacities, and so equal bits. A configuration with `cells` gives steps with
+    `ProbedCells`.
+
+    Raises:
+        InputError: see `ratslam.backends.registry.build` and `plan_recording`.
     """
     prepare_precision(config.session.precision)
     sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
+    backend = build(config.backend, config, sensors, config.session.precision, ablation)
+    plan = plan_recording(config, source, backend)
     return Session(
-        build(config.backend, config, sensors, config.session.precision, ablation),
+        backend,
         seed=config.session.seed,
         reserve=config.session.reserve or _known_rows(source.length),
         precision=config.session.precision,
+        probe=None if plan is None else probe_of(backend, plan),
     )
 
 

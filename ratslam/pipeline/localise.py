@@ -76,7 +76,7 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
             found = f"{found}, {reason}"
         cure = "map the place again with `backend: recall`"
         raise InputError(str(saved.path), found, "a map made by `backend: recall`", cure)
-    own = {name: getattr(config, name) for name in (*SourceConfig.model_fields, "score")}
+    own = {name: getattr(config, name) for name in (*SourceConfig.model_fields, "score", "cells")}
     place = config.localise.model_copy(update={"map": saved.path.resolve()})
     return saved.config.model_copy(update=own | {"backend": "localise", "localise": place})
 

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.artifacts.run_directory import read_run, read_scorecard
+from evaluation.cells.recording import NAME as CELLS
+from evaluation.cells.recording import CellRecording, read_recording
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, render_health, scorecard_html
 from evaluation.plots.run_plots import run_plots
@@ -107,6 +109,16 @@ class Result:
 
         file = self.directory / "map.json"
         return read_json(file) if file.exists() else networkx.DiGraph()
+
+    @cached_property
+    def cells(self) -> CellRecording | None:
+        """The recorded pose cells of this run's steps; None if its configuration has no `cells`.
+
+        Raises:
+            InputError: the file is broken.
+        """
+        file = self.directory / CELLS
+        return read_recording(file) if file.exists() else None
 
     @property
     def health(self) -> Health:

@@ -39,6 +39,8 @@ from ratslam.pipeline.artifacts import (
     save_world,
 )
 from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.cell_plan import plan_recording
+from ratslam.pipeline.cell_recorder import CellRecorder
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.online_error import OnlineErrorLog
@@ -88,6 +90,8 @@ class Runner:
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
         self._saved, self._estimate = session.steps, estimate
+        plan = plan_recording(config, source, session.backend)
+        self._cells = None if plan is None else CellRecorder(directory.path, plan)
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
             observer.begin(_describe(config, source, session))
@@ -98,6 +102,8 @@ class Runner:
         began = time.perf_counter()
         steps = list(self.session.replay(observations))
         took = time.perf_counter() - began
+        if self._cells is not None:
+            self._cells.add(self.session.steps - len(steps), samples, steps)
         self._views += [(o.view, o.alive) for o in observations] if self._source.whiskers else []
         self._images += [eight_bit(o.view) if bool(o.view_seen) else None for o in observations]
         odometry = []
@@ -133,6 +139,8 @@ class Runner:
         directory, config = self._directory, self._config
         self._checkpoint()
         _write_final_map(self.session, directory)
+        if self._cells is not None:
+            self._cells.finish()
         save_whisker_views(self._views, config.touch, directory)
         save_closure_views(self._images, directory)
         save_grid_map(directory)

@@ -155,7 +155,7 @@ def write_map(
     """
     arrays: dict[str, Any] = session.arrays() | {
         "format": np.array(FORMAT),
-        "config": np.array(dump(config)),
+        "config": np.array(dump(config.model_copy(update={"cells": None}))),  # of a run, not of its map
         "source": np.array(source.to_json()),
         "recording": np.array(recording),
     }

@@ -1,0 +1,100 @@
+"""Records the pose cells of a run: rows go to a file while it runs, which becomes cells.npz at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.cells.recording import NAME, CellRecording, write_recording
+from ratslam.attractor.cell_probe import is_due
+from ratslam.core.session import CHUNK, Step
+from ratslam.pipeline.cell_plan import RecordingPlan
+from ratslam.pipeline.cell_sums import CellSums
+from robot.sources.source import Sample
+
+ROWS = "cells.rows"
+"""File of the rows of a run that goes on, or was killed: plain records of `row_type`."""
+BUFFERED = 32 * CHUNK
+"""Rows kept in memory before they are appended to the file."""
+
+
+def row_type(chosen: int) -> np.dtype:
+    """The record of one step with this number of chosen cells, as the fields of `CellRecording`."""
+    return np.dtype(
+        [
+            ("time", "<f8"),
+            ("truth", "<f8", 3),
+            ("packet", "<f8", 3),
+            ("energy", "<f8"),
+            ("place", "<i4"),
+            ("activity", "<f4", (chosen,)),
+        ]
+    )
+
+
+class CellRecorder:
+    """Records the steps of a session whose probe is `probe_of(backend, plan)`.
+
+    Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
+
+    Args:
+        directory: of the run, where `cells.rows` and `cells.npz` are written.
+    """
+
+    def __init__(self, directory: Path, plan: RecordingPlan) -> None:
+        self._directory, self._plan = directory, plan
+        self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
+        self._filled = 0
+        self._sums: CellSums | None = None
+        (directory / ROWS).touch(exist_ok=False)
+
+    def add(self, number: int, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        """Adds up to one chunk of steps.
+
+        Args:
+            number: of the first step in the map. samples: of the source, one a step.
+        """
+        if self._filled + len(steps) > BUFFERED:
+            self._write()
+        rows = self._rows[self._filled : self._filled + len(steps)]
+        unknown = np.full(3, np.nan)
+        rows["time"] = [sample.time for sample in samples]
+        rows["truth"] = [unknown if sample.truth is None else sample.truth for sample in samples]
+        rows["packet"] = [step.evidence.packet for step in steps]
+        rows["energy"] = [step.evidence.energy for step in steps]
+        rows["place"] = [step.estimate.place for step in steps]
+        rows["activity"] = [step.probed.chosen for step in steps]
+        self._filled += len(steps)
+        if self._plan.sums is not None:
+            self._add_sums(number, samples, steps)
+
+    def finish(self) -> None:
+        """Writes cells.npz with all rows and the sums, and removes cells.rows.
+
+        Raises:
+            OSError: the disk is full; the rows written so far stay.
+        """
+        self._write()
+        path, plan = self._directory / ROWS, self._plan
+        kind = self._rows.dtype
+        rows = np.memmap(path, kind, mode="r") if path.stat().st_size else np.zeros(0, kind)
+        sums = None if self._sums is None else self._sums.result()
+        columns = {name: rows[name] for name in kind.names or ()}
+        recording = CellRecording(plan.shape, plan.cell_size, **columns, cell=plan.cell, sums=sums)
+        write_recording(self._directory / NAME, recording)
+        path.unlink()
+
+    def _add_sums(self, number: int, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        assert self._plan.sums is not None
+        if self._sums is None:
+            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.shape)), samples[0].time)
+        for k, (sample, step) in enumerate(zip(samples, steps, strict=True), number):
+            if is_due(k, self._plan.sums.interval):
+                self._sums.add(sample.time, sample.truth, step.probed.every)
+
+    def _write(self) -> None:
+        with (self._directory / ROWS).open("ab") as file:
+            file.write(self._rows[: self._filled].tobytes())
+        self._filled = 0
