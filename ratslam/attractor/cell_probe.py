@@ -99,7 +99,7 @@ def activity_of(levels: tuple[Level, ...], activity: Activity, cell: np.ndarray)
 def _held(level: Level, block: Block, at: np.ndarray) -> Array:
     """[C] the activity that a block holds at cells [C, 3] over x, y, heading: 0 outside its windows."""
     size = np.array(level.window.shape[::-1], np.int32)
-    inside = (at[None] - block.origin[:, None]) % window.ring_sizes(level.window)
-    x, y, heading = jnp.moveaxis(jnp.minimum(inside, size - 1), -1, 0)
+    inside = (at[None] - block.origin[:, None]) % window.ring_sizes(level.window)[None, None]
+    x, y, heading = jnp.moveaxis(jnp.minimum(inside, size[None, None] - 1), -1, 0)
     held = block.activity[np.arange(level.windows, dtype=np.int32)[:, None], heading, y, x]
-    return jnp.sum(jnp.where(jnp.all(inside < size, axis=-1), held, 0.0), axis=0)
+    return jnp.sum(jnp.where(jnp.all(inside < size[None, None], axis=-1), held, 0.0), axis=0)

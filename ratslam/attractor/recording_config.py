@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, field_validator
+from pydantic import Discriminator, Field, PositiveFloat, Tag, field_validator
 
 from tactile.base.config import Settings
 
+
+def _form(value: Any) -> str:
+    return "list" if isinstance(value, list | tuple) else "number"
+
+
 CellIndex = Annotated[int, Field(ge=0)]
+Number = Annotated[CellIndex, Tag("number")]
+Positions = Annotated[tuple[tuple[CellIndex, CellIndex, CellIndex], ...], Tag("list")]
 
 
 class CellSumsConfig(Settings):
@@ -38,7 +45,7 @@ class CellSumsConfig(Settings):
 class CellsConfig(Settings):
     """Recording of the pose cells."""
 
-    chosen: Annotated[int, Field(ge=0)] | tuple[tuple[CellIndex, CellIndex, CellIndex], ...] = 64
+    chosen: Annotated[Number | Positions, Discriminator(_form)] = 64
     """Cells whose activity is recorded at every step: their number, drawn from the whole network by
     `session.seed`; or the indices x, y, heading of each."""
     sums: CellSumsConfig | None = None

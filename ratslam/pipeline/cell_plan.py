@@ -1,4 +1,4 @@
-"""What is recorded of the pose cells of a session: the settings, completed with the network and the source."""
+"""What is recorded of the pose cells of a session: settings completed with the network and the source."""
 
 from __future__ import annotations
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from evaluation.cells.recording import NAME, CellRecording, write_recording
 from ratslam.attractor.cell_probe import is_due
+from ratslam.config.run_config import RunConfig
+from ratslam.core.backend import Backend
 from ratslam.core.session import CHUNK, Step
-from ratslam.pipeline.cell_plan import RecordingPlan
+from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
 from ratslam.pipeline.cell_sums import CellSums
-from robot.sources.source import Sample
+from robot.sources.source import Sample, Source
 
 ROWS = "cells.rows"
 """File of the rows of a run that goes on, or was killed: plain records of `row_type`."""
@@ -98,3 +100,15 @@ class CellRecorder:
         with (self._directory / ROWS).open("ab") as file:
             file.write(self._rows[: self._filled].tobytes())
         self._filled = 0
+
+
+def open_cell_recorder(
+    config: RunConfig, source: Source, backend: Backend, directory: Path
+) -> CellRecorder | None:
+    """The recorder of a completed configuration; None: nothing is recorded.
+
+    Raises:
+        InputError: see `plan_recording`.
+    """
+    plan = plan_recording(config, source, backend)
+    return None if plan is None else CellRecorder(directory, plan)

@@ -39,8 +39,7 @@ from ratslam.pipeline.artifacts import (
     save_world,
 )
 from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_plan import plan_recording
-from ratslam.pipeline.cell_recorder import CellRecorder
+from ratslam.pipeline.cell_recorder import open_cell_recorder
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.online_error import OnlineErrorLog
@@ -90,8 +89,7 @@ class Runner:
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
         self._saved, self._estimate = session.steps, estimate
-        plan = plan_recording(config, source, session.backend)
-        self._cells = None if plan is None else CellRecorder(directory.path, plan)
+        self._cells = open_cell_recorder(config, source, session.backend, directory.path)
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
             observer.begin(_describe(config, source, session))

@@ -64,8 +64,11 @@ class Slam:
     def _build(self, config: RunConfig, source: Source) -> None:
         observed = open_touch_source(source, config.touch)
         self.config, self.source = config, describe_readings(observed)
-        self.session = build_session(config, observed)
+        # Sums of the cells need the true poses, which a loop does not use.
+        cells = config.cells and config.cells.model_copy(update={"sums": None})
+        self.session = build_session(config.model_copy(update={"cells": cells}), observed)
         self.estimate = START
+        self._cells: np.ndarray | None = None
         self._frontend = observed.start() if isinstance(observed, TouchSource) else None
         self._blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=observed.view_shape, whiskers=observed.whiskers
@@ -80,6 +83,12 @@ class Slam:
     def steps(self) -> int:
         """Number of observations so far."""
         return self.session.steps
+
+    @property
+    def cells(self) -> np.ndarray | None:
+        """[C] float32 activity of the chosen pose cells (`cells.chosen`) after the last step; None before the
+        first, without `cells` in the configuration, and of a loaded map. A loop makes no sums."""
+        return self._cells
 
     def step(self, reading: Sample | Observation | Cycle | Whisk | Report) -> PoseEstimate:
         """Folds the next reading into the map; whisker readings go through the touch front end.
@@ -100,6 +109,7 @@ class Slam:
             step = self.session.step(match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
             self.estimate = pose_estimate(step, entry.outcome(step.evidence))
+            self._cells = None if step.probed is None else step.probed.chosen
         return self.estimate
 
     def trajectory(self) -> np.ndarray:
