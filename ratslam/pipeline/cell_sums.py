@@ -22,7 +22,6 @@ class CellSums:
         self._heading = np.zeros((plan.heading_bins, cells))
         self._place_seconds = np.zeros(self._height * self._width)
         self._heading_seconds = np.zeros(plan.heading_bins)
-        self._share = np.zeros(cells)
 
     def add(self, time: float, truth: np.ndarray | None, activity: np.ndarray) -> None:
         """Adds a step, for the time since the one before.
@@ -36,9 +35,10 @@ class CellSums:
         if at is None:
             return
         place, heading = at
-        np.multiply(activity, elapsed, out=self._share)
-        self._place[place] += self._share
-        self._heading[heading] += self._share
+        active = np.flatnonzero(activity)  # a packet fills a few hundred cells of a network of any size
+        share = elapsed * activity[active].astype(np.float64)
+        self._place[place, active] += share
+        self._heading[heading, active] += share
         self._place_seconds[place] += elapsed
         self._heading_seconds[heading] += elapsed
 
