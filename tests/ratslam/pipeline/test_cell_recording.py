@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import signal
 from dataclasses import replace
+from functools import partial
 
+import jax
 import numpy as np
 import pytest
 
 import ratslam
 from ratslam.attractor.levels import to_full_torus
+from ratslam.backends.registry import Sensors
 from ratslam.config.run_config import LoopConfig
+from ratslam.examples import dead_reckoning
 from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.cell_plan import plan_recording
 from ratslam.pipeline.cell_recorder import ROWS
 from ratslam.pipeline.run import process_source
 from ratslam.pipeline.runner import open_runner
@@ -49,10 +54,11 @@ def session_of(walk, cells):
 def live(walk):
     """A session that records, its steps one at a time, and the whole torus after each."""
     session = session_of(walk, CELLS)
+    whole = jax.jit(partial(to_full_torus, session.backend.window_levels))
     steps, torus = [], []
     for sample in walk:
         steps.append(session.step(sample.reading))
-        torus.append(to_full_torus(session.backend.window_levels, session.state.cells.activity))
+        torus.append(whole(session.state.cells.activity))
     return session, steps, np.array(torus).reshape(STEPS, -1)
 
 
@@ -178,11 +184,6 @@ def test_the_rows_of_a_killed_run_are_those_of_whole_chunks(walk, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"backend": "localise"}, "localise.map: missing"),
-        (
-            {"backend": "dead_reckoning"},
-            "cells: `backend: dead_reckoning`, a method without pose cells; expected `backend: recall`",
-        ),
         ({"cells": {"chosen": 15_877}}, "cells.chosen: 15877; expected at most 15876"),
         ({"cells": {"sums": {"bins": 500}}}, "cells.sums: sums of 15876 cells, which need 29.6 GiB"),
     ],
@@ -192,6 +193,13 @@ def test_bad_settings_are_one_error_before_the_run_directory_is_made(walk, tmp_p
     with pytest.raises(InputError, match=message), open_runner(config, walk, tmp_path / "run"):
         pass
     assert not (tmp_path / "run").exists()
+
+
+def test_a_method_without_pose_cells_is_refused(walk):
+    backend = dead_reckoning.ENTRY.build(dead_reckoning.Config(), Sensors((1, 8, 1)), np.dtype(float))
+    config = LoopConfig.model_validate({"backend": "dead_reckoning", "cells": {}})
+    with pytest.raises(InputError, match="cells: `backend: dead_reckoning`, a method without pose cells"):
+        plan_recording(config, walk, backend)
 
 
 def test_an_unknown_extent_is_an_error_and_a_given_one_is_used(walk, tmp_path):
