@@ -35,6 +35,7 @@ SOURCES = {
     "recording": "a recording",
     "simulation": "a simulated whisker head in a maze",
     "create_simulation": "a simulated Create with whiskers",
+    "rat_simulation": "a simulated rat in a box with cues",
     "source": "a registered source",
     "live": "a live session",
 }

@@ -22,6 +22,7 @@ from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import CreateSimulationConfig
 from robot.simulation.head.session import SimulationConfig
+from robot.simulation.rat.session import RatSimulationConfig
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 from tactile.base.config import Settings
@@ -53,7 +54,7 @@ class ScoreConfig(Settings):
 
 
 class SourceConfig(Settings):
-    """The source of a run, exactly one of five, and the processing of whisker readings to views."""
+    """The source of a run, exactly one of six, and the processing of whisker readings to views."""
 
     fewest_sources: ClassVar[int] = 1
     """Least number of sources: 0 where the caller brings the readings."""
@@ -63,6 +64,8 @@ class SourceConfig(Settings):
     """Or a simulated arm with a whisker head in a maze."""
     create_simulation: CreateSimulationConfig | None = None
     """Or a simulated Create with whiskers in an arena."""
+    rat_simulation: RatSimulationConfig | None = None
+    """Or a simulated rat in a box with cues."""
     source: PluginConfig | None = None
     """Or a registered source (`ratslam.sources`)."""
     live: Annotated[LiveConfig | None, Field(validate_default=True)] = None
@@ -73,12 +76,12 @@ class SourceConfig(Settings):
     @field_validator("live", mode="after")
     @classmethod
     def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
-        names = ("recording", "simulation", "create_simulation", "source")
+        names = ("recording", "simulation", "create_simulation", "rat_simulation", "source")
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
         if all(name in info.data for name in names) and not cls.fewest_sources <= len(given) <= 1:
             there = " and ".join(given) if given else f"neither {', '.join(names)} nor live"
-            raise ValueError(f"{there}; give one of these five, and null for the others")
+            raise ValueError(f"{there}; give one of these six, and null for the others")
         return live
 
 
@@ -109,7 +112,7 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
         relations = self.score.relations
         parts = {
             name: part and part.resolved(folder)
-            for name in ("recording", "simulation", "create_simulation", "live")
+            for name in ("recording", "simulation", "create_simulation", "rat_simulation", "live")
             for part in [getattr(self, name)]
         }
         parts["source"] = self.source and resolved_plugin(self.source, SOURCES, folder)

@@ -12,6 +12,7 @@ from ratslam.config.run_config import RunConfig, load_config
 from robot.recordings.formats import open_recording
 from robot.simulation.create.session import CreateSimulation
 from robot.simulation.head.session import HeadSimulation
+from robot.simulation.rat.session import RatSimulation
 from robot.sources.registry import SOURCES
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of, open_touch_source
@@ -50,6 +51,8 @@ def open_source(config: ConfigLike, report: Callable[[str], None] | None = None)
     config = resolve_config(config)
     if config.create_simulation is not None:
         return CreateSimulation(config.create_simulation)
+    if config.rat_simulation is not None:
+        return RatSimulation(config.rat_simulation)
     if config.simulation is not None:
         session = HeadSimulation(config.simulation, config.touch.head)
         if report is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from robot.sources.input_files import digest_of
 from robot.sources.source import ClosedSource, Sample
 from tactile.base.se2 import wrap
-from tactile.base.types import Cycle, Odometry, Report, Whisk
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 NO_ODOMETRY = Odometry(0.0, 0.0, 0.0, 0.0)
 """Placeholder in a reading until its row's odometry is filled in."""
@@ -30,8 +30,8 @@ class SimulatedSource(ClosedSource, ABC):
     odometry: np.ndarray
 
     @abstractmethod
-    def _readings(self) -> Iterator[Cycle | Whisk | Report]:
-        """The whisker reading of each row; its odometry is overwritten."""
+    def _readings(self) -> Iterator[Cycle | Whisk | Report | Observation]:
+        """The reading of each row; its odometry is overwritten."""
 
     @property
     def length(self) -> int:

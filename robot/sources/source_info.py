@@ -86,9 +86,11 @@ class SourceInfo(Settings):
     """The arena of a Create, in the format of an arena file."""
     simulation: SimulationInfo | None = None
     """Set if a session on a whisker head was simulated."""
+    box: tuple[float, float, float, float] | None = None
+    """Extent of the box in the frame of the truth: x0, y0, x1, y1, m; of the largest if there are several."""
     provenance: dict[str, Any] = Field(default_factory=dict)
     """Generating configuration under its key in a run configuration (`simulation`, `create_simulation`,
-    `live`), or `parameters` of a recording. Its reader validates it."""
+    `rat_simulation`, `live`), or `parameters` of a recording. Its reader validates it."""
 
     def to_json(self) -> str:
         """The record as a JSON document with sorted keys.

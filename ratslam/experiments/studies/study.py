@@ -30,6 +30,7 @@ MOST = 100_000  # largest number of jobs of a study
 SEEDS = {
     "simulation": "simulation.seed",
     "create_simulation": "create_simulation.seed",
+    "rat_simulation": "rat_simulation.seed",
     "recording": "session.seed",
 }
 """Key path that `seeds` sets, by kind of source."""

@@ -142,8 +142,8 @@ def test_without_a_source_info_is_required(own: Path) -> None:
 
 def test_a_run_without_a_source_is_refused_as_before(own: Path) -> None:
     message = (
-        "live: nothing: neither recording, simulation, create_simulation, source nor live; "
-        "give one of these five"
+        "live: nothing: neither recording, simulation, create_simulation, rat_simulation, source nor live; "
+        "give one of these six"
     )
     with pytest.raises(ratslam.InputError, match=message):
         ratslam.run(own)
