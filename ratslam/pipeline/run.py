@@ -79,7 +79,7 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     Raises:
         InputError: the configuration has no simulation, it cannot be simulated, or the file exists.
     """
-    if config.simulation is None and config.create_simulation is None:
+    if config.simulation is config.create_simulation is config.rat_simulation is None:
         raise InputError("simulation", "missing", "a simulation", "`simulation: {}` is a complete session")
     source = open_source(config, print_status)
     raw = config.simulation is None or config.simulation.raw

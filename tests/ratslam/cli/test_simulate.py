@@ -126,7 +126,10 @@ def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_pat
 @pytest.mark.parametrize(
     ("text", "messages"),
     [
-        ("touch: {}\n", ["neither recording, simulation, create_simulation, rat_simulation, source nor live"]),
+        (
+            "touch: {}\n",
+            ["neither recording, simulation, create_simulation, rat_simulation, source nor live"],
+        ),
         ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
         ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
         ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),
