@@ -1,4 +1,4 @@
-"""A rat in a box: the packaged sessions run, a recording of one has the same readings, and errors exit with 2."""
+"""A rat in a box: the packaged sessions run, a recording has the same readings, errors exit with 2."""
 
 from __future__ import annotations
 
