@@ -19,15 +19,43 @@ def add_commands(commands: Commands) -> None:
     export.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE",
         help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
-        "experiences, .yaml nav2 map; a name without a suffix becomes a ROS 2 bag folder",
+        "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells; a name without a suffix "
+        "becomes a ROS 2 bag folder",
     )  # fmt: skip
+    export.add_argument(
+        "--peak-rate", type=_rate, default=20.0, metavar="HZ",
+        help="spikes: rate of a cell at the peak of a settled packet (default 20 Hz)",
+    )  # fmt: skip
+    export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
 
 
 def _export(arguments: argparse.Namespace) -> int:
     from ratslam.export.formats import export_run
+    from ratslam.rats.spikes import SpikeConfig
 
     export_run(
-        arguments.run, arguments.output, lambda text: print(f"ratslam: warning: {text}", file=sys.stderr)
+        arguments.run,
+        arguments.output,
+        lambda text: print(f"ratslam: warning: {text}", file=sys.stderr),
+        SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
     )
     print(f"{arguments.output}: written")
     return 0
+
+
+def _rate(text: str) -> float:
+    """Argument type of a rate in Hz."""
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0")
+    return rate
+
+
+def _seed(text: str) -> int:
+    """Argument type of a seed."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} must be an integer from 0 on")
+    return int(text)

@@ -9,32 +9,43 @@ from pathlib import Path
 
 from evaluation.artifacts.grid_npz import read_grid
 from evaluation.artifacts.nav2 import write_nav2
+from ratslam.export.nwb import write_nwb
 from ratslam.export.ros_bag import write_bag, write_mcap
 from ratslam.export.ros_messages import RosMessages
+from ratslam.export.run_cells import read_run_cells
 from ratslam.export.run_files import ExportedRun, read_exported_run
 from ratslam.pose_graph.io import read_json
+from ratslam.rats.spikes import SpikeConfig, write_spikes
 from robot.recordings.mcap_writer import existing_error
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
 Warn = Callable[[str], None]
 PARTED = "the map is in several pieces, whose poses cannot be compared"
-FORMATS = ".mcap, .tum, .g2o, .json, .graphml or .yaml, or a folder without a suffix for a ROS 2 bag"
+FORMATS = (
+    ".mcap, .tum, .g2o, .json, .graphml, .yaml, .nwb or .npz, or a folder without a suffix for a ROS 2 bag"
+)
 
 
-def export_run(directory: Path, output: Path, warn: Warn = lambda sentence: None) -> None:
+def export_run(
+    directory: Path,
+    output: Path,
+    warn: Warn = lambda sentence: None,
+    spikes: SpikeConfig | None = None,
+) -> None:
     """Writes the results of a run to a new file, whole or not at all.
 
     Args:
         directory: of the run. output: its suffix chooses the format; without one, the folder of a ROS 2 bag.
-        warn: called with a sentence about parts that the file lacks.
+        warn: called with a sentence about parts that the file lacks. spikes: of the recorded cells in .nwb
+            and .npz files.
 
     Raises:
         InputError: the run lacks what the format holds, a file of it is malformed, the output exists or its
             folder does not, or the format is unknown.
     """
-    write = WRITERS.get(output.suffix.lower())
-    if write is None:
+    suffix = output.suffix.lower()
+    if suffix not in WRITERS and suffix not in CELL_WRITERS:
         raise InputError(str(output), f"an unknown suffix {output.suffix!r}", FORMATS)
     if not directory.is_dir():
         raise InputError(str(directory), "no such folder", "a run directory")
@@ -42,7 +53,10 @@ def export_run(directory: Path, output: Path, warn: Warn = lambda sentence: None
         raise existing_error(output)
     if not output.absolute().parent.is_dir():
         raise InputError(str(output.parent), "no such folder", "a folder for the new file")
-    write(directory, output, warn)
+    if suffix in CELL_WRITERS:
+        CELL_WRITERS[suffix](directory, output, spikes or SpikeConfig())
+    else:
+        WRITERS[suffix](directory, output, warn)
 
 
 def _read_run(directory: Path, warn: Warn) -> ExportedRun:
@@ -106,6 +120,16 @@ def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
     write_nav2(output.parent, grid, output.stem)
 
 
+def _write_nwb(directory: Path, output: Path, config: SpikeConfig) -> None:
+    cells = read_run_cells(directory, config)
+    write_atomically(output, lambda path: write_nwb(path, *cells))
+
+
+def _write_spikes(directory: Path, output: Path, config: SpikeConfig) -> None:
+    cells = read_run_cells(directory, config)
+    write_atomically(output, lambda path: write_spikes(path, cells.spikes))
+
+
 WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
     "": _write_bag,
     ".mcap": _write_mcap,
@@ -114,6 +138,10 @@ WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
     ".json": _write_json,
     ".graphml": _write_graphml,
     ".yaml": _write_nav2,
+}
+CELL_WRITERS: dict[str, Callable[[Path, Path, SpikeConfig], None]] = {
+    ".nwb": _write_nwb,
+    ".npz": _write_spikes,
 }
 
 

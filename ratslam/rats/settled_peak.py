@@ -17,14 +17,17 @@ SETTLING = 60
 """Steps without motion; after 40 the peak of the default network changes by less than 1e-12 a step."""
 
 
-@lru_cache(maxsize=32)
 def settled_peak(config: PoseCellConfig) -> float:
     """The largest activity of a packet at rest on a cell, in the precision that JAX has by default.
 
     It depends on the network alone, so rates scaled by it can be compared between cells and recordings. A
     packet between cells, or in motion, is wider and its peak lower.
     """
-    dtype = np.dtype(jax.dtypes.canonicalize_dtype(float))
+    return _settled_peak(config, np.dtype(jax.dtypes.canonicalize_dtype(float)))
+
+
+@lru_cache(maxsize=32)
+def _settled_peak(config: PoseCellConfig, dtype: np.dtype) -> float:
     levels = window_levels(config, dtype)
     zero = np.zeros((), dtype)
     still, nowhere = Odometry(zero, zero, zero, zero), np.zeros(3, dtype)

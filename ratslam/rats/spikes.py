@@ -8,7 +8,8 @@ sharper than the reference fires faster than the peak rate.
 
 Spikes are those of an inhomogeneous Poisson process, by time rescaling (Brown et al. 2002, Neural
 Computation 14: 325): arrival times of a process of rate 1 are mapped through the inverse of the integral of
-the rate, which is exact for piecewise constant rates: counts are Poisson, and times are uniform within a step.
+the rate. That is exact for piecewise constant rates: the count of a step is Poisson with the integral of the
+rate as its mean, and times are uniform within the step.
 There is no refractory period, no burst and no adaptation; two spikes may be as close as they like.
 
 A cell draws from a stream that is named after its index. Its spikes do not depend on which other cells were
