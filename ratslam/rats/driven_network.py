@@ -28,7 +28,7 @@ class DrivenNetwork:
         pose: [3] m, m, rad, at which the network starts with one active cell.
 
     Attributes:
-        activity: [K * N * N] of all cells; it sums to 1. packet: [3] decoded packet over x, y, heading, cells.
+        activity: [K * N * N] of all cells; it sums to 1. packet: [3] decoded over x, y, heading, cells.
     """
 
     def __init__(self, config: PoseCellConfig, pose: np.ndarray) -> None:

@@ -32,15 +32,17 @@ injected and the energy, as a share of the activity of all cells; None for none.
 class PoseCellNeurons(Neurons):
     """The cells of a network that integrates the path of a RatInABox agent.
 
-    At `update()` the motion of the agent since the last update drives the network: displacement in the frame of
-    the head direction, and turn of the head. The rates are `max_fr * activity / settled_peak(pose_cells)`:
+    At `update()` the motion of the agent since the last update drives the network: displacement in the frame
+    of the head direction, and turn of the head. The rates are `max_fr * activity / settled_peak(pose_cells)`:
     a cell fires at `max_fr` at the peak of a packet at rest. The network starts at the pose of the agent, and
-    its axes are those of the environment, modulo the torus. An agent at NaN has no rate, and the network waits.
+    its axes are those of the environment, modulo the torus. An agent at NaN has no rate, and the network
+    waits.
 
     `params` beside those of `Neurons` (`min_fr` has no effect, `n` follows from `cell`):
-        pose_cells: a `PoseCellConfig`, the network. cell: [C] indices in the flattened network [K, N, N]; None:
-        all. max_fr: Hz. speed_noise: white error of the speed as a share of it over one second, sqrt(s).
-        heading_noise: white error of the turn, rad/sqrt(s). seed: of these errors. anchor: an `Anchor` or None.
+        pose_cells: a `PoseCellConfig`, the network. cell: [C] indices in the flattened network [K, N, N];
+        None: all. max_fr: Hz. speed_noise: white error of the speed as a share of it over one second,
+        sqrt(s). heading_noise: white error of the turn, rad/sqrt(s). seed: of these errors. anchor: an
+        `Anchor`, or None.
 
     The cells have no receptive field in closed form, so rate maps come from the history.
 
