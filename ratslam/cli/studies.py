@@ -33,7 +33,9 @@ REPLACED = {
 """Replacements of commands of earlier versions."""
 GROWTH = "growth"
 """Preset that measures long sessions."""
-PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto", GROWTH)
+CELLS = "cells"
+"""Preset that simulates many networks of pose cells."""
+PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto", GROWTH, CELLS)
 """Names of presets, known before JAX is loaded."""
 CYCLES = 800
 """Cycles of the session that `size` tries settings on."""
@@ -95,15 +97,15 @@ class Progress:
     """A progress bar over runs, which collects the failed ones.
 
     Args:
-        total: number of runs. path: of the file of records.
+        total: number of runs. path: of the file of records. unit: name of a run.
     """
 
-    def __init__(self, total: int | None, path: Path) -> None:
+    def __init__(self, total: int | None, path: Path, unit: str = "run") -> None:
         self.failed: list[Any] = []
         self._path = path
         from tqdm import tqdm
 
-        self._bar = tqdm(total=total, unit="run", file=sys.stderr, mininterval=0.5, delay=1.0)
+        self._bar = tqdm(total=total, unit=unit, file=sys.stderr, mininterval=0.5, delay=1.0)
 
     def __enter__(self) -> Self:
         return self
@@ -112,17 +114,19 @@ class Progress:
         """Counts a run."""
         if record.error is not None:
             self.failed.append(record)
-        self._bar.update()
+        self.count(1)
+
+    def count(self, runs: int) -> None:
+        """Counts runs that did not fail."""
+        self._bar.update(runs)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.close()
         if kind is KeyboardInterrupt:
-            print(
-                f"ratslam: {self._bar.n} runs are kept in {self._path}; the same command continues",
-                file=sys.stderr,
-            )
+            kept = f"{self._bar.n} {self._bar.unit}s are kept in {self._path}"
+            print(f"ratslam: {kept}; the same command continues", file=sys.stderr)
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
@@ -155,6 +159,8 @@ def _study(arguments: argparse.Namespace) -> int:
     prepare_jax()
     if arguments.preset == GROWTH:
         return _growth(arguments)
+    if arguments.preset == CELLS:
+        return _cells(arguments)
     from ratslam.experiments.studies.metrics import find_error
     from ratslam.experiments.studies.presets import preset_study
     from ratslam.experiments.studies.records import RunLog
@@ -217,6 +223,28 @@ def _growth(arguments: argparse.Namespace) -> int:
             paths = save_growth(study.name, rows, folder)
             print(render_growth(rows))
             print(f"\n{folder} holds {', '.join(path.name for path in paths)}")
+    return 0
+
+
+def _cells(arguments: argparse.Namespace) -> int:
+    for option in ("search", "error"):
+        if getattr(arguments, option):
+            raise InputError(f"--{option}", f"with --preset {CELLS}", "no search", "leave it out")
+    from ratslam.experiments.cells.cell_report import make_cell_report, render_cells, save_cells
+    from ratslam.experiments.cells.cell_study import FOLDER, cell_study, run_cell_study
+    from ratslam.experiments.studies.executor import Executor
+
+    study = cell_study(find_config(arguments.config), arguments.set)
+    folder = arguments.output or Path("runs") / study.name
+    with (
+        Progress(study.plan.sets, folder / FOLDER, "set") as progress,
+        Executor(arguments.workers, arguments.scheduler) as executor,
+    ):
+        scores = run_cell_study(study, folder, executor, progress.count)
+    report = make_cell_report(study, scores)
+    paths = save_cells(report, folder)
+    print(render_cells(report))
+    print(f"\n{folder} holds {', '.join(path.name for path in paths)}")
     return 0
 
 

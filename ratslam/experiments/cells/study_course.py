@@ -1,0 +1,180 @@
+"""The course of a cell study: odometry and true poses of a session, and the templates that it sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.attractor.cell_batch import CellCourse
+from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.config.run_config import RunConfig
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.source import open_observations, read_observations
+from robot.sources.source import Source
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.types import Observation
+
+CELLS = 8
+"""Largest number of cells whose rate maps a study makes."""
+
+
+class StudyCourse(NamedTuple):
+    """The course of T steps, and what its statistics need.
+
+    Attributes:
+        name: of the source. config: of the network. course: input of the networks. expected: [T, 3] poses
+            that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
+            of the true position. seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m.
+            chosen: [C] cells of the flattened network whose rate maps are made.
+    """
+
+    name: str
+    config: PoseCellConfig
+    course: CellCourse
+    expected: np.ndarray
+    bin: np.ndarray
+    seconds: np.ndarray
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+    chosen: np.ndarray
+
+
+class _Session(NamedTuple):
+    """truth: [T, 3] m, m, rad. motion: [T, 4] m, m, rad, s. template: [T] int32, -1 before the first view.
+    relative: [T] heading minus that of the template, rad. energy: [T] injected."""
+
+    truth: np.ndarray
+    motion: np.ndarray
+    template: np.ndarray
+    relative: np.ndarray
+    energy: np.ndarray
+
+
+def read_course(
+    config: RunConfig, steps: int, views: bool, bins: int, cells: tuple[int, ...], seed: int
+) -> StudyCourse:
+    """Reads the session of a configuration.
+
+    Views are matched once, by the classic backend with its settings of `templates`: which template is seen
+    and how much energy it injects do not depend on the network.
+
+    Args:
+        steps: most steps. views: whether views inject energy. bins: along each side of the square round the
+            path. cells: chosen cells; none: those that the undisturbed packet passes at eight equally spaced
+            times. seed: of the unit noise, the same for every network.
+
+    Raises:
+        InputError: a pose or a motion is unknown or not finite, a step exceeds half the torus, the robot
+            stays in one place, no views are there, or a cell is none of the network.
+    """
+    config = config.model_copy(update={"backend": "classic"})
+    with open_observations(config) as (config, source):
+        session = _watch(config, source, steps) if views else _drive(source, steps)
+        name = source.name
+    network = config.pose_cells
+    _check(name, network, session, views)
+    motion, expected = session.motion.copy(), expected_poses(network, session.truth)
+    motion[0, :3] = 0.0  # the course begins at its first pose
+    unit = stream(seed, "cells.noise").standard_normal((len(motion), 2))
+    unit[:, 1] *= np.sqrt(motion[:, 3])
+    template = np.maximum(session.template, 0)
+    newest = np.maximum.accumulate(np.r_[-1, session.template])
+    course = CellCourse(
+        motion[:, :3], unit, template, session.template > newest[:-1],
+        session.relative / units(network, np.dtype(float))[2], session.energy,
+    )  # fmt: skip
+    bin, x_edges, y_edges = place_bins(session.truth, bins)
+    chosen = np.array(cells, np.int32) if cells else cells_on_the_way(network, expected)
+    most = network.cells_heading * network.cells_xy**2
+    if chosen.max() >= most:
+        raise InputError("cells", str(chosen.max()), f"indices below {most}, the cells of the network")
+    return StudyCourse(name, network, course, expected, bin, motion[:, 3], x_edges, y_edges, chosen)
+
+
+def expected_poses(config: PoseCellConfig, truth: np.ndarray) -> np.ndarray:
+    """[T, 3] poses in cells, not wrapped, of a packet that starts as the networks do and follows the truth
+    [T, 3] without error."""
+    start, unit = rings(config, np.dtype(float)) // 2, units(config, np.dtype(float))
+    turn = start[2] * unit[2] - truth[0, 2]
+    gone = truth[:, :2] - truth[0, :2]
+    c, s = np.cos(turn), np.sin(turn)
+    heading = np.unwrap(truth[:, 2]) - truth[0, 2]
+    gone = np.stack([c * gone[:, 0] - s * gone[:, 1], s * gone[:, 0] + c * gone[:, 1], heading], axis=1)
+    return start + gone / unit
+
+
+def place_bins(truth: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[T] flat bins of positions [T, 3] in the smallest square round them, and its edges in x and y, m."""
+    low, high = truth[:, :2].min(axis=0), truth[:, :2].max(axis=0)
+    side, middle = (high - low).max(), (low + high) / 2
+    edges = middle[:, None] + side * (np.arange(bins + 1) / bins - 0.5)
+    at = np.clip(((truth[:, :2] - edges[:, 0]) / side * bins).astype(int), 0, bins - 1)
+    return at[:, 1] * bins + at[:, 0], edges[0], edges[1]
+
+
+def cells_on_the_way(config: PoseCellConfig, expected: np.ndarray) -> np.ndarray:
+    """[8] flat indices of the cells nearest to the undisturbed packet at eight equally spaced times."""
+    at = ((np.arange(CELLS) + 0.5) / CELLS * len(expected)).astype(int)
+    x, y, heading = (np.round(expected[at]).astype(int) % rings(config, np.dtype(int))).T
+    return ((heading * config.cells_xy + y) * config.cells_xy + x).astype(np.int32)
+
+
+def _drive(source: Source, steps: int) -> _Session:
+    """The session without its views."""
+    rows = [
+        (sample.truth, observation.odometry[:4])
+        for sample, observation in islice(read_observations(source), steps)
+    ]
+    nothing = np.zeros(len(rows))
+    return _Session(*_poses(source.name, rows), np.full(len(rows), -1, np.int32), nothing, nothing)
+
+
+def _watch(config: RunConfig, source: Source, steps: int) -> _Session:
+    """The session with the templates that it sees."""
+    rows = []
+
+    def observations() -> Iterator[Observation]:
+        for sample, observation in islice(read_observations(source), steps):
+            rows.append((sample.truth, observation.odometry[:4]))
+            yield observation
+
+    seen = [step.evidence for step in build_session(config, source).replay(observations())]
+    columns = [
+        np.array([getattr(each, name) for each in seen]) for name in ("template", "relative", "energy")
+    ]
+    return _Session(*_poses(source.name, rows), *columns)
+
+
+def _poses(name: str, rows: list) -> tuple[np.ndarray, np.ndarray]:
+    if len(rows) < 2:
+        raise InputError(name, f"{len(rows)} steps", "at least two", "a longer session")
+    unknown = np.full(3, np.nan)
+    truth = np.array([unknown if pose is None else pose for pose, _ in rows], float)
+    if np.isnan(truth).all():
+        raise InputError(name, "no true poses", "a source whose true poses are known", "a simulation")
+    return truth, np.array([odometry for _, odometry in rows], float)
+
+
+def _check(name: str, config: PoseCellConfig, session: _Session, views: bool) -> None:
+    for what, values in (("true pose", session.truth), ("odometry", session.motion)):
+        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(wrong):
+            raise InputError(f"{name}, step {wrong[0]}", f"its {what} is unknown or not finite", "numbers")
+    if session.motion[:, 3].min() < 0 or session.motion[:, 3].sum() <= 0:
+        raise InputError(name, "steps without duration", "durations in s from 0 on")
+    if not np.ptp(session.truth[:, :2], axis=0).any():
+        raise InputError(name, "the robot stays in one place", "a path through an arena")
+    reach = np.hypot(*session.motion[1:, :2].T)
+    turn, half = np.abs(session.motion[1:, 2]), config.cells_xy * config.cell_size / 2
+    fast = np.flatnonzero((reach >= half) | (turn >= np.pi))
+    if len(fast):
+        k = fast[0]
+        found = f"a motion of {reach[k]:.3g} m and {turn[k]:.3g} rad"
+        expected = f"less than half the torus, {half:.3g} m and 3.14 rad, in a step"
+        raise InputError(f"{name}, step {k + 1}", found, expected, "larger pose_cells, or shorter steps")
+    if views and session.template.max() < 0:
+        raise InputError(name, "no views", "views that the classic backend can match", "views=false")
