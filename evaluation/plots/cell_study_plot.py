@@ -30,6 +30,8 @@ def draw_scores(
     Args:
         parameters: by label with unit. score: on a logarithmic axis if positive. label: with unit.
     """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
     rows = -(-len(parameters) // _COLUMNS)
     height = style.TOP + rows * (_PANEL + _GAP_UP)
     figure = style.new_figure(height, title, line)
@@ -43,6 +45,10 @@ def draw_scores(
         axes.grid(color=style.LINE_GREY, lw=0.7)
         if score.min() > 0:
             axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
+            axes.yaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+            axes.set_ylim(0.5 * score.min(), 2 * score.max())
         axes.locator_params(axis="x", nbins=4)
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
         style.name_axes(axes, name, label if column == 0 else "")

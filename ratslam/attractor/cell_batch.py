@@ -7,7 +7,7 @@ networks' states and of one segment, whatever the length of the course.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -92,7 +92,7 @@ class _Fleet:
     """
 
     def __init__(
-        self, config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: Sequence[int]
+        self, config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray
     ) -> None:
         self._config, self._chosen = config, np.asarray(chosen, np.int32)
         dtype = np.dtype(course.motion.dtype)
@@ -144,12 +144,12 @@ class _Fleet:
 
 
 def walk(
-    config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: Sequence[int], block: int = BLOCK
+    config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray, block: int = BLOCK
 ) -> Iterator[CellTrack]:
     """Simulates B networks over a course; yields its segments, of `SEGMENT` steps except for the last.
 
     Args:
-        course: T steps, whose dtype is that of the networks. chosen: cells of the flattened network
+        course: T steps, whose dtype is that of the networks. chosen: [C] cells of the flattened network
             [K, N, N] whose activity is recorded. block: networks computed at a time.
     """
     fleet, steps = _Fleet(config, sets, course, chosen), len(course.motion)

@@ -62,8 +62,12 @@ def save_cells(report: CellReport, folder: Path) -> list[Path]:
     write_text_atomically(folder / "table.csv", _csv(report))
     write_text_atomically(folder / "table.md", f"{render_cells(report)}\n")
     course = study.course
-    edges = {"x_edges": course.x_edges, "y_edges": course.y_edges, "cell": course.chosen}
-    write_atomically(folder / "maps.npz", lambda path: np.savez_compressed(path, maps=scores.maps, **edges))
+    write_atomically(
+        folder / "maps.npz",
+        lambda path: np.savez_compressed(
+            path, maps=scores.maps, cell=course.chosen, x_edges=course.x_edges, y_edges=course.y_edges
+        ),
+    )
     paths = [folder / name for name in ("table.csv", "table.md", "maps.npz")]
     for name, figure in _figures(report).items():
         write_atomically(folder / name, figure.savefig)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ from ratslam.attractor.cell_batch import CellSets
 from ratslam.config.run_config import load_config
 from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.config.strict_yaml.document import Place
-from ratslam.core.precision import prepare_precision
+from ratslam.core.precision import Precision, prepare_precision
 from ratslam.experiments.cells.set_scores import SetScores, score_sets
 from ratslam.experiments.cells.study_course import CELLS, StudyCourse, read_course
 from ratslam.experiments.studies.executor import Executor
@@ -75,7 +75,7 @@ class CellPlan(Settings):
     """Parameter sets of a job, whose scores are written together."""
     seed: NonNegativeInt = 0
     """Seed of the parameter sets and of the noise, which is the same for all sets apart from its size."""
-    precision: Literal["float32", "float64"] = "float32"
+    precision: Precision = "float32"
     """Floating-point type of the networks."""
 
 
@@ -105,7 +105,7 @@ class CellTask(NamedTuple):
     course: StudyCourse
     parameters: np.ndarray
     size: int
-    precision: str
+    precision: Precision
 
     @property
     def key(self) -> str:
