@@ -18,8 +18,9 @@ from jax import lax
 
 from ratslam.attractor import pose_cells, window
 from ratslam.attractor.batch import BLOCK, Network
+from ratslam.attractor.cell_probe import activity_of
 from ratslam.attractor.config import PoseCellConfig, rings
-from ratslam.attractor.levels import Activity, Block, Level, window_levels
+from ratslam.attractor.levels import Level, window_levels
 from ratslam.attractor.pose_cells import PoseCells
 from tactile.base.types import Array, Odometry
 
@@ -94,7 +95,7 @@ class _Fleet:
     def __init__(
         self, config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray
     ) -> None:
-        self._config, self._chosen = config, np.asarray(chosen, np.int32)
+        self._config, self._chosen = config, tuple(map(int, chosen))
         dtype = np.dtype(course.motion.dtype)
         self._sets = jax.tree.map(lambda column: np.asarray(column, dtype), sets)
         self._count = len(self._sets.speed_noise)
@@ -180,18 +181,18 @@ def _with_larger_levels(walker: _Walker, whole: _Walker) -> _Walker:
     return walker._replace(cells=walker.cells._replace(activity=activity))
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(jax.jit, static_argnames=("config", "chosen"))
 def _walk_together(
-    config: PoseCellConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: Array
+    config: PoseCellConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: tuple[int, ...]
 ) -> tuple[_Walker, CellTrack]:
     """Networks over a segment, at the smallest level alone."""
     levels = window_levels(config, np.dtype(rows.motion.dtype))[:1]
     return jax.vmap(partial(_walk, config, levels), (0, 0, None, None))(sets, walkers, rows, chosen)
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(jax.jit, static_argnames=("config", "chosen"))
 def _walk_alone(
-    config: PoseCellConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: Array
+    config: PoseCellConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: tuple[int, ...]
 ) -> tuple[_Walker, CellTrack]:
     """One network over a segment, with all levels."""
     levels = window_levels(config, np.dtype(rows.motion.dtype))
@@ -204,7 +205,7 @@ def _walk(
     own: CellSets,
     walker: _Walker,
     rows: CellCourse,
-    chosen: Array,
+    chosen: tuple[int, ...],
 ) -> tuple[_Walker, CellTrack]:
     dtype, network = rows.motion.dtype, own.network
     kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
@@ -222,27 +223,7 @@ def _walk(
         turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
         recall, energy = (seen + turned) % ring, row.energy * network.energy
         cells, info = pose_cells.step(config, tuned, walker.cells, moved, recall, energy)
-        active = activity_of_cells(levels, cells.activity, chosen)
+        active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
         return _Walker(cells, packet), CellTrack(cells.pose, active, info.outcome, info.level)
 
     return lax.scan(step, walker, rows)
-
-
-def activity_of_cells(levels: tuple[Level, ...], activity: Activity, chosen: Array) -> Array:
-    """[C] activity of cells given by their indices in the flattened network [K, N, N]."""
-    ring = window.ring_sizes(levels[-1].window)
-    at = jnp.stack([chosen % ring[0], chosen // ring[0] % ring[1], chosen // (ring[0] * ring[1])])
-
-    def read(level: Level, block: Block) -> Array:
-        size = np.array(level.window.shape[::-1], np.int32)
-        own = (at[None] - block.origin[:, :, None]) % ring[None, :, None]
-        inside = jnp.all(own < size[None, :, None], axis=1)
-        x, y, heading = (jnp.minimum(own[:, k], size[k] - 1) for k in range(3))
-        windows = np.arange(level.windows, dtype=np.int32)[:, None]
-        return jnp.sum(jnp.where(inside, block.activity[windows, heading, y, x], 0.0), axis=0)
-
-    held = activity.blocks
-    if len(held) == 1:
-        return read(levels[0], held[0])
-    each = [partial(read, level, block) for level, block in zip(levels, held, strict=True)]
-    return lax.switch(activity.level, each)

@@ -67,7 +67,7 @@ class CellPlan(Settings):
     """Standard deviation of each step's motion, as a share of it."""
     heading_noise: Range = (0.0, 0.1)
     """Standard deviation of the heading, rad / sqrt(s)."""
-    cells: Annotated[tuple[NonNegativeInt, ...], Field(max_length=CELLS)] = ()
+    chosen: Annotated[tuple[NonNegativeInt, ...], Field(max_length=CELLS)] = ()
     """Cells whose rate maps are made, indices in the flattened network; none: eight on the way."""
     bins: Annotated[int, Field(ge=2, le=100)] = 20
     """Place bins along each side of the square round the path."""
@@ -129,7 +129,7 @@ def cell_study(path: Path, overrides: Sequence[str] = ()) -> CellStudy:
     empty = Document({}, {(): Place("--preset cells", "--preset cells")})
     plan = validate(override(empty, own), CellPlan)
     config = load_config(path, [text for text in overrides if text not in own])
-    course = read_course(config, plan.steps, plan.views, plan.bins, plan.cells, plan.seed)
+    course = read_course(config, plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
     return CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
 
 

@@ -55,7 +55,7 @@ class _Session(NamedTuple):
 
 
 def read_course(
-    config: RunConfig, steps: int, views: bool, bins: int, cells: tuple[int, ...], seed: int
+    config: RunConfig, steps: int, views: bool, bins: int, chosen: tuple[int, ...], seed: int
 ) -> StudyCourse:
     """Reads the session of a configuration.
 
@@ -64,7 +64,7 @@ def read_course(
 
     Args:
         steps: most steps. views: whether views inject energy. bins: along each side of the square round the
-            path. cells: chosen cells; none: those that the undisturbed packet passes at eight equally spaced
+            path. chosen: cells; none: those that the undisturbed packet passes at eight equally spaced
             times. seed: of the unit noise, the same for every network.
 
     Raises:
@@ -88,11 +88,11 @@ def read_course(
         session.relative / units(network, np.dtype(float))[2], session.energy,
     )  # fmt: skip
     bin, x_edges, y_edges = place_bins(session.truth, bins)
-    chosen = np.array(cells, np.int32) if cells else cells_on_the_way(network, expected)
+    cells = np.array(chosen, np.int32) if chosen else cells_on_the_way(network, expected)
     most = network.cells_heading * network.cells_xy**2
-    if chosen.max() >= most:
-        raise InputError("cells", str(chosen.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, motion[:, 3], x_edges, y_edges, chosen)
+    if cells.max() >= most:
+        raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
+    return StudyCourse(name, network, course, expected, bin, motion[:, 3], x_edges, y_edges, cells)
 
 
 def expected_poses(config: PoseCellConfig, truth: np.ndarray) -> np.ndarray:

@@ -212,7 +212,7 @@ def still(steps: int = 200) -> dict[str, np.ndarray]:
         ({}, ["sett=3"], "sett"),
         ({}, ["excite_sigma=[1.2, 0.8]"], "lower end"),
         ({}, ["excite_sigma=[0.0, 0.8]"], "greater than 0"),
-        ({}, ["cells=[15876]"], "indices below 15876"),
+        ({}, ["chosen=[15876]"], "indices below 15876"),
         ({}, ["pose_cells.cell_size=0.001"], "less than half the torus"),
         ({"truth": None}, [], "no true poses"),
         ({"in_flags": np.full(200, 2)}, ["views=true"], "no views"),
