@@ -173,7 +173,7 @@ def test_an_interrupted_run_has_its_cells_and_a_continued_one_the_rest(result, w
     assert lost == pytest.approx(1 / RATE)
 
 
-def test_the_rows_of_a_killed_run_are_those_of_whole_chunks(walk, tmp_path):
+def test_an_unfinished_run_has_rows_and_no_recording(walk, tmp_path):
     config = LoopConfig.model_validate({**METHOD, "cells": CELLS})
     with open_runner(config, walk, tmp_path / "run") as runner:
         runner.process(list(walk)[:16])
