@@ -54,6 +54,7 @@ def agent_source(agent: Any, odometry: RatOdometryConfig | None = None, seed: in
         InputError: as `agent_path`.
     """
     path = agent_path(agent)
+    assert path.heading is not None
     time, rows = path.time, len(path.time)
     truth = np.column_stack([path.position, path.heading])
     motion = from_poses(time, truth)
