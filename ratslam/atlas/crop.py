@@ -59,7 +59,6 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     graph, log = _unmerged(map)
     elsewhere = bool(graph.begins.rows[taken[-1] + 1 :].any())
     since = HALT if elsewhere else _since(graph, int(taken[-1]))
-    map.outdated.take(taken)
     own = map.arrays()
     arrays = {name: value for name, value in own.items() if not name.startswith(AFRESH)}
     arrays |= {name: value for name, value in blank.arrays().items() if name.startswith(AFRESH)}

@@ -80,9 +80,10 @@ class LocaliseBackend(Backend):
         self._recall, self._log_odds = recall, log_odds
         self._views = views = MapViews(recall, map.kept_keyframes())
         poses = map.solution().fit.poses  # those of trajectory.tum and map.json
-        frames, known = valid_keyframes(map), np.flatnonzero(~map.outdated.flags(len(poses)))
+        frames = map.kept_keyframes().taken.rows
         self._memory = views.freeze(frames, poses[frames])
-        odds = views.odds(known, poses[known], np.isin(known, frames))
+        every = np.arange(len(poses))
+        odds = views.odds(every, poses, np.isin(every, frames))
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
         self._start = map.map_trajectory()[-1] if here else None
 
@@ -148,12 +149,6 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     return LocaliseBackend(recall, map, settings.log_odds, settings.start == "here")
 
 
-def valid_keyframes(map: KeyframeMap) -> np.ndarray:
-    """[N] keyframes that are neither merged nor outdated, numbered as they were taken."""
-    kept = map.kept_keyframes()
-    return kept.taken.rows[~map.outdated.flags(kept.ever)[kept.taken.rows]]
-
-
 def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
     """The keyframe map in a map file that was made with these settings.
 
@@ -168,6 +163,6 @@ def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         expected = "a map made by `backend: recall` with the same settings"
         raise InputError(str(path), str(error) or type(error).__name__, expected) from None
-    if not len(valid_keyframes(map)):
+    if not map.kept_keyframes().count:
         raise InputError(str(path), "a map without keyframes", "a map in which a session can be found")
     return map

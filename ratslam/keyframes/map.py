@@ -33,7 +33,6 @@ from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.keyframes.optimizer import MapFit
-from ratslam.keyframes.outdated import OutdatedKeyframes
 from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord
@@ -59,13 +58,13 @@ class KeyframeMap(Checkpointed, Map):
             study. acceptance: makes the rule for closure sequences. find_tie: see `FindTie`.
 
     Attributes:
-        log: of the kept keyframes. archive, appearance, outdated: of all. merger, selection: at work.
+        log: of the kept keyframes. archive, appearance: of all. merger, selection: at work.
     """
 
     VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
-        "_live", "selection", "outdated",
+        "_live", "selection",
     )  # fmt: skip
 
     def __init__(
@@ -90,7 +89,7 @@ class KeyframeMap(Checkpointed, Map):
         self.selection = SelectionWorker(config.select_every)
         self._acceptance, self._find_tie = acceptance(self._graph), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
-        self._steps, self.outdated = StepRecord(), OutdatedKeyframes()
+        self._steps = StepRecord()
         self._travel = HALT
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece

@@ -1,15 +1,13 @@
-"""Changes between a map and a session localised in it: the file changes.csv, and outdated keyframes."""
+"""Changes between a map and a session localised in it: the file changes.csv."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from evaluation.artifacts.change_table import NAME, ChangeRow, write_changes
 from ratslam.atlas.change import Change
 from ratslam.atlas.localiser import Localiser
-from ratslam.atlas.session_changes import Touch, contradicted_keyframes, session_changes
+from ratslam.atlas.session_changes import Touch, session_changes
 from ratslam.core.backend import Map
 from ratslam.pipeline.run_directory import RunDirectory
 from tactile.frontend import TouchConfig
@@ -26,13 +24,6 @@ def save_changes(map: Map, config: TouchConfig, directory: RunDirectory) -> None
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
     """The places at which a localised session does not agree with its map, the surest first."""
     return session_changes(localiser.place, localiser.visits(), _touch(config))
-
-
-def outdated_by(localiser: Localiser, config: TouchConfig) -> np.ndarray:
-    """[n] keyframes of the map that a localised session contradicts, numbered as they were taken: to be
-    marked (`KeyframeMap.outdated`) when the map takes up the session."""
-    changes = changes_of(localiser, config)
-    return contradicted_keyframes(localiser.place, localiser.visits(), _touch(config), changes)
 
 
 def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:
