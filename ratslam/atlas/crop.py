@@ -17,7 +17,7 @@ from ratslam.recall.memory import MergedRows
 from tactile.base.se2 import between, compose, correct_heading, inverse
 
 Arrays = dict[str, np.ndarray]
-AFRESH = ("archive/", "merger/", "selection/")
+AFRESH = ("archive/", "merger/", "selection/", "tie_odds/")
 """Parts of a map that begin anew after a crop: what they hold is about keyframes that are gone."""
 
 

@@ -19,7 +19,15 @@ from ratslam.keyframes.optimizer import CalibrationPrior
 from tactile.base.se2 import bend_motion, between
 
 Arrays = dict[str, np.ndarray]
-AFRESH = ("acceptance/control/", "acceptance/log_ratio", "experiences/", "merger/", "selection/", "solved/")
+AFRESH = (
+    "acceptance/control/",
+    "acceptance/log_ratio",
+    "experiences/",
+    "merger/",
+    "selection/",
+    "solved/",
+    "tie_odds/",
+)
 """Parts of a map that begin anew: what they hold is about one session."""
 OF_NEWEST = ("live/", "since/", "turned/", "begins/", "doubt/")
 """Parts about the newest keyframe, which is that of the second map."""
@@ -66,8 +74,8 @@ def unite(first: KeyframeMap, second: KeyframeMap, blank: KeyframeMap) -> Keyfra
     if first.archive.begun or second.archive.begun:
         united |= _archive(_archived(first, a), _archived(second, b), counts, bend)
     united |= _steps(a, b, counts.ever, bend) | _newest(b, bend)
-    united |= {name: value for name, value in blank.arrays().items() if name.startswith(AFRESH)}
-    blank.restore(united)
+    kept = {name: value for name, value in united.items() if not name.startswith(AFRESH)}
+    blank.restore(blank.arrays() | kept)
     blank.appearance.extend(second.appearance)
     graph, log = blank.kept_keyframes(), blank.log
     blank.appearance.relearn(blank.archive.confirmed_pairs(graph, log))

@@ -12,6 +12,7 @@ import numpy as np
 from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
+from ratslam.alignment.learned_odds import LearnedOdds
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
@@ -38,8 +39,8 @@ class PlacedOn(NamedTuple):
 
 
 class PieceTies:
-    """Finds where the newest piece of a map lies on an older one. What it keeps between two calls follows
-    from the map alone.
+    """Finds where the newest piece of a map lies on an older one. What it keeps between two calls are only
+    compiled functions.
 
     Args:
         recall: the backend that makes the map.
@@ -48,9 +49,10 @@ class PieceTies:
     def __init__(self, recall: RecallBackend) -> None:
         self._recall = recall
         self._views: MapViews | None = None
-        self._odds: dict[tuple[int, ...], GainOdds] = {}
 
-    def __call__(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Tie | None:
+    def __call__(
+        self, graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds
+    ) -> Tie | None:
         """The best placement of the keyframes since the newest beginning on one of the pieces before."""
         begin = int(np.flatnonzero(graph.begins.rows)[-1])
         own, piece = np.arange(begin, graph.count), graph.pieces(log)[:begin]
@@ -62,8 +64,8 @@ class PieceTies:
         for number in np.unique(piece).tolist():
             frames = np.flatnonzero(piece == number)
             if len(frames) >= FEWEST:
-                on = self._ground(self._views, graph, archive, frames)
-                found += self._place(graph, own, on, self._views)
+                on = _placed_on(self._views, archive, odds, frames)
+                found += _place(self._views, own, on)
         if not found:
             return None
         best, *others = sorted(found, key=lambda tie: -tie.log_odds)
@@ -71,33 +73,36 @@ class PieceTies:
         margin = graph.config.tie_log_odds / 2
         return best if best.log_odds - rival >= margin else best._replace(log_odds=best.log_odds - rival)
 
-    def _ground(
-        self, views: MapViews, graph: KeyframeGraph, archive: Archive, frames: np.ndarray
-    ) -> PlacedOn:
-        taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
-        key = (len(frames), int(taken[0]), int(taken[-1]))
-        if key not in self._odds:
-            every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
-            poses_of_every = archive.poses(graph.pose.rows)[every]
-            self._odds[key] = views.odds(every, poses_of_every, np.isin(every, taken))
-        return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), self._odds[key])
 
-    def _place(self, graph: KeyframeGraph, own: np.ndarray, on: PlacedOn, views: MapViews) -> list[Tie]:
-        """All placements on a ground."""
-        motions = _motions(graph, own)
-        compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
-        places = float(np.log(max(on.ground.places(), 1.0)))
-        session = Traverse(compared, motions)
-        return [
-            Tie(
-                float(path.odds.sum()) - places,
-                [
-                    Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
-                    for k, frame, shift, gain in closures_along(on.ground, compared, path)
-                ],
-            )
-            for path in find_placements(on.ground, on.odds, session)
-        ]
+def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.ndarray) -> PlacedOn:
+    graph = views.graph
+    taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
+
+    def learn() -> GainOdds:
+        every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
+        return views.odds(every, archive.poses(graph.pose.rows)[every], np.isin(every, taken))
+
+    key = (len(frames), int(taken[0]), int(taken[-1]))
+    return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), odds.of(key, learn))
+
+
+def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
+    """All placements on a ground."""
+    graph = views.graph
+    motions = _motions(graph, own)
+    compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
+    places = float(np.log(max(on.ground.places(), 1.0)))
+    session = Traverse(compared, motions)
+    return [
+        Tie(
+            float(path.odds.sum()) - places,
+            [
+                Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
+                for k, frame, shift, gain in closures_along(on.ground, compared, path)
+            ],
+        )
+        for path in find_placements(on.ground, on.odds, session)
+    ]
 
 
 def _motions(graph: KeyframeGraph, own: np.ndarray) -> list[Motion]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ratslam.alignment.learned_odds import LearnedOdds
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.types import Estimate
@@ -64,7 +65,7 @@ class KeyframeMap(Checkpointed, Map):
     VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
-        "_live", "selection",
+        "_live", "selection", "_tie_odds",
     )  # fmt: skip
 
     def __init__(
@@ -85,11 +86,10 @@ class KeyframeMap(Checkpointed, Map):
         self.log = ClosureLog()
         self.archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
         self.merger = KeyframeMerger(self.archive)
-        self._live = LiveFilter()
         self.selection = SelectionWorker(config.select_every)
         self._acceptance, self._find_tie = acceptance(self._graph), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
-        self._steps = StepRecord()
+        self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
         self._travel = HALT
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece
@@ -222,7 +222,8 @@ class KeyframeMap(Checkpointed, Map):
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()
-            if self.closes_loops and tie_newest_piece(self._graph, self.log, self.archive, self._find_tie):
+            map = self._graph, self.log, self.archive, self._tie_odds
+            if self.closes_loops and tie_newest_piece(*map, self._find_tie):
                 self._optimise()
             self._judge()
             change = self._arrive(matched)

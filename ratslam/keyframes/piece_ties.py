@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.alignment.learned_odds import LearnedOdds
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
@@ -28,19 +29,24 @@ class Tie(NamedTuple):
     closures: Sequence[Candidate]
 
 
-FindTie = Callable[[KeyframeGraph, ClosureLog, Archive], Tie | None]
-"""Finds the best placement of the keyframes since the newest beginning among those before; None without
-any."""
+FindTie = Callable[[KeyframeGraph, ClosureLog, Archive, LearnedOdds], Tie | None]
+"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the odds
+that it learns for these; None without any."""
 
 
-def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Tie | None:
+def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds) -> Tie | None:
     """The rule by which pieces stay apart."""
     return None
 
 
-def tie_newest_piece(graph: KeyframeGraph, log: ClosureLog, archive: Archive, find: FindTie) -> bool:
+def tie_newest_piece(
+    graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds, find: FindTie
+) -> bool:
     """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the views
     contradict it.
+
+    Args:
+        odds: of the map's pieces, learned so far.
 
     Returns:
         whether the map has changed.
@@ -48,7 +54,7 @@ def tie_newest_piece(graph: KeyframeGraph, log: ClosureLog, archive: Archive, fi
     starts = np.flatnonzero(graph.begins.rows)
     if graph.ever % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
         return False
-    tie, across = find(graph, log, archive), _across(graph, log)
+    tie, across = find(graph, log, archive, odds), _across(graph, log)
     if not len(across):
         if tie is None or tie.log_odds < graph.config.tie_log_odds:
             return False

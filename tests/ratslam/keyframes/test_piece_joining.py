@@ -22,7 +22,7 @@ RULES = pytest.mark.parametrize(
 TIE = [Candidate(LAP + k, k, 0, 1.0, 4.0) for k in range(2, 14)]
 
 
-def tie_late(graph, log, archive):
+def tie_late(graph, log, archive, odds):
     """The tie of the second lap to the first, once the views that show it are there."""
     return Tie(20.0, TIE) if graph.ever > LAP + 14 else None
 
@@ -47,7 +47,7 @@ def test_a_tie_joins_two_pieces(rule):
 
 @RULES
 def test_a_tie_that_later_views_contradict_is_undone(rule):
-    def tie_once(graph, log, archive):
+    def tie_once(graph, log, archive, odds):
         return Tie(20.0 if graph.ever < LAP + 40 else -1.0, TIE) if graph.ever > LAP + 14 else None
 
     assert not driven(rule, find_tie=tie_once, last=LAP + 38).pieces().any()

@@ -28,6 +28,8 @@ from tests.ratslam.pipeline.touch_walks import (
 
 CARRIED = 240
 """Step before which the robot is carried: not the start of a chunk of the session, nor of a keyframe's."""
+LEARNED = CARRIED + 16
+"""Step at which the odds of the first piece are learned and the second one is not tied to it yet."""
 
 
 @cache
@@ -94,7 +96,7 @@ def test_live_gives_the_bits_of_a_replay() -> None:
     assert same(session.arrays(), whole)
 
 
-@pytest.mark.parametrize("stop", [CARRIED, CARRIED + 5, CARRIED + 60])
+@pytest.mark.parametrize("stop", [CARRIED, CARRIED + 5, LEARNED, CARRIED + 60])
 def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
     _, whole = replayed()
     walk, session = carried(), empty_session()
@@ -104,6 +106,25 @@ def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
     session.restore(saved)
     list(session.replay(walk.readings[stop:]))
     assert same(session.arrays(), whole)
+
+
+def test_a_piece_that_stays_untied_continues_from_a_checkpoint() -> None:
+    first, other = carried(), simulate_walk(5, maze=WIDE | {"seed": 31002})
+    readings = [*first.readings[:CARRIED], *other.readings[:100]]
+    whole = empty_session()
+    replay(whole, readings)
+    assert np.unique(whole.map.pieces()).tolist() == [0, 1]
+    assert len(whole.arrays()["map/tie_odds/ground"]) == 1
+    expected, path = whole.arrays(), whole.map.trajectory()
+    for stop in (LEARNED + 1, CARRIED + 60):
+        session = empty_session()
+        replay(session, readings[:stop])
+        saved = session.arrays()
+        session = empty_session()
+        session.restore(saved)
+        list(session.replay(readings[stop:]))
+        assert same(session.arrays(), expected)
+        assert np.array_equal(session.map.trajectory(), path)
 
 
 def test_no_link_leads_from_one_piece_to_the_next() -> None:
