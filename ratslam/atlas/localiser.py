@@ -14,7 +14,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
 from ratslam.alignment.interruptions import LONGEST
-from ratslam.atlas.placement import CONFIRMING
+from ratslam.atlas.placement import NOTHING_RECALLED
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -22,7 +22,6 @@ from ratslam.core.types import Action, Estimate
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.travel import HALT
-from tactile.base.se2 import between, compose
 from tactile.base.types import Observation
 
 if TYPE_CHECKING:
@@ -106,7 +105,7 @@ class Localiser(Checkpointed, Map):
     """
 
     VALUES = (
-        "_travel", "_state", "_recalled", "_agreeing", "_newest", "_covariance", "_mass", "_log_odds",
+        "_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds",
     )  # fmt: skip
     PARTS = ("_views", "_hypotheses")
 
@@ -118,8 +117,7 @@ class Localiser(Checkpointed, Map):
         self._views, self._hypotheses = SessionViews(shifts, count), Hypotheses()
         self._travel = HALT
         self._state = int(Localisation.SEARCHING)
-        self._recalled = np.full(3, np.nan)  # the newest recalled pose, moved on by odometry
-        self._agreeing = 0  # number of recalled poses in a row that agree with odometry
+        self._recalled = NOTHING_RECALLED
         self._newest, self._covariance = np.zeros(3), np.zeros((3, 3))  # pose of the newest keyframe
         self._mass, self._log_odds = 0.0, -self._places
         self._pose = GrowableArray((3,), np.float64)
@@ -245,18 +243,12 @@ class Localiser(Checkpointed, Map):
 
     def _recall(self, evidence: Evidence, moved: Motion) -> Recalled | None:
         """The recalled pose once some in a row agree with odometry."""
-        expected = compose(self._recalled, moved.motion)
-        if int(evidence.match) < 0 or float(evidence.posterior) <= 0.5:
-            self._recalled = expected
+        shift, match = int(evidence.shift_row), int(evidence.match)
+        ground, posterior = self.place.ground, float(evidence.posterior)
+        self._recalled = self._recalled.onwards(ground, moved, shift, match, posterior)
+        if not self._recalled.is_confirmed:
             return None
-        ground, shift, frame = self.place.ground, int(evidence.shift_row), int(evidence.match)
-        self._recalled = ground.claims(np.array([shift]), np.array([frame]))[0]
-        error = between(expected, self._recalled)
-        agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
-        self._agreeing = self._agreeing + 1 if agrees else 1
-        if self._agreeing < CONFIRMING:
-            return None
-        return Recalled(self._recalled, float(np.asarray(evidence.gain)[shift, frame]))
+        return Recalled(self._recalled.pose, float(np.asarray(evidence.gain)[shift, match]))
 
     def _judge(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""

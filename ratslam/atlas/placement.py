@@ -22,6 +22,39 @@ CONFIRMING = 3
 """Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
 
 
+class RecalledPose(NamedTuple):
+    """Attributes:
+    pose: [3] the newest recalled pose, moved on by odometry; NaN before any. agreeing: number of recalled
+        poses in a row that agree with odometry. now: whether the newest keyframe was recalled.
+    """
+
+    pose: np.ndarray
+    agreeing: int
+    now: bool
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the pose is to be proposed for the newest keyframe."""
+        return self.now and self.agreeing >= CONFIRMING
+
+    def onwards(
+        self, ground: Ground, moved: Motion, shift: int, match: int, posterior: float
+    ) -> RecalledPose:
+        """After the next keyframe, reached by `moved`, which recall places at keyframe `match` of the ground
+        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior."""
+        expected = compose(self.pose, moved.motion)
+        if match < 0 or posterior <= 0.5:
+            return RecalledPose(expected, self.agreeing, False)
+        pose = ground.claims(np.array([shift]), np.array([match]))[0]
+        error = between(expected, pose)
+        agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
+        return RecalledPose(pose, self.agreeing + 1 if agrees else 1, True)
+
+
+NOTHING_RECALLED = RecalledPose(np.full(3, np.nan), 0, False)
+"""Before the first keyframe."""
+
+
 class Traverse(NamedTuple):
     """A session of n keyframes over a ground.
 
@@ -95,14 +128,9 @@ def _is_same(ground: Ground, path: Path, other: Path) -> bool:
 
 def _proposals(ground: Ground, session: Traverse) -> Iterator[tuple[int, np.ndarray]]:
     """Keyframes and their recalled poses [3] that agree with odometry for `CONFIRMING` of them."""
-    views, newest, agreeing = session.views, np.full(3, np.nan), 0
+    views, newest = session.views, NOTHING_RECALLED
     for k, moved in enumerate(session.motions):
-        newest = compose(newest, moved.motion)
-        if views.match[k] < 0 or views.posterior[k] <= 0.5:
-            continue
-        pose = ground.claims(views.shift[k : k + 1], views.match[k : k + 1])[0]
-        error = between(newest, pose)
-        agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
-        newest, agreeing = pose, agreeing + 1 if agrees else 1
-        if agreeing >= CONFIRMING:
-            yield k, pose
+        claim = int(views.shift[k]), int(views.match[k])
+        newest = newest.onwards(ground, moved, *claim, float(views.posterior[k]))
+        if newest.is_confirmed:
+            yield k, newest.pose
