@@ -45,10 +45,12 @@ def ate_within_pieces(estimate: np.ndarray, truth: np.ndarray, piece: np.ndarray
 
 def arrange_pieces(run: RunArrays) -> RunArrays:
     """The run with its pieces where a picture shows them: each aligned to the truth by itself or, where that
-    is unknown, beside the one before. Within a piece nothing changes; a run of one piece is left as it is."""
+    is unknown, beside the one before. Within a piece nothing changes; a run of one piece is left as it is.
+    Online poses are moved with the pieces in which their steps end up."""
     if not run.has_pieces:
         return run
-    final, nodes, of_node = run.final.copy(), run.nodes.copy(), run.piece[run.created]
+    final, online, nodes = run.final.copy(), run.online.copy(), run.nodes.copy()
+    of_node = run.piece[run.created]
     rows, right = truth_rows(run), 0.0
     for one in np.unique(run.piece):
         steps = run.piece == one
@@ -56,10 +58,10 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
         moved = np.array([right, 0.0, 0.0]) - [*final[steps, :2].min(axis=0), 0.0]
         if run.truth is not None and len(known):
             moved = align(final[known], run.truth[known])
-        final[steps] = compose(moved, final[steps])
+        final[steps], online[steps] = compose(moved, final[steps]), compose(moved, online[steps])
         nodes[of_node == one] = compose(moved, nodes[of_node == one])
         right = final[steps, 0].max() + GAP * np.ptp(final[:, 0][run.piece == run.piece[0]])
-    return run._replace(final=final, nodes=nodes)
+    return run._replace(final=final, online=online, nodes=nodes)
 
 
 def unjoined_share(piece: np.ndarray) -> float:

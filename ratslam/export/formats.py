@@ -62,7 +62,7 @@ def export_run(
 def _read_run(directory: Path, warn: Warn) -> ExportedRun:
     exported = read_exported_run(directory, warn)
     if exported.run.has_pieces:
-        warn(f"{PARTED}; the file holds them in one frame, far apart")
+        warn(f"{PARTED}; the file shows them beside each other, or each where it is true if that is known")
     return exported
 
 

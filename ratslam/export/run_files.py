@@ -13,6 +13,7 @@ from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.nav2 import Nav2Map, read_nav2
 from evaluation.artifacts.run_directory import read_column, read_run
 from evaluation.artifacts.whisker_views import read_whisker_views
+from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import align
 from ratslam.config.run_config import load_config
@@ -28,7 +29,8 @@ class ExportedRun(NamedTuple):
     """A run of N steps; poses are in the frame of the map unless stated otherwise.
 
     Attributes:
-        stamps: [N] int64, ns, the times of the recording. run: its arrays.
+        stamps: [N] int64, ns, the times of the recording. run: its arrays, pieces of the map where
+            plots show them.
         spread: [N, 3] standard deviations of the online pose, m, m, rad.
         truth: [N, 3] true poses brought nearest to the final trajectory by one rigid motion, NaN in rows
             without one; or None.
@@ -55,7 +57,7 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
     Raises:
         InputError: a file is missing or malformed, or a time does not fit into a ROS 2 stamp.
     """
-    run = read_run(directory)
+    run = arrange_pieces(read_run(directory))
     steps = len(run.time)
     columns = [read_column(directory / "steps.csv", name)[:steps] for name in ("sd_x", "sd_y", "sd_heading")]
     closures = read_closure_table(directory)

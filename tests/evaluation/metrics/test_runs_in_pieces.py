@@ -68,6 +68,12 @@ def test_a_picture_shows_pieces_where_they_are_true(circle, parted):
     assert "within the pieces of the map" in describe_score(score_run(parted))
 
 
+def test_online_poses_are_moved_with_their_pieces(parted):
+    run = parted._replace(truth=None, online=parted.final)
+    shown = arrange_pieces(run)
+    assert np.array_equal(shown.online, shown.final)
+
+
 def test_without_truth_a_picture_shows_pieces_side_by_side(parted):
     shown = arrange_pieces(parted._replace(truth=None))
     first, second = (shown.final[shown.piece == one] for one in (0, 1))

@@ -21,7 +21,7 @@ from evaluation.artifacts.pieces_table import write_pieces
 from evaluation.artifacts.run_directory import read_run
 from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from evaluation.metrics.trajectory import align, read_tum
+from evaluation.metrics.trajectory import align, read_tum, write_tum
 from ratslam.cli import main
 from ratslam.export.formats import export_run
 from ratslam.pose_graph.io import read_g2o
@@ -325,6 +325,24 @@ def test_a_missing_library_is_named(square, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(InputError, match=r"pip install 'ratslam\[ros\]'"):
         export_run(square, tmp_path / "a.mcap")
+
+
+def test_pieces_stand_beside_each_other(copy, tmp_path):
+    run = read_run(copy)
+    later = np.arange(len(run.time)) >= len(run.time) // 2
+    for name, path in (("trajectory.tum", run.final), ("online.tum", run.online)):
+        write_tum(copy / name, run.time, np.where(later[:, None], path + [1000.0, 0.0, 0.0], path))
+    (copy / "truth.tum").write_text("")
+    write_pieces(copy / "pieces.csv", run.time, later.astype(int))
+    said = []
+    export_run(copy, tmp_path / "run.mcap", said.append)
+    (sentence,) = (one for one in said if "several pieces" in one)
+    assert "beside each other" in sentence
+    shown = np.array(path_of(messages(tmp_path / "run.mcap"), "/path/map"))[:, :2]
+    own = run.final[:, :2]
+    assert shown[~later, 0].max() < shown[later, 0].min()
+    assert np.ptp(shown[:, 0]) < 3 * np.ptp(own[:, 0])
+    assert np.allclose(np.diff(shown[later], axis=0), np.diff(own[later], axis=0))
 
 
 def test_a_trajectory_in_pieces_comes_with_the_piece_of_each_pose(copy, tmp_path):
