@@ -23,9 +23,11 @@ from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
 
 NOT_LOCALISED = {
-    "grid": "in which the contacts of a session fit several poses, and those of other places fit too"
+    "classic": "whose view templates say which view is nearest, and not how likely it is of another place",
+    "grid": "in which the contacts of a session fit several poses, and those of other places fit too",
+    "localise": "which is a session in another map, and no map of its own",
 }
-"""Why nothing can be localised in the maps of a method, where that was measured."""
+"""Why nothing can be localised in the maps of a method."""
 
 
 class LocalisationSummary(NamedTuple):

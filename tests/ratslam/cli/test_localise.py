@@ -123,14 +123,22 @@ def test_another_sensor_is_refused(
     assert message in error
 
 
-@pytest.mark.parametrize("backend", ["classic", "grid", "localise"])
+@pytest.mark.parametrize(
+    ("backend", "reason"),
+    [
+        ("classic", "not how likely it is of another place"),
+        ("grid", "the contacts of a session fit several poses"),
+        ("localise", "a session in another map"),
+    ],
+)
 def test_maps_of_methods_that_cannot_localise_are_refused(
-    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], backend: str
+    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], backend: str, reason: str
 ) -> None:
     text = (square / "config.yaml").read_text().replace("backend: recall", f"backend: {backend}")
     file = rewritten(square / "map.npz", tmp_path / "map.npz", config=text)
     error = refused(capsys, tmp_path / "run", "localise", str(file), str(SQUARE))
-    assert f"a map made by `backend: {backend}`" in error
+    assert f"a map made by `backend: {backend}`, w" in error or f"`backend: {backend}`, in w" in error
+    assert reason in error
     assert "expected a map made by `backend: recall`" in error
 
 
