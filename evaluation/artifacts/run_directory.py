@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
@@ -27,6 +28,7 @@ def check_run_directory(path: Path) -> None:
     """
     if not path.is_dir():
         raise InputError(str(path), "no such folder", "the directory of a run")
+    refuse_merged(path)
     if not any((path / name).exists() for name in ("manifest.json", "steps.csv")):
         raise InputError(str(path), "no run in this folder", "the directory of a run")
 
@@ -35,8 +37,9 @@ def read_run(path: Path) -> RunArrays:
     """Reads the arrays of a run. Without a final trajectory (interrupted run) the online one replaces it.
 
     Raises:
-        InputError: a file is missing or malformed.
+        InputError: a file is missing or malformed, or it is a merged map.
     """
+    refuse_merged(path)
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
     place = read_column(path / "steps.csv", "place").astype(int)

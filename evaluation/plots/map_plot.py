@@ -25,8 +25,7 @@ from evaluation.plots.style import (
 from tactile.base.se2 import between, compose
 
 _BOTTOM = 1.0  # inches below the axes
-_FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
-_ROOM, _MARGIN = 0.2, 0.08  # shares of the map's size: for drifting odometry, and on all sides
+_ROOM = 0.2  # share of the map's size for drifting odometry
 _JUMP = 5.0  # a step longer than this multiple of the usual one: the robot was moved by hand
 _PALE, _DARK = 0.86, 0.62  # greys of a wall of height 0 and of the tallest wall
 NAMED = 5
@@ -152,9 +151,7 @@ def _frame(layers: Layers, walls: np.ndarray) -> np.ndarray:
         far_low, far_high = bounds(layers.odometry)
         low = np.minimum(low, np.maximum(far_low, low - room))
         high = np.maximum(high, np.minimum(far_high, high + room))
-    middle, size = (low + high) / 2, np.maximum(high - low + _MARGIN * (high - low).max(), 1e-3)
-    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
-    return np.stack([middle - size / 2, middle + size / 2])
+    return style.frame(np.stack([low, high]))
 
 
 def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:

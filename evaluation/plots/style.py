@@ -28,6 +28,8 @@ SKY = "#56b4e9"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Width and margins of every plot, inches."""
+MARGIN, FLATTEST, TALLEST = 0.08, 0.4, 1.15
+"""Share of a map's size kept free around it; least and largest height / width of its axes."""
 ROOM = 0.12
 """Share of logarithmic axes kept free on each side."""
 
@@ -75,6 +77,14 @@ def log_axes(axes: Axes, across: np.ndarray, up: np.ndarray) -> None:
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
     axes.grid(color=LINE_GREY, lw=0.7)
+
+
+def frame(points: np.ndarray) -> np.ndarray:
+    """Corners [[left, bottom], [right, top]] (m) around points [n, 2], neither too flat nor too tall."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, size = (low + high) / 2, np.maximum(high - low + MARGIN * (high - low).max(), 1e-3)
+    size = np.maximum(size, size[::-1] * [1 / TALLEST, FLATTEST])
+    return np.stack([middle - size / 2, middle + size / 2])
 
 
 def metre_grid(axes: Axes) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, VERMILLION
 
-_BOTTOM, _MARGIN = 1.0, 0.08
-_FLATTEST, _TALLEST = 0.4, 1.15  # height / width of the axes
+_BOTTOM = 1.0  # inches below the axes
 
 
 def draw_way(
@@ -22,7 +21,7 @@ def draw_way(
     """
     from matplotlib.collections import LineCollection
 
-    box = _frame(np.concatenate([nodes, felt, way[:, :2]]))
+    box = style.frame(np.concatenate([nodes, felt, way[:, :2]]))
     width, height = box[1] - box[0]
     inner = style.WIDTH - style.LEFT - style.RIGHT
     figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
@@ -41,11 +40,3 @@ def draw_way(
     axes.plot(*way[-1, :2], "*", ms=15, color=INK, mec="white", mew=0.8, ls="none", zorder=5, label="goal")
     style.add_legend(figure, axes, columns=6)
     return figure
-
-
-def _frame(points: np.ndarray) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] around points, m."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, size = (low + high) / 2, np.maximum(high - low + _MARGIN * (high - low).max(), 1e-3)
-    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
-    return np.stack([middle - size / 2, middle + size / 2])

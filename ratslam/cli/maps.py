@@ -95,8 +95,10 @@ def _undo(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.map_care import undo_sequence
 
     output = arguments.output or saved.path
-    undo_sequence(saved, arguments.sequence, output)
+    rewritten = undo_sequence(saved, arguments.sequence, output)
     print(f"{output}: the map without sequence {arguments.sequence}")
+    if rewritten:
+        print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
     return 0
 
 

@@ -17,7 +17,8 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.saved_map import SavedMap, write_map
+from ratslam.pipeline.map_results import rewrite_results
+from ratslam.pipeline.saved_map import NAME, SavedMap, write_map
 from ratslam.pipeline.sensor import disagreement
 from tactile.base.errors import InputError
 
@@ -107,8 +108,12 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
     }
 
 
-def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> None:
-    """Removes the closures of a sequence from a map, solves it without them, and writes it.
+def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
+    """Removes the closures of a sequence from a map, solves it without them, and writes it. If it replaces
+    the map of a run directory, the files there that follow from the map are written anew.
+
+    Returns:
+        whether they were.
 
     Raises:
         InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, or the map
@@ -124,6 +129,8 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> None:
         output, session, saved.config, saved.source,
         recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
     )  # fmt: skip
+    replaced = output == saved.path and output.name == NAME
+    return replaced and rewrite_results(output.parent, made, saved.config.score)
 
 
 def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:

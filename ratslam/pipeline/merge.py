@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.trajectory import write_tum
+from evaluation.artifacts.merged_map import NAME as REPORT
 from ratslam.atlas.joining import Join, Stretches, join_all
 from ratslam.atlas.union import renew_experiences, unite
 from ratslam.backends.map_views import MapViews
@@ -22,6 +22,7 @@ from ratslam.config.strict_yaml import dump
 from ratslam.core.session import Session
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.estimate import START
+from ratslam.pipeline.map_results import write_merged_results
 from ratslam.pipeline.saved_map import NAME, SavedMap, digest_of, read_map, write_map
 from ratslam.pipeline.sensor import check_same_sensor
 from tactile.base.errors import InputError
@@ -195,11 +196,8 @@ def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Mer
     try:
         write(folder / NAME)
         (folder / "config.yaml").write_text(dump(first.config), encoding="utf-8")
-        (folder / "merge.json").write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
-        path = made.trajectory()
-        write_tum(folder / "trajectory.tum", np.arange(len(path), dtype=float), path)
-        for file, write_file in made.files().items():
-            write_file(folder / file)
+        (folder / REPORT).write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
+        write_merged_results(folder, made, output.name, report.steps)
         folder.chmod(0o755)
         os.rename(folder, output)
     finally:

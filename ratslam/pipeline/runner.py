@@ -15,15 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.closure_views import eight_bit
-from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
-from evaluation.metrics.scorecard import Scorecard, score_run
-from evaluation.metrics.trajectory import write_tum
-from evaluation.plots.run_plots import plot_writers
+from evaluation.metrics.scorecard import Scorecard
 from ratslam.backends.registry import BACKENDS, BackendEntry
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
@@ -42,6 +37,7 @@ from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.cell_recorder import open_cell_recorder
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
+from ratslam.pipeline.map_results import score_and_plot, write_map_results
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
 from ratslam.pipeline.run_directory import RunDirectory
@@ -136,23 +132,15 @@ class Runner:
         """
         directory, config = self._directory, self._config
         self._checkpoint()
-        _write_final_map(self.session, directory)
+        time = np.loadtxt(directory.path / "online.tum", usecols=0, ndmin=1)
+        write_map_results(directory.path, self.session.map, time)
         if self._cells is not None:
             self._cells.finish()
         save_whisker_views(self._views, config.touch, directory)
         save_closure_views(self._images, directory)
         save_grid_map(directory)
         save_changes(self.session.map, config.touch, directory)
-        card = score_run(
-            read_run(directory.path),
-            directory.path.name,
-            exm=config.score.experience_metric,
-            relations=read_relations(config.score.relations) if config.score.relations else None,
-            metrics=build_metrics(config.score.metrics),
-        )
-        directory.text("scorecard.json", card.model_dump_json(indent=2) + "\n")
-        for name, save in plot_writers(directory.path).items():
-            directory.file(name, save)
+        card = score_and_plot(directory.path, config.score)
         status = "interrupted" if interrupted else "complete"
         _write_manifest(directory, self._manifest | {"status": status, "steps": self.session.steps})
         for observer in self._observers:
@@ -288,28 +276,6 @@ def _cell(value: Any) -> str:
     if np.issubdtype(value.dtype, np.integer):
         return str(int(value))
     return repr(float(value)) if np.isfinite(value) else ""
-
-
-def _write_final_map(session: Session, directory: RunDirectory) -> None:
-    time = np.loadtxt(directory.path / "online.tum", usecols=0, ndmin=1)
-    final = session.map.trajectory()[session.steps - len(time) :]
-    own = session.map.map_trajectory()[session.steps - len(time) :]
-    directory.file("trajectory.tum", lambda path: write_tum(path, time, final))
-    directory.file("map.tum", lambda path: write_tum(path, time, own))
-    piece = session.map.pieces()
-    if piece.any():
-        directory.file(
-            "pieces.csv", lambda path: write_pieces(path, time, piece[session.steps - len(time) :])
-        )
-    doubt = session.map.final_doubt()
-    if np.isfinite(doubt):
-        directory.text("health.json", json.dumps({"worse_than_odometry": doubt}) + "\n")
-    files = session.map.files()
-    for name, write in files.items():
-        directory.file(name, write)
-    pairs = session.map.closures()
-    if "closures.csv" not in files and len(pairs):
-        directory.file("closures.csv", lambda path: write_closure_pairs(path, pairs))
 
 
 def check_finished_map(config: RunConfig, source: Source) -> None:

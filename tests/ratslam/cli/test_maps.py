@@ -13,6 +13,7 @@ import ratslam
 from ratslam.cli import main
 from ratslam.pipeline.saved_map import read_map
 from robot.recordings.formats import RecordingConfig, open_recording
+from tests.helpers.square_run import copy_square_run
 
 MAPS = Path(__file__).parents[2] / "data" / "maps"
 FILE = MAPS / "ratslam-map-1.npz"
@@ -71,6 +72,27 @@ def test_an_undone_sequence_is_gone_and_the_map_differs(capsys, tmp_path: Path) 
     said(capsys, "undo", tmp_path / "own.npz", sequence)
     assert info(capsys, tmp_path / "own.npz")["digest"] == after["digest"]
     assert "is not an accepted closure sequence" in refused(capsys, "undo", tmp_path / "own.npz", sequence)
+
+
+def test_the_files_of_a_run_follow_a_map_that_is_corrected_in_it(capsys, tmp_path: Path) -> None:
+    run = copy_square_run(tmp_path / "run")
+    capsys.readouterr()
+    sequence = info(capsys, run)["accepted_sequences"][-1]["sequence"]
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    said(capsys, "undo", run, sequence, "-o", tmp_path / "undone.npz")
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+    text = said(capsys, "undo", run, sequence)
+    assert f"{run}: trajectory, graph, closures and map.png follow it" in text
+    made = read_map(run).open_session().map
+    assert np.array_equal(ratslam.Result(run).trajectory[:, :2], made.trajectory()[:, :2])
+    lines = (run / "closures.csv").read_text().splitlines()
+    head = lines[0].split(",")
+    number, verdict = head.index("sequence"), head.index("verdict")
+    rows = [line.split(",") for line in lines[1:]]
+    assert {row[verdict] for row in rows if row[number] == str(sequence)} == {"undone"}
+    changed = {name for name, content in before.items() if (run / name).read_bytes() != content}
+    assert {"map.npz", "closures.csv", "map.tum", "map.g2o", "scorecard.json", "map.png"} <= changed
+    assert not changed & {"steps.csv", "online.tum", "odometry.tum", "truth.tum", "config.yaml"}
 
 
 def test_a_cropped_map_is_a_map(capsys, tmp_path: Path) -> None:

@@ -109,6 +109,18 @@ def test_what_nothing_joins_stays_a_piece(
     assert "Nothing in the views joins these maps" in capsys.readouterr().out
     made = read_map(target).open_session().map
     piece, path = made.pieces(), made.trajectory()
+    assert np.loadtxt(target / "pieces.csv", delimiter=",", skiprows=1)[:, 1].tolist() == piece.tolist()
+    assert (target / "map.png").stat().st_size > 10_000
+    for command in (["score", str(target)], ["report", str(target), "-o", str(tmp_path / "page.html")]):
+        assert main(command) == 2
+        (error,) = capsys.readouterr().err.splitlines()
+        assert f"{target}: a merged map, which has no steps; expected the directory of a run" in error
+    assert main(["export", str(target), "-o", str(tmp_path / "both.mcap")]) == 2
+    assert "a merged map, which has no steps" in capsys.readouterr().err
+    for suffix in ("tum", "g2o", "json"):
+        assert main(["export", str(target), "-o", str(tmp_path / f"exported.{suffix}")]) == 0
+    assert main(["map", "info", str(target)]) == 0
+    assert "pieces 2" in capsys.readouterr().out
     assert np.unique(piece).tolist() == [0, 1]
     assert {one.name for one in target.iterdir()} >= {"map.npz", "trajectory.tum", "map.json", "merge.json"}
     for name in ("one", "other"):

@@ -1,0 +1,110 @@
+"""The files of a run directory or a merged folder that follow from its map; scores and plots of these."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.artifacts.closure_table import write_closure_pairs
+from evaluation.artifacts.merged_map import is_merged, read_session_steps
+from evaluation.artifacts.pieces_table import NAME as PIECES
+from evaluation.artifacts.pieces_table import write_pieces
+from evaluation.artifacts.run_directory import read_run
+from evaluation.metrics.energy_metric import read_relations
+from evaluation.metrics.registry import build_metrics
+from evaluation.metrics.scorecard import Scorecard, score_run
+from evaluation.metrics.trajectory import write_tum
+from evaluation.plots.run_plots import plot_writers
+from evaluation.plots.session_plot import draw_sessions
+from ratslam.config.run_config import ScoreConfig
+from ratslam.core.backend import Map
+from ratslam.pipeline.report import NAME as REPORT
+from tactile.base.atomic_write import write_atomically, write_text_atomically
+
+DERIVED = ("pieces.csv", "health.json", "calibration.yaml", "closures.csv")
+"""Files that only some maps have."""
+
+
+def write_map_results(folder: Path, made: Map, time: np.ndarray) -> None:
+    """Writes trajectories, pieces, health, graph, closures and calibration of a map, each atomically;
+    those of an earlier map that this one lacks are removed.
+
+    Args:
+        time: [n] s, of the last n steps, which are those of the folder.
+    """
+    first = len(made.pieces()) - len(time)
+    final, own, piece = (path[first:] for path in (made.trajectory(), made.map_trajectory(), made.pieces()))
+    write_atomically(folder / "trajectory.tum", lambda path: write_tum(path, time, final))
+    write_atomically(folder / "map.tum", lambda path: write_tum(path, time, own))
+    files = dict(made.files())
+    if made.pieces().any():
+        files[PIECES] = lambda path: write_pieces(path, time, piece)
+    doubt, pairs = made.final_doubt(), made.closures()
+    if np.isfinite(doubt):
+        files["health.json"] = lambda path: _write_health(path, doubt)
+    if len(pairs):
+        files.setdefault("closures.csv", lambda path: write_closure_pairs(path, pairs))
+    for name, write in files.items():
+        write_atomically(folder / name, write)
+    for name in DERIVED:
+        if name not in files:
+            (folder / name).unlink(missing_ok=True)
+
+
+def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int]) -> None:
+    """The same for a merged map, whose steps have no times but their numbers, and its picture.
+
+    Args:
+        name: title of the picture. steps: of each session, in the order of the map.
+    """
+    path, piece = made.trajectory(), made.pieces()
+    write_map_results(folder, made, np.arange(len(path), dtype=float))
+    figure = draw_sessions(name, path, piece, steps)
+    write_atomically(folder / "map.png", figure.savefig)
+
+
+def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> bool:
+    """Writes the files that follow from a map that was changed in its run directory or merged folder.
+
+    Returns:
+        whether the folder is one of these.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    if is_merged(folder):
+        write_merged_results(folder, made, folder.resolve().name, read_session_steps(folder))
+        return True
+    online = folder / "online.tum"
+    if not online.exists() or not online.stat().st_size:
+        return False
+    write_map_results(folder, made, np.loadtxt(online, usecols=0, ndmin=1))
+    score_and_plot(folder, config)
+    (folder / REPORT).unlink(missing_ok=True)
+    return True
+
+
+def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:
+    """Scores a run directory and plots it; see `Runner.finish`.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    card = score_run(
+        read_run(folder),
+        folder.name,
+        exm=config.experience_metric,
+        relations=read_relations(config.relations) if config.relations else None,
+        metrics=build_metrics(config.metrics),
+    )
+    write_text_atomically(folder / "scorecard.json", card.model_dump_json(indent=2) + "\n")
+    for name, save in plot_writers(folder).items():
+        write_atomically(folder / name, save)
+    return card
+
+
+def _write_health(path: Path, doubt: float) -> None:
+    path.write_text(json.dumps({"worse_than_odometry": doubt}) + "\n", encoding="utf-8")
