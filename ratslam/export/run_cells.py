@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from evaluation.cells.recording import CellRecording, read_recording
+from evaluation.cells.recording import NAME, CellRecording, read_recording
 from ratslam.config.run_config import load_config
 from ratslam.core.precision import prepare_precision
 from ratslam.rats.settled_peak import settled_peak
@@ -13,8 +13,6 @@ from ratslam.rats.spikes import SpikeConfig, SpikeTrains, draw_spikes
 from robot.sources.input_files import digest_of
 from tactile.base.errors import InputError
 
-CELLS = "cells.npz"
-"""The recorded cells in a run directory."""
 CURE = "add `cells: {chosen: 64}` to the configuration and run it again"
 
 
@@ -33,7 +31,7 @@ def read_run_cells(directory: Path, config: SpikeConfig) -> RunCells:
     Raises:
         InputError: the run has no recorded cells, no chosen ones among them, or a file is malformed.
     """
-    file = directory / CELLS
+    file = directory / NAME
     if not file.exists():
         raise InputError(str(file), "no such file", "a run with recorded pose cells", CURE)
     recording = read_recording(file)
