@@ -1,0 +1,111 @@
+"""Sessions of a simulated rat, held in memory: the recorded pose cells beside truth and odometry."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.cells.recording import CellRecording
+from ratslam.attractor.cell_probe import is_due
+from ratslam.config.run_config import RunConfig, load_config
+from ratslam.core.session import Session, Step
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
+from ratslam.pipeline.cell_sums import CellSums
+from ratslam.pipeline.source import read_observations
+from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
+from robot.sources.source import Sample, Source
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+
+PACKAGED = "rat_box"
+"""The packaged configuration that the sessions begin with: a box of 1 m, RatSLAM as published."""
+
+
+class RatRun(NamedTuple):
+    """A finished session of T steps.
+
+    Attributes:
+        recording: of its cells. motion: [T, 4] odometry (dx m, dy m, dtheta rad, dt s).
+    """
+
+    recording: CellRecording
+    motion: np.ndarray
+
+
+class RatSessions:
+    """Sessions of one configuration over sources alike, one after the other; compiled once.
+
+    Args:
+        config: its method has pose cells and it has `cells`; `rat_config` gives one.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        self.config = config
+        self._session: Session | None = None
+
+    def run(self, source: Source) -> RatRun:
+        """The session over a source, from the start.
+
+        Raises:
+            InputError: no cells are to be recorded, or see `plan_recording`.
+        """
+        if self._session is None:
+            self._session = build_session(self.config, source)
+        self._session.restart(self.config.session.seed)
+        plan = plan_recording(self.config, source, self._session.backend)
+        if plan is None:
+            raise InputError("cells", "null", "a section", "`cells: {chosen: 0}` records packets alone")
+        rows = list(read_observations(source))
+        samples = [sample for sample, _ in rows]
+        observations = [observation for _, observation in rows]
+        steps = list(self._session.replay(observations))
+        motion = np.array([each.odometry[:4] for each in observations], float)
+        return RatRun(_recording(plan, samples, steps), motion)
+
+
+def rat_config(*assignments: str) -> RunConfig:
+    """The configuration `rat_box` with recorded packets, and settings `a.b=value` replaced."""
+    return load_config(PACKAGED, ("cells={chosen: 0}", *assignments))
+
+
+def rat_source(config: RunConfig, seed: int, **changed: Any) -> RatSimulation:
+    """The rat of a configuration with another seed and with settings of `RatSimulationConfig` replaced.
+
+    Raises:
+        InputError: see `RatSimulation`.
+    """
+    assert config.rat_simulation is not None
+    given = {name: getattr(config.rat_simulation, name) for name in config.rat_simulation.model_fields_set}
+    return RatSimulation(RatSimulationConfig.model_validate({**given, "seed": seed, **changed}))
+
+
+def slice_start(seed: int, seconds: float, whole: float = 600.0) -> float:
+    """Time at which the slice of a recorded path for a seed begins, s: anywhere that leaves `seconds`."""
+    return float(stream(seed, "cells.slice").uniform(0.0, whole - seconds - 1.0))
+
+
+def _recording(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellRecording:
+    unknown = np.full(3, np.nan)
+    return CellRecording(
+        shape=plan.shape,
+        cell_size=plan.cell_size,
+        time=np.array([sample.time for sample in samples]),
+        truth=np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
+        packet=np.array([step.evidence.packet for step in steps]),
+        energy=np.array([step.evidence.energy for step in steps]),
+        place=np.array([step.estimate.place for step in steps], np.int32),
+        cell=plan.cell,
+        activity=np.array([step.probed.chosen for step in steps], np.float32),
+        sums=None if plan.sums is None else _sums(plan, samples, steps).result(),
+    )
+
+
+def _sums(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellSums:
+    assert plan.sums is not None
+    sums = CellSums(plan.sums, int(np.prod(plan.shape)), samples[0].time)
+    for number, (sample, step) in enumerate(zip(samples, steps, strict=True)):
+        if is_due(number, plan.sums.interval):
+            sums.add(sample.time, sample.truth, step.probed.every)
+    return sums
