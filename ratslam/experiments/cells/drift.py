@@ -35,6 +35,8 @@ HEADING = (0.01, 0.02, 0.05)
 """Levels of white noise of the heading, rad / sqrt(s); the speed is exact."""
 USUAL = 5
 """Seeds: each is a path and a draw of the noise, common to all levels."""
+LEAST = 0.1
+"""Least upper end of the axes of errors, m and rad: smaller errors are those of the lattice of cells."""
 COLOURS = (style.SKY, style.BLUE, style.VERMILLION)
 """Of the times."""
 COLUMNS = (
@@ -113,8 +115,8 @@ def draw_drift(result: DriftResult, png: Path) -> None:
     """Errors of position and heading against the noise of speed and of heading."""
     most = float(result.added[..., 0].max()), float(result.added[..., 1].max())
     line = (
-        f"{len(result.packet)} seeds (dots), root mean square (lines); dashed: odometry integrated alone. "
-        f"The packet differs from it by at most {most[0]:.2f} m, {most[1]:.2f} rad."
+        f"Dots: {len(result.packet)} seeds, lines: root mean square. "
+        f"The packet adds at most {most[0]:.3f} m, {most[1]:.3f} rad to odometry."
     )
     figure, axes = panel_grid("Path integration drift against noise of odometry", line, 2, 2)
     speed = [0, *range(1, 1 + len(SPEED))]
@@ -144,7 +146,7 @@ def _draw_curves(
         axes.plot(levels, odometry[:, j], "--", color=style.INK, lw=0.9, zorder=3)
         spread_dots(axes, levels, result.packet[:, rows, j, quantity].T.tolist(), colour)
     axes.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, max(axes.get_ylim()[1], LEAST))
 
 
 def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

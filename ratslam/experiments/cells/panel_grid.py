@@ -41,8 +41,9 @@ def panel_grid(
         ]
         for row in range(rows)
     ]
-    for each in sum(axes, []):
-        each.grid(color=style.LINE_GREY, lw=0.7)
+    for line_of_axes in axes:
+        for each in line_of_axes:
+            each.grid(color=style.LINE_GREY, lw=0.7)
     return figure, axes
 
 

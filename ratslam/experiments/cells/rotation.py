@@ -1,0 +1,181 @@
+"""The figure of cue rotation: how far packet and cells turn with the cues in the middle of a session.
+
+A rat walks at random in a box of 1 m; then cues turn round the middle of the box. What turns with them is
+measured three ways: by the packet's heading, by its place, and by the preferred directions of cells. Controls:
+no turn, and darkness instead of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.cells.drift import packet_pose, truth_in_sheet
+from evaluation.cells.head_direction import preferred_direction
+from evaluation.cells.rate_map import bin_activity, tuning_curves
+from evaluation.cells.recording import CellRecording
+from evaluation.plots import style
+from ratslam.experiments.cells.figure import CellFigure, CellTask
+from ratslam.experiments.cells.packet_error import shortest, torus_error
+from ratslam.experiments.cells.panel_grid import head_panel, panel_grid, spread_dots
+from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from tactile.base.se2 import wrap
+
+RATE = 10.0
+"""Steps and views per second."""
+ANGLES = (0, 45, 90, 135, 180)
+"""Turns of all cues, degrees counter-clockwise."""
+CONFLICT = 90
+"""Turn of the distal cues alone, degrees; the cards stay."""
+CELLS = 512
+"""Cells recorded, drawn from the whole network."""
+LEAST = 0.05
+"""Least activity of a cell, summed over the time of each part, s, for a preferred direction."""
+USUAL = 3
+"""Seeds: each is a walk and a draw of the noise of odometry, common to the turns."""
+EDGES = np.array([0.0, 1.0])
+"""Of the box, m."""
+COLUMNS = ("cues", "turn deg", "heading of packet deg", "place of packet deg", "cells deg", "gain", "expected")
+
+
+class Schedule(NamedTuple):
+    """Times, s: the cues turn; the rotation is measured from `late` on; the session ends."""
+
+    turn: float = 90.0
+    late: float = 110.0
+    end: float = 140.0
+
+
+class Condition(NamedTuple):
+    """What happens at the turn.
+
+    Attributes:
+        name: of the cues that turn, or of the control. degrees: of the turn. phase: settings of the phase of
+            the session; empty: none.
+    """
+
+    name: str
+    degrees: int
+    phase: Mapping[str, Any]
+
+    @property
+    def control(self) -> bool:
+        """Whether no cue turns."""
+        return self.degrees == 0
+
+
+CONDITIONS = (
+    Condition("all", 0, {}),
+    *(Condition("all", each, {"rotate_cues_deg": each}) for each in ANGLES if each),
+    Condition("distal alone", CONFLICT, {"rotate_cues_deg": CONFLICT, "cues": "distal"}),
+    Condition("darkness", 0, {"dark": True}),
+)
+
+
+class Rotation(NamedTuple):
+    """Rotations in a session, rad counter-clockwise, of the late part against the part before the turn.
+
+    Attributes:
+        heading, place: of the packet's frame against the true pose. cells: of preferred directions, NaN if
+            fewer than two cells were active in both parts. course: [T] of the packet's heading at each step.
+    """
+
+    heading: float
+    place: float
+    cells: float
+    course: np.ndarray
+
+
+class RotationResult(NamedTuple):
+    """The rotations of n seeds by condition, in the order of `CONDITIONS`."""
+
+    schedule: Schedule
+    found: Mapping[Condition, list[Rotation]]
+
+    def degrees(self, condition: Condition, name: str) -> np.ndarray:
+        """[n] rotations of one kind: `heading`, `place`, `cells`."""
+        return np.degrees([getattr(each, name) for each in self.found[condition]])
+
+
+def measure_rotation(task: CellTask, schedule: Schedule | None = None) -> RotationResult:
+    """The rotations of all conditions and seeds."""
+    schedule = schedule or Schedule()
+    sessions = RatSessions(
+        rat_config(
+            f"rat_simulation.rate_hz={RATE}",
+            "rat_simulation.views.every=1",
+            "rat_simulation.walk={}",
+            "session.reserve=256",
+            f"cells.chosen={CELLS}",
+        )
+    )
+    found: dict[str, list[Rotation]] = {}
+    for condition in CONDITIONS:
+        phases = [{"start": schedule.turn, **condition.phase}] if condition.phase else []
+        sources = (
+            rat_source(sessions.config, seed, seconds=schedule.end, phases=phases)
+            for seed in task.seeds(USUAL)
+        )
+        found[_key(condition)] = [
+            rotation_of(sessions.run(each).recording, schedule, np.radians(condition.degrees))
+            for each in sources
+        ]
+    return RotationResult(schedule, found)
+
+
+def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> Rotation:
+    """The rotations in a session whose cues turn by `turn`, rad.
+
+    Angles are told up to a whole turn; each is taken as the one nearest to half the turn of the cues.
+    """
+    time = recording.time
+    before = (time >= schedule.turn / 2) & (time < schedule.turn)
+    late = time >= schedule.late
+    # A packet that follows cues turned by a reports headings lower by a.
+    phase = np.exp(-1j * torus_error(recording)[:, 2])
+    place = _place_phase(recording)
+    cells = _preferred_turn(recording, time < schedule.turn, late)
+
+    def angle(turned: complex) -> float:
+        return float(turn / 2 + wrap(np.angle(turned) - turn / 2))
+
+    base = phase[before].mean()
+    course = turn / 2 + wrap(np.angle(phase * np.conj(base)) - turn / 2)
+    return Rotation(
+        angle(phase[late].mean() * np.conj(base)),
+        angle(place[late].mean() * np.conj(place[before].mean())),
+        angle(cells) if np.isfinite(cells) else np.nan,
+        course,
+    )
+
+
+def _place_phase(recording: CellRecording) -> np.ndarray:
+    """[T] complex products of the true place from the middle of the box with the packet's, conjugate; their
+    mean has the angle by which the packet's frame is turned."""
+    true = truth_in_sheet(recording)
+    middle = np.full(2, EDGES.mean())
+    heading = true[0, 2] - recording.truth[0, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    centre = true[0, :2] + np.array([[c, -s], [s, c]]) @ (middle - recording.truth[0, :2])
+    origin = np.array([*centre, 0.0])
+    packet, there = shortest(recording, packet_pose(recording) - origin), true - origin
+    return (there[:, 0] + 1j * there[:, 1]) * np.conj(packet[:, 0] + 1j * packet[:, 1])
+
+
+def _preferred_turn(recording: CellRecording, before: np.ndarray, late: np.ndarray) -> complex:
+    """Mean over cells of exp(i turn of the preferred direction), NaN for fewer than two cells."""
+    directions, active = [], np.ones(len(recording.cell), bool)
+    for part in (before, late):
+        rows = recording.time[part], recording.truth[part], recording.activity[part]
+        sums = bin_activity(*rows, EDGES, EDGES)
+        enough = sums.heading.sum(axis=1) >= LEAST
+        curves = np.where(enough[:, None], tuning_curves(sums), 1.0)
+        directions.append(preferred_direction(curves, sums.heading_seconds))
+        active &= enough
+    if active.sum() < 2:
+        return complex(np.nan)
+    return complex(np.exp(1j * (directions[1] - directions[0])[active]).mean())
