@@ -95,7 +95,7 @@ def anchored_after(run: RatRun, light: RatRun, schedule: Schedule) -> float:
     """Time from the return of the light until the packet is and stays near to that of the session of the same
     seed in light throughout, s; inf if it does not."""
     apart = packet_pose(run.recording) - packet_pose(light.recording)
-    far = (error_size(shortest(run.recording, apart)) > NEAR).any(axis=1)[round(schedule.back * RATE) :]
+    far = np.any(error_size(shortest(run.recording, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
     held = round(HELD * RATE)
     windows = np.lib.stride_tricks.sliding_window_view(far, held)
     near = np.flatnonzero(~windows.any(axis=1))
@@ -129,8 +129,8 @@ def table_anchoring(result: AnchoringResult) -> list[str]:
 
 
 NOT_SHOWN = (
-    "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so the error"
-    " in light contains the drift during learning; the experience map corrects it, the pose cells do not."
+    "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so the"
+    " error in light contains the drift during learning; the experience map corrects it, the pose cells do not."
 )
 
 
