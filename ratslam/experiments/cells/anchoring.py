@@ -130,7 +130,7 @@ def table_anchoring(result: AnchoringResult) -> list[str]:
 
 NOT_SHOWN = (
     "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so the"
-    " error in light contains the drift during learning; the experience map corrects it, the pose cells do not."
+    " error in light contains the drift during learning; the experience map corrects it, pose cells do not."
 )
 
 
