@@ -1,0 +1,221 @@
+"""The figure of two boxes: rate maps of the same cells in box A, in A again, and in box B with other cues.
+
+The rat is carried from A to B and set down elsewhere, with another heading; odometry does not tell. Grid
+cells of one module keep their phases to each other in another box and turn and shift as one (Fyhn et al. 2007,
+Nature 446:190); place cells remap, each in its own way (Leutgeb et al. 2005, Science 309:619). The maps of
+all cells are therefore compared as they are and after the best turn and shift common to all.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.cells.rate_map import bin_activity, rate_maps
+from evaluation.cells.recording import CellRecording
+from ratslam.core.precision import prepare_precision
+from ratslam.experiments.cells.boxes_plot import MapPairs, draw_boxes
+from ratslam.experiments.cells.figure import CellFigure, CellTask
+from ratslam.experiments.cells.place_columns import choose_columns, one_of_each, sum_columns
+from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
+from ratslam.experiments.cells.torus_alignment import Alignment, align_maps, correlate_shifts, lay_on_torus
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from tactile.base.se2 import wrap
+
+RATE = 10.0
+"""Steps per second, each with a view."""
+SECONDS = 300.0
+"""In A, in A again, and in B."""
+PLACE = (0.25, 0.7)
+"""Where the rat is set down in B, m."""
+BOX = {
+    "cards": [
+        {"at_deg": 300, "extent_deg": 70, "brightness": 0.9},
+        {"at_deg": 70, "extent_deg": 30, "brightness": 0.1},
+        {"at_deg": 150, "extent_deg": 40, "brightness": 0.7},
+    ],
+    "distal": [
+        {"at_deg": 190, "extent_deg": 50, "brightness": 0.8},
+        {"at_deg": 20, "extent_deg": 30, "brightness": 0.5},
+    ],
+}
+"""Box B: of the size of A, with other cues."""
+COLUMNS = 64
+"""Places on the torus whose cells are recorded."""
+ANGLES = np.radians(np.arange(0, 360, 5))
+"""Common turns tried, rad; of shifts all are tried, in steps of a cell."""
+USUAL = 3
+"""Sessions."""
+
+
+class MapFit(NamedTuple):
+    """How well maps of n cells fit. still: [n] correlation as they are. best: after the best common turn and
+    shift. shuffled_still, shuffled_best: the same with the identities of the cells shuffled."""
+
+    still: np.ndarray
+    best: Alignment
+    shuffled_still: np.ndarray
+    shuffled_best: Alignment
+
+
+class BoxSession(NamedTuple):
+    """One session.
+
+    Attributes:
+        maps: [3, n, H, W] of columns in A, in A again and in B. again, moved: fits of these: A with A and A
+            with B. single_again, single_moved: those of one cell of each column. turn: of the sheet against B
+            as the rat was set down, rad.
+    """
+
+    maps: np.ndarray
+    again: MapFit
+    moved: MapFit
+    single_again: MapFit
+    single_moved: MapFit
+    turn: float
+
+
+class BoxResult(NamedTuple):
+    """Sessions. side: of the box, m. torus: its side, m."""
+
+    sessions: list[BoxSession]
+    side: float
+    torus: float
+
+
+def measure_boxes(task: CellTask, seconds: float = SECONDS, columns: int = COLUMNS) -> BoxResult:
+    """The fits of all sessions.
+
+    Args:
+        seconds: in A, in A again, and in B. columns: places on the torus.
+    """
+    prepare_precision("float64")
+    config = rat_config(f"rat_simulation.rate_hz={RATE}")
+    network = config.pose_cells
+    chosen = choose_columns(network, columns, task.first)
+    config = rat_config(
+        f"rat_simulation.rate_hz={RATE}",
+        "rat_simulation.views.every=1",
+        f"cells={{chosen: {json.dumps(chosen)}}}",
+    )
+    phase: dict[str, Any] = {"start": 2 * seconds, "kidnap": PLACE, "box": BOX}
+    rats, sessions = RatSessions(config), []
+    for seed in task.seeds(USUAL):
+        source = rat_source(config, seed, walk={}, seconds=3 * seconds, phases=[phase])
+        side = source.config.box.width
+        sessions.append(fit_session(rats.run(source).recording, seconds, side, columns))
+    return BoxResult(sessions, side, network.cells_xy * network.cell_size)
+
+
+def fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> BoxSession:
+    """The fits of a recording of columns in three parts of equal duration: A, A again, and B of the same
+    size, with bins of one cell."""
+    count = round(side / recording.cell_size)
+    edges = np.linspace(0.0, side, count + 1)
+    part = np.minimum((recording.time - recording.time[0]) // seconds, 2)
+    all_maps = []
+    for activity in (sum_columns(recording.activity, columns), one_of_each(recording.activity, columns)):
+        sums = [
+            bin_activity(recording.time[here], recording.truth[here], activity[here], edges, edges)
+            for here in (part == number for number in range(3))
+        ]
+        all_maps.append([rate_maps(each) for each in sums])
+    bins = recording.shape[2]
+    fits = [fit_maps(maps[0 + k], maps[1 + k], bins) for maps in all_maps for k in (0, 1)]
+    after = int(np.flatnonzero(part == 2)[0])
+    turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
+    return BoxSession(np.array(all_maps[0]), *fits, float(turn))
+
+
+def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> MapFit:
+    """The fit of maps [n, H, W] with others of the same cells on a torus of so many bins a side.
+
+    Shuffled identities: each cell is compared with the next one; cells are drawn in no order.
+    """
+    other = np.roll(second, 1, axis=0)
+    still = [
+        correlate_shifts(lay_on_torus(first, bins, 0.0), lay_on_torus(each, bins, 0.0))[:, 0, 0]
+        for each in (second, other)
+    ]
+    best = [align_maps(first, each, bins, ANGLES) for each in (second, other)]
+    return MapFit(still[0], best[0], still[1], best[1])
+
+
+def table_boxes(result: BoxResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    sessions = result.sessions
+    lines = [
+        f"{len(sessions)} sessions of {sessions[0].maps.shape[1]} columns. Correlations: mean over the cells "
+        "and the lowest and highest session.",
+        "",
+        *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
+    ]
+    for kind, name in (("", "columns"), ("single_", "single cells")):
+        again = [getattr(each, f"{kind}again") for each in sessions]
+        moved = [getattr(each, f"{kind}moved") for each in sessions]
+        rows = (
+            ("A with A, no shift", "high", again, "still"),
+            ("A with B, no shift", "about 0: the sheet has turned and shifted", moved, "still"),
+            ("A with B, best common turn and shift", "as A with A: cells do not remap", moved, "best"),
+        )
+        for figure, goal, fits, field in rows:
+            control = f"{_range(fits, f'shuffled_{field}')} shuffled identities"
+            lines.append(markdown_row([f"{name}: {figure}", goal, _range(fits, field), control]))
+    found = ", ".join(f"{np.degrees(wrap(each.moved.best.angle)):.0f}" for each in sessions)
+    down = ", ".join(f"{np.degrees(each.turn):.0f}" for each in sessions)
+    lines.append(markdown_row(["common turn, degrees", "that of setting down", found, f"{down} set down"]))
+    ratio = f"{result.side:.2f} / {result.torus:.2f} m = {result.side / result.torus:.2f}"
+    lines.append(markdown_row(["box over torus", "-", ratio, "-"]))
+    return [*lines, "", NOT_SHOWN]
+
+
+NOT_SHOWN = (
+    "A rigid torus has one map, which it can only turn and shift as a whole: a high correlation after that "
+    "is built in, and global remapping of place cells cannot be shown by it. Activity is a rate, without "
+    "spikes and without theta. A column is the cells of one place on the torus, every third heading."
+)
+
+
+def draw_result(result: BoxResult, png: Path) -> None:
+    """Maps of six columns in each box, and histograms of the correlations of all columns."""
+    sessions = result.sessions
+    found = sessions[0].moved.best
+    pairs = []
+    for title, field in (("as they are", "still"), ("after the best common turn and shift", "best")):
+        fits = {
+            "A with A": ([each.again for each in sessions], field),
+            "A with B": ([each.moved for each in sessions], field),
+            "A with B, identities shuffled": ([each.moved for each in sessions], f"shuffled_{field}"),
+        }
+        pairs.append(MapPairs(title, {name: _correlations(*each) for name, each in fits.items()}))
+    bins = round(result.torus / result.side * sessions[0].maps.shape[2])
+    again, other = (
+        lay_on_torus(sessions[0].maps[k], bins, angle) for k, angle in ((1, 0.0), (2, found.angle))
+    )
+    fitted = np.roll(other, found.shift[::-1], axis=(1, 2))
+    first = lay_on_torus(sessions[0].maps[0], bins, 0.0)
+    turned = f"B turned by {np.degrees(found.angle):.0f}°,\nshifted"
+    plain = lay_on_torus(sessions[0].maps[2], bins, 0.0)
+    rows = {"A": first, "A again": again, "B": plain, turned: fitted}
+    line = (
+        f"{len(sessions)} sessions; box {result.side:g} m, torus {result.torus:g} m (ratio "
+        f"{result.side / result.torus:.2f}). Maps agree after one turn and shift of all: no cell remaps."
+    )
+    draw_boxes("Rate maps in two boxes", line, rows, result.torus, pairs, png)
+
+
+def _correlations(fits: list[MapFit], field: str) -> np.ndarray:
+    values = [getattr(each, field) for each in fits]
+    joined = np.concatenate([each.correlation if isinstance(each, Alignment) else each for each in values])
+    return joined[np.isfinite(joined)]
+
+
+def _range(fits: list[MapFit], field: str) -> str:
+    means = [_correlations([each], field).mean() for each in fits]
+    return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
+
+
+FIGURE = CellFigure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)

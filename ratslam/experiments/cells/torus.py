@@ -1,0 +1,221 @@
+"""The figure of the torus: rate maps in a box larger than the torus, and in a smaller one.
+
+In the larger box a cell has a place in every copy of the torus: on a square lattice whose spacing is the side
+of the torus. The grid cells of the entorhinal cortex lie on a hexagonal one (Hafting et al. 2005, Nature
+436:801). Odometry is exact and there are no views, so that the maps show the network and no drift.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.cells.autocorrelogram import autocorrelogram
+from evaluation.cells.fields import count_fields
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, Lattice, lattice_scores
+from evaluation.cells.grid_spacing import LatticeShape, measure_lattice
+from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
+from evaluation.cells.recording import CellRecording
+from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
+from ratslam.core.precision import prepare_precision
+from ratslam.experiments.cells.figure import CellFigure, CellTask
+from ratslam.experiments.cells.place_columns import choose_columns, one_of_each, sum_columns
+from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
+from ratslam.experiments.cells.torus_plot import BoxMaps, draw_torus
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+
+RATE = 10.0
+"""Steps per second."""
+LARGE, SMALL = (3.5, 2.5), (0.7, 0.7)
+"""Boxes, m."""
+BINS = 0.1, 0.05
+"""Bins of maps in the large and in the small box, m."""
+SECONDS = 900.0, 200.0
+"""In the large and in the small box."""
+SMOOTHING = 0.075
+"""Standard deviation of the Gaussian over rate maps, m."""
+COLUMNS = 64
+"""Places on the torus whose cells are recorded."""
+SHUFFLES = 100
+"""Of each cell."""
+DARK = {"speed_white": 0.0, "heading_white": 0.0}
+"""Exact odometry."""
+
+
+class LatticeFigures(NamedTuple):
+    """Figures of n cells in one box.
+
+    Attributes:
+        size: of the box, m. bin: m. maps: [n, H, W] rates. hexagonal, square: lattice scores and shuffles.
+            shape: spacing and orientation of the square lattice. fields: [n] number.
+    """
+
+    size: tuple[float, float]
+    bin: float
+    maps: np.ndarray
+    hexagonal: ShuffledScores
+    square: ShuffledScores
+    shape: LatticeShape
+    fields: np.ndarray
+
+
+class TorusResult(NamedTuple):
+    """Columns in the large box, one cell of each, and columns in the small box. torus: its side, m."""
+
+    large: LatticeFigures
+    single: LatticeFigures
+    small: LatticeFigures
+    torus: float
+
+
+def measure_torus(
+    task: CellTask, seconds: tuple[float, float] = SECONDS, columns: int = COLUMNS, shuffles: int = SHUFFLES
+) -> TorusResult:
+    """The figures of a session in each box; the path is that of the first seed.
+
+    Args:
+        seconds: in the large and in the small box. columns: places on the torus. shuffles: of each.
+    """
+    prepare_precision("float64")
+    network = rat_config().pose_cells
+    chosen = choose_columns(network, columns, task.first)
+    config = rat_config(f"rat_simulation.rate_hz={RATE}", f"cells={{chosen: {json.dumps(chosen)}}}")
+    rats = RatSessions(config)
+    recordings = [
+        rats.run(
+            rat_source(
+                config, task.first, walk={"speed": 0.3, "speed_sd": 0.15}, seconds=time, odometry=DARK,
+                box={"width": size[0], "height": size[1]}, phases=[{"start": 0, "dark": True}],
+            )
+        ).recording
+        for size, time in zip((LARGE, SMALL), seconds, strict=True)
+    ]  # fmt: skip
+    measure = partial(measure_cells, shuffles=shuffles, seed=task.first)
+    large, small = recordings
+    return TorusResult(
+        measure(large, sum_columns(large.activity, columns), LARGE, BINS[0]),
+        measure(large, one_of_each(large.activity, columns), LARGE, BINS[0]),
+        measure(small, sum_columns(small.activity, columns), SMALL, BINS[1]),
+        network.cells_xy * network.cell_size,
+    )
+
+
+def measure_cells(
+    recording: CellRecording, activity: np.ndarray, size: tuple[float, float], bin: float, shuffles: int,
+    seed: int,
+) -> LatticeFigures:  # fmt: skip
+    """The figures of activity [T, n] along the path of a recording.
+
+    Args:
+        size: of the box, m, with a corner at the origin. bin: m. shuffles: of each cell, at least 19.
+
+    Raises:
+        InputError: see `shuffled_scores`.
+    """
+    x_edges, y_edges = (np.linspace(0.0, side, round(side / bin) + 1) for side in size)
+    shape = len(y_edges) - 1, len(x_edges) - 1
+    place = place_index(recording.truth, x_edges, y_edges)
+    bins = PathBins(place, shape, sample_seconds(recording.time))
+
+    def score(lattice: Lattice, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+        return lattice_scores(autocorrelogram(smooth_rates(rates, seconds, SMOOTHING / bin)), lattice)
+
+    scores = [
+        shuffled_scores(activity, bins, partial(score, lattice), shuffles, seed)
+        for lattice in (HEXAGONAL, SQUARE)
+    ]
+    maps = _maps(activity, bins, bin)
+    lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
+    return LatticeFigures(size, bin, maps, *scores, lattice, count_fields(maps, np.zeros(shape)))
+
+
+def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:
+    """[n, H, W] smoothed rates."""
+    inside, count = bins.flat >= 0, int(np.prod(bins.shape))
+    at, weight = bins.flat[inside], bins.seconds[inside]
+    seconds = np.bincount(at, weight, count)
+    sums = np.array([np.bincount(at, weight * cell, count) for cell in activity[inside].T])
+    rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *bins.shape)
+    return smooth_rates(rates, seconds.reshape(bins.shape), SMOOTHING / bin)
+
+
+def table_torus(result: TorusResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    lines = [
+        f"{len(result.large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
+        "control: median of the 95th percentile of each cell's shuffles, and the share of cells above theirs.",
+        "",
+        *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
+    ]
+    large, single, small, torus = result
+    lines.append(markdown_row(["larger box over torus", "above 1", _ratio(large, torus), "-"]))
+    for name, found in (("columns", large), ("single cells", single)):
+        spacing = markdown_row([
+            f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.shape.spacing, 3),
+            f"shuffles have none; found in {np.isfinite(found.shape.spacing).sum()} of {len(found.maps)}",
+        ])  # fmt: skip
+        square, hexagonal = _control(found.square), _control(found.hexagonal)
+        lines += [
+            spacing,
+            markdown_row([f"{name}: square score", "above control", _spread(found.square.score), square]),
+            markdown_row([f"{name}: grid score", "no grid cell", _spread(found.hexagonal.score), hexagonal]),
+        ]
+    lines += [
+        markdown_row(["columns: fields", "several", _counts(large.fields), "-"]),
+        markdown_row(["smaller box over torus", "below 1", _ratio(small, torus), "-"]),
+        markdown_row(["columns: fields", "one or none", _counts(small.fields), "-"]),
+    ]
+    for name, scores in (("square", small.square), ("grid", small.hexagonal)):
+        text = f"columns in the smaller box: {name} score"
+        lines.append(markdown_row([text, "no lattice", _spread(scores.score), _control(scores)]))
+    return [*lines, "", NOT_SHOWN]
+
+
+NOT_SHOWN = (
+    "Not shown: entorhinal grid cells, whose lattice is hexagonal, with several spacings; this torus is "
+    "rigid and square, its activity a rate without spikes and theta, and its path integration here exact."
+)
+
+
+def draw_result(result: TorusResult, png: Path) -> None:
+    """Maps and autocorrelograms in both boxes, and the scores beside their controls."""
+    large, _, small, torus = result
+    line = (
+        f"Torus {torus:.2f} m. Larger box: spacing {np.nanmedian(large.shape.spacing):.2f} m, square score "
+        f"{np.nanmedian(large.square.score):.2f}, grid score {np.nanmedian(large.hexagonal.score):.2f} (medians)."
+    )
+    boxes = [
+        BoxMaps(f"box {_ratio(each, torus)} of the torus", each.size, each.bin, each.maps)
+        for each in (large, small)
+    ]
+    scores = {"square score": large.square, "grid score": large.hexagonal}
+    draw_torus("A torus cell in boxes of two sizes", line, boxes, scores, large.shape.spacing, torus, png)
+
+
+def _ratio(found: LatticeFigures, torus: float) -> str:
+    x, y = found.size
+    return f"{x:g} x {y:g} m / {torus:.2f} m = {x / torus:.2f} x {y / torus:.2f}"
+
+
+def _spread(values: np.ndarray, digits: int = 2) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "none"
+    middle, low, high = np.percentile(known, [50, 2.5, 97.5])
+    return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _control(scores: ShuffledScores) -> str:
+    return f"{_spread(scores.percentile).split(' ')[0]}; {100 * scores.above.mean():.0f} % above"
+
+
+def _counts(fields: np.ndarray) -> str:
+    numbers, cells = np.unique(fields.astype(int), return_counts=True)
+    return ", ".join(f"{number}: {count} cells" for number, count in zip(numbers, cells, strict=True))
+
+
+FIGURE = CellFigure("A torus cell in boxes of two sizes", measure_torus, table_torus, draw_result)
