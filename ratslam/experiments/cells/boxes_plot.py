@@ -12,7 +12,7 @@ from evaluation.plots import style
 
 SHOWN = 7
 """Columns whose maps are drawn."""
-SIDE, GAP, MARGIN = 0.84, 0.10, 1.05
+SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
 """Inches: of a map, between maps, left of them."""
 HEIGHT, LOW = 1.7, 0.95
 """Inches: of a histogram, below it."""
@@ -56,9 +56,9 @@ def draw_boxes(
     top = height - style.TOP - 0.2 - len(rows) * step
     bar = style.add_axes(figure, MARGIN + SHOWN * step - GAP + 0.06, top + GAP, 0.08, len(rows) * step - GAP)
     figure.colorbar(image, cax=bar, ticks=(0, 1))
-    bar.set_title("rate /\npeak", fontsize=7.5, color=style.LABEL_GREY, pad=3)
+    bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
     figure.text(
-        MARGIN / style.WIDTH, (top - 0.08) / height, f"each map: the torus, {torus:g} x {torus:g} m; white: no box",
+        MARGIN / style.WIDTH, (top - 0.08) / height, f"each map: the torus, {torus:g} x {torus:g} m; white: not visited",
         fontsize=7.5, color=style.LABEL_GREY,
     )  # fmt: skip
     axes = _draw_histograms(figure, pairs)
@@ -72,11 +72,12 @@ def _draw_histograms(figure: style.Figure, pairs: Sequence[MapPairs]) -> style.A
     for k, pair in enumerate(pairs):
         axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
         for (name, values), colour in zip(pair.correlations.items(), COLOURS, strict=True):
-            label = f"{name}"
-            axes.hist(values, BINS, color=colour, alpha=0.65, label=label)
+            axes.hist(values, BINS, color=colour, alpha=0.65, label=name)
             axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
         axes.grid(color=style.LINE_GREY, lw=0.7)
-        axes.set_xlim(-1, 1)
-        axes.set_title(f"{pair.title} (dashed: means)", fontsize=9.5, color=style.INK, loc="left")
-        style.name_axes(axes, "correlation of two maps of a column", "columns" if k == 0 else "")
+        axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
+        axes.set_title(f"{pair.title}", fontsize=9.5, color=style.INK, loc="left")
+        style.name_axes(
+            axes, "correlation of two maps of a column (dashed: mean)", "columns" if k == 0 else ""
+        )
     return axes

@@ -147,7 +147,7 @@ def table_torus(result: TorusResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     lines = [
         f"{len(result.large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
-        "control: median of the 95th percentile of each cell's shuffles, and the share of cells above theirs.",
+        "control: median of the 95th percentile of each cell's shuffles, and the share above theirs.",
         "",
         *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
     ]

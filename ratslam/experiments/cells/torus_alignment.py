@@ -1,4 +1,4 @@
-"""How well the rate maps of all cells in one box fit those in another after one turn and shift on the torus."""
+"""How well the maps of all cells in one box fit those in another after one turn and shift on the torus."""
 
 from __future__ import annotations
 
