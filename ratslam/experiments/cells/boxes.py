@@ -2,8 +2,8 @@
 
 The rat is carried from A to B and set down elsewhere, with another heading; odometry does not tell. Grid
 cells of one module keep their phases to each other in another box and turn and shift as one (Fyhn et al.
-2007, Nature 446:190); place cells remap, each in its own way (Leutgeb et al. 2005, Science 309:619). The maps of
-all cells are therefore compared as they are and after the best turn and shift common to all.
+2007, Nature 446:190); place cells remap, each in its own way (Leutgeb et al. 2005, Science 309:619). The
+maps of all cells are therefore compared as they are and after the best turn and shift common to all.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def table_boxes(result: BoxResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     sessions = result.sessions
     lines = [
-        f"Sessions: {len(sessions)}, of {sessions[0].maps.shape[1]} columns. Correlations: mean over the cells, "
+        f"Sessions: {len(sessions)}, of {sessions[0].maps.shape[1]} columns. Correlations: mean over cells, "
         "then the lowest and the highest session.",
         "",
         *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
@@ -197,11 +197,10 @@ def draw_result(result: BoxResult, png: Path) -> None:
     fitted = np.roll(other, found.shift[::-1], axis=(1, 2))
     turned = f"B turned\n{np.degrees(found.angle):.0f}°, shifted"
     rows = {"A": first, "A again": again, "B": plain, turned: fitted}
-    means = {name: values.mean() for pair in pairs for name, values in pair.correlations.items()}
-    still = pairs[0].correlations["A with B"].mean()
+    still, best = (pair.correlations["A with B"].mean() for pair in pairs)
     line = (
         f"Box {result.side:g} m, torus {result.torus:g} m (ratio {result.side / result.torus:.2f}). Mean "
-        f"correlation of A with B: {still:.2f}, after one turn and shift of all {means['A with B']:.2f}."
+        f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
     )
     draw_boxes("Rate maps in two boxes", line, rows, result.torus, pairs, png)
 

@@ -185,8 +185,8 @@ def draw_result(result: TorusResult, png: Path) -> None:
     """Maps and autocorrelograms in both boxes, and the scores beside their controls."""
     large, _, small, torus = result
     line = (
-        f"Torus {torus:.2f} m. Larger box: spacing {np.nanmedian(large.shape.spacing):.2f} m, square score "
-        f"{np.nanmedian(large.square.score):.2f}, grid score {np.nanmedian(large.hexagonal.score):.2f} (medians)."
+        f"Torus {torus:.2f} m. Larger box: spacing {np.nanmedian(large.shape.spacing):.2f} m, "
+        f"square score {np.nanmedian(large.square.score):.2f}, grid score {np.nanmedian(large.hexagonal.score):.2f} (medians)."
     )
     boxes = [
         BoxMaps(f"box {_ratio(each, torus)} of the torus", each.size, each.bin, each.maps)
