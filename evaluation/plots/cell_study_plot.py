@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.plots import style
+from evaluation.plots.cell_plot import draw_rate_map
 from evaluation.plots.style import BLUE, LABEL_GREY, WIDTH
 
 _PANEL, _GAP_ACROSS, _GAP_UP = 1.9, 0.62, 0.75  # inches: height of a panel, between panels
@@ -69,15 +70,12 @@ def draw_rate_maps(
     step = side + 0.5
     height = style.TOP + len(rows) * step + 0.1
     figure = style.new_figure(height, title, line)
-    extent = (x_edges[0], x_edges[-1], y_edges[0], y_edges[-1])
     for k, row in enumerate(rows):
         bottom = height - style.TOP - side - 0.18 - k * step
         for column, rates in enumerate(row.maps):
             axes = style.add_axes(figure, style.LEFT + column * (side + _MAP_GAP), bottom, side, side)
-            peak = float(np.nanmax(rates))
-            axes.imshow(rates, origin="lower", extent=extent, cmap="viridis", vmin=0, vmax=peak or 1.0)
-            axes.set(xticks=[], yticks=[])
-            axes.set_title(f"{peak:.2g}", fontsize=7, color=LABEL_GREY, pad=2)
+            draw_rate_map(axes, rates, x_edges, y_edges)
+            axes.set_title(f"{np.nanmax(rates):.2g}", fontsize=7, color=LABEL_GREY, pad=2)
         figure.text(
             0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, row.name, rotation=90, fontsize=9,
             ha="center", va="center", color=style.INK,

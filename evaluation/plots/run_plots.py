@@ -12,8 +12,10 @@ from evaluation.artifacts.closure_table import read_closures
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
 from evaluation.artifacts.run_directory import read_run, read_scorecard, read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
+from evaluation.cells import recording
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays
+from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.change_plot import draw_changes
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
@@ -29,7 +31,7 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
     """The plots of a scored run: name -> function that draws the plot.
 
     Every run has `map`, runs with whiskers also `whiskers` and `experiences`, sessions localised in a map
-    also `changes`, runs with a grid map also `grid`.
+    also `changes`, runs with a grid map also `grid`, runs with recorded pose cells also `cells`.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -46,6 +48,11 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         plots["changes"] = lambda: draw_changes(card.name, run, changes, walls)
     if (directory / "grid.npz").exists():
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))
+    cells = directory / recording.NAME
+    if cells.exists():
+        plots["cells"] = lambda: draw_recorded_cells(
+            f"Pose cells: {card.name}", recording.read_recording(cells)
+        )
     return plots
 
 

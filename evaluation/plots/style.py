@@ -57,6 +57,15 @@ def add_axes(figure: Figure, left: float, bottom: float, width: float, height: f
     return axes
 
 
+def add_dial(figure: Figure, left: float, bottom: float, side: float) -> Axes:
+    """Polar axes with a thin rim and no labels at a position of the figure, in inches."""
+    across, up = figure.get_size_inches()
+    axes = figure.add_axes((left / across, bottom / up, side / across, side / up), projection="polar")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(color=GREY, lw=0.6)
+    return axes
+
+
 def name_axes(axes: Axes, across: str, up: str) -> None:
     """Sets the axis labels, with units."""
     axes.set_xlabel(across, color=LABEL_GREY, fontsize=9)

@@ -19,12 +19,12 @@ def add_commands(commands: Commands) -> None:
     export.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE",
         help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
-        "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells; a name without a suffix "
-        "becomes a ROS 2 bag folder",
+        "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells, .csv their scores; a name "
+        "without a suffix becomes a ROS 2 bag folder",
     )  # fmt: skip
     export.add_argument(
         "--peak-rate", type=_rate, default=20.0, metavar="HZ",
-        help="spikes: rate of a cell at the peak of a settled packet (default 20 Hz)",
+        help="cells: rate of a cell at the peak of a settled packet (default 20 Hz)",
     )  # fmt: skip
     export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
 

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from evaluation.artifacts.grid_npz import read_grid
 from evaluation.artifacts.nav2 import write_nav2
+from evaluation.cells.analysis import write_scores
 from ratslam.export.nwb import write_nwb
 from ratslam.export.ros_bag import write_bag, write_mcap
 from ratslam.export.ros_messages import RosMessages
-from ratslam.export.run_cells import read_run_cells
+from ratslam.export.run_cells import read_run_cells, score_run_cells
 from ratslam.export.run_files import ExportedRun, read_exported_run
 from ratslam.pose_graph.io import read_json
 from ratslam.rats.spikes import SpikeConfig, write_spikes
@@ -23,7 +24,8 @@ from tactile.base.errors import InputError
 Warn = Callable[[str], None]
 PARTED = "the map is in several pieces, whose poses cannot be compared"
 FORMATS = (
-    ".mcap, .tum, .g2o, .json, .graphml, .yaml, .nwb or .npz, or a folder without a suffix for a ROS 2 bag"
+    ".mcap, .tum, .g2o, .json, .graphml, .yaml, .nwb, .npz or .csv, "
+    "or a folder without a suffix for a ROS 2 bag"
 )
 
 
@@ -38,7 +40,7 @@ def export_run(
     Args:
         directory: of the run. output: its suffix chooses the format; without one, the folder of a ROS 2 bag.
         warn: called with a sentence about parts that the file lacks. spikes: of the recorded cells in .nwb
-            and .npz files.
+            and .npz files; its peak rate is also that of the scores in a .csv file.
 
     Raises:
         InputError: the run lacks what the format holds, a file of it is malformed, the output exists or its
@@ -130,6 +132,10 @@ def _write_spikes(directory: Path, output: Path, config: SpikeConfig) -> None:
     write_atomically(output, lambda path: write_spikes(path, cells.spikes))
 
 
+def _write_scores(directory: Path, output: Path, config: SpikeConfig) -> None:
+    write_scores(output, score_run_cells(directory, config.peak_rate))
+
+
 WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
     "": _write_bag,
     ".mcap": _write_mcap,
@@ -142,6 +148,7 @@ WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
 CELL_WRITERS: dict[str, Callable[[Path, Path, SpikeConfig], None]] = {
     ".nwb": _write_nwb,
     ".npz": _write_spikes,
+    ".csv": _write_scores,
 }
 
 

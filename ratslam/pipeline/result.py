@@ -135,7 +135,8 @@ class Result:
         """A plot of the run as a matplotlib figure; a notebook shows it after `%matplotlib inline`.
 
         Args:
-            name: `map`; with whiskers also `whiskers` and `experiences`, with a grid map also `grid`.
+            name: `map`; with whiskers also `whiskers` and `experiences`, with a grid map also `grid`, with
+                recorded pose cells also `cells`.
 
         Raises:
             InputError: the run has no such plot.

@@ -1,0 +1,147 @@
+"""Plots of recorded pose cells: rate maps, heading tuning, spikes on the path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.cells.analysis import AnalysisSettings, CellScores, score_sums
+from evaluation.cells.rate_map import arena_edges, bin_activity, known_poses, rate_maps, tuning_curves
+from evaluation.cells.recording import BinnedSums, CellRecording
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
+from tactile.base.errors import InputError
+
+MOST = 12
+"""Largest number of cells in a plot of a run."""
+_COLUMNS, _GAP = 6, 0.14  # panels in a row; inches between them
+_SIDE = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP) / _COLUMNS  # of a map, inches
+_DIAL = 0.62 * _SIDE  # of a tuning curve, inches
+_LABEL = 0.5  # inches above a map
+
+
+class CellMaps(NamedTuple):
+    """What is drawn of n cells.
+
+    Attributes:
+        rates: [n, H, W] mean activity, NaN where the path was not. tuning: [n, B] over heading, bin b centred
+            on 2 pi b / B rad. x_edges, y_edges: of the place bins, m. scores: [n] each.
+    """
+
+    rates: np.ndarray
+    tuning: np.ndarray
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+    scores: CellScores
+
+
+def map_cells(recording: CellRecording, most: int = MOST) -> CellMaps:
+    """Maps and scores of up to `most` recorded cells: of the more active half of the chosen ones, or of all
+    cells if only sums were recorded, evenly spread over their indices.
+
+    Raises:
+        InputError: no cells were recorded, no pose is known, the path has no area, or no bin was visited long
+            enough.
+    """
+    settings = AnalysisSettings()
+    sums, cell = _recorded_sums(recording, settings)
+    total = sums.place.sum(axis=(1, 2))
+    active = np.sort(np.argsort(-total, kind="stable")[: -(-len(cell) // 2)])
+    chosen = active[np.unique(np.linspace(0, len(active) - 1, most).round().astype(int))]
+    sums = sums._replace(place=sums.place[chosen], heading=sums.heading[chosen])
+    maps = settings.maps
+    return CellMaps(
+        rate_maps(sums, maps.smoothing, maps.least_seconds),
+        tuning_curves(sums, maps.heading_smoothing, maps.least_seconds),
+        sums.x_edges,
+        sums.y_edges,
+        score_sums(sums, cell[chosen], recording, settings),
+    )
+
+
+def draw_cells(title: str, maps: CellMaps) -> style.Figure:
+    """Draws the rate map of each cell, with its spatial information and its peak, and below it its activity
+    over heading."""
+    cells, step = len(maps.rates), _LABEL + _SIDE + _DIAL + 0.1
+    height = style.TOP + -(-cells // _COLUMNS) * step + 0.1
+    line = "activity at each true place and, below it, true heading; peak: share of the activity of all cells"
+    figure = style.new_figure(height, title, line)
+    for k in range(cells):
+        row, column = divmod(k, _COLUMNS)
+        left, bottom = style.LEFT + column * (_SIDE + _GAP), height - style.TOP - _LABEL - _SIDE - row * step
+        axes = style.add_axes(figure, left, bottom, _SIDE, _SIDE)
+        draw_rate_map(axes, maps.rates[k], maps.x_edges, maps.y_edges)
+        information, peak = maps.scores.information[k], np.nanmax(maps.rates[k])
+        label = f"cell {maps.scores.cell[k]}\n{information:.2f} bits/spike\npeak {peak:.2g}"
+        axes.set_title(label, fontsize=7, color=LABEL_GREY, pad=2, linespacing=1.15)
+        dial = left + (_SIDE - _DIAL) / 2, bottom - _DIAL - 0.06
+        draw_tuning(style.add_dial(figure, *dial, _DIAL), maps.tuning[k])
+    return figure
+
+
+def draw_recorded_cells(title: str, recording: CellRecording) -> style.Figure:
+    """Draws `map_cells` of a recording; of one from which no map can be made, the reason."""
+    try:
+        maps = map_cells(recording)
+    except InputError as error:
+        return style.new_figure(style.TOP, title, f"no rate maps: {error}")
+    return draw_cells(title, maps)
+
+
+def draw_rate_map(axes: style.Axes, rates: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> None:
+    """Draws a rate map [H, W] into axes, in colours from 0 to its peak; NaN stay white."""
+    extent = (x_edges[0], x_edges[-1], y_edges[0], y_edges[-1])
+    peak = float(np.nanmax(rates))
+    axes.imshow(rates, origin="lower", extent=extent, cmap="viridis", vmin=0, vmax=peak or 1.0)
+    axes.set(xticks=[], yticks=[])
+
+
+def draw_tuning(axes: style.Axes, curve: np.ndarray) -> None:
+    """Draws activity over heading [B] into polar axes; headings that were not held are left out."""
+    angle = 2 * np.pi * np.arange(len(curve) + 1) / len(curve)
+    axes.plot(angle, np.append(curve, curve[0]), color=BLUE, lw=1.2)
+    peak = np.nanmax(curve)
+    axes.set(ylim=(0, peak or 1.0), yticks=[])
+
+
+def draw_spikes_on_path(
+    title: str, line: str, recording: CellRecording, spikes: Sequence[np.ndarray]
+) -> style.Figure:
+    """Draws the true path, and on it the pose at each spike, a panel for each chosen cell.
+
+    Args:
+        spikes: of each chosen cell its times, s.
+
+    Raises:
+        InputError: no pose is known.
+    """
+    rows = -(-len(spikes) // _COLUMNS)
+    step = _SIDE + 0.3
+    height = style.TOP + rows * step + 0.1
+    figure = style.new_figure(height, title, line)
+    known = known_poses(recording.truth)
+    time, place = recording.time[known], recording.truth[known, :2].T
+    for k, times in enumerate(spikes):
+        row, column = divmod(k, _COLUMNS)
+        bottom = height - style.TOP - (row + 1) * step
+        axes = style.add_axes(figure, style.LEFT + column * (_SIDE + _GAP), bottom, _SIDE, _SIDE)
+        axes.plot(*place, color=GREY, lw=0.4)
+        axes.plot(*(np.interp(times, time, axis) for axis in place), ".", color=VERMILLION, ms=2.5, mew=0)
+        axes.set(xticks=[], yticks=[], aspect="equal")
+        label = f"cell {recording.cell[k]}, {len(times)} spikes"
+        axes.set_title(label, fontsize=7, color=INK, pad=2)
+    return figure
+
+
+def _recorded_sums(recording: CellRecording, settings: AnalysisSettings) -> tuple[BinnedSums, np.ndarray]:
+    """The sums of the chosen cells, or if there are none those of all, and the indices of these cells."""
+    if len(recording.cell) == 0 and recording.sums is not None:
+        return recording.sums, np.arange(len(recording.sums.place))
+    if len(recording.cell) == 0:
+        raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
+    edges = arena_edges(recording.truth, settings.maps.place_bins)
+    bins = settings.maps.heading_bins
+    sums = bin_activity(recording.time, recording.truth, recording.activity, *edges, bins)
+    return sums, recording.cell
