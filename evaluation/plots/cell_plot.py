@@ -7,8 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.analysis import AnalysisSettings, CellScores, score_sums
-from evaluation.cells.rate_map import arena_edges, bin_activity, known_poses, rate_maps, tuning_curves
+from evaluation.cells.information import information
+from evaluation.cells.rate_map import (
+    MapSettings,
+    arena_edges,
+    bin_activity,
+    known_poses,
+    rate_maps,
+    tuning_curves,
+)
 from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
@@ -27,38 +34,45 @@ class CellMaps(NamedTuple):
 
     Attributes:
         rates: [n, H, W] mean activity, NaN where the path was not. tuning: [n, B] over heading, bin b centred
-            on 2 pi b / B rad. x_edges, y_edges: of the place bins, m. scores: [n] each.
+            on 2 pi b / B rad. x_edges, y_edges: of the place bins, m. seconds: [H, W]
+            time in each. cell: [n] indices in the flattened network.
     """
 
     rates: np.ndarray
     tuning: np.ndarray
     x_edges: np.ndarray
     y_edges: np.ndarray
-    scores: CellScores
+    seconds: np.ndarray
+    cell: np.ndarray
 
 
 def map_cells(recording: CellRecording, most: int = MOST) -> CellMaps:
-    """Maps and scores of up to `most` recorded cells: of the more active half of the chosen ones, or of all
-    cells if only sums were recorded, evenly spread over their indices.
+    """Maps of up to `most` recorded cells: of the more active half of the chosen ones, or of all cells if
+    only sums were recorded, evenly spread over their indices.
 
     Raises:
         InputError: no cells were recorded, no pose is known, the path has no area, or no bin was visited long
             enough.
     """
-    settings = AnalysisSettings()
+    settings = MapSettings()
     sums, cell = _recorded_sums(recording, settings)
     total = sums.place.sum(axis=(1, 2))
     active = np.sort(np.argsort(-total, kind="stable")[: -(-len(cell) // 2)])
     chosen = active[np.unique(np.linspace(0, len(active) - 1, most).round().astype(int))]
-    sums = sums._replace(place=sums.place[chosen], heading=sums.heading[chosen])
-    maps = settings.maps
-    return CellMaps(
-        rate_maps(sums, maps.smoothing, maps.least_seconds),
-        tuning_curves(sums, maps.heading_smoothing, maps.least_seconds),
-        sums.x_edges,
-        sums.y_edges,
-        score_sums(sums, cell[chosen], recording, settings),
-    )
+    picked = sums._replace(place=sums.place[chosen], heading=sums.heading[chosen])
+    return map_sums(picked, cell[chosen])
+
+
+def map_sums(sums: BinnedSums, cell: np.ndarray) -> CellMaps:
+    """Maps of `cell` [n], indices in the flattened network, from their sums, smoothed as by `MapSettings`.
+
+    Raises:
+        InputError: no bin was visited long enough.
+    """
+    made = MapSettings()
+    rates = rate_maps(sums, made.smoothing, made.least_seconds)
+    tuning = tuning_curves(sums, made.heading_smoothing, made.least_seconds)
+    return CellMaps(rates, tuning, sums.x_edges, sums.y_edges, sums.seconds, cell)
 
 
 def draw_cells(title: str, maps: CellMaps) -> style.Figure:
@@ -68,13 +82,15 @@ def draw_cells(title: str, maps: CellMaps) -> style.Figure:
     height = style.TOP + -(-cells // _COLUMNS) * step + 0.1
     line = "activity at each true place and, below it, true heading; peak: share of the activity of all cells"
     figure = style.new_figure(height, title, line)
+    bits = information(maps.rates, maps.seconds)
     for k in range(cells):
         row, column = divmod(k, _COLUMNS)
         left, bottom = style.LEFT + column * (_SIDE + _GAP), height - style.TOP - _LABEL - _SIDE - row * step
         axes = style.add_axes(figure, left, bottom, _SIDE, _SIDE)
         draw_rate_map(axes, maps.rates[k], maps.x_edges, maps.y_edges)
-        information, peak = maps.scores.information[k], np.nanmax(maps.rates[k])
-        label = f"cell {maps.scores.cell[k]}\n{information:.2f} bits/spike\npeak {peak:.2g}"
+        peak = np.nanmax(maps.rates[k])
+        said = f"{bits[k]:.2f} bits/spike\npeak {peak:.2g}" if peak > 0 else "silent"
+        label = f"cell {maps.cell[k]}\n{said}"
         axes.set_title(label, fontsize=7, color=LABEL_GREY, pad=2, linespacing=1.15)
         dial = left + (_SIDE - _DIAL) / 2, bottom - _DIAL - 0.06
         draw_tuning(style.add_dial(figure, *dial, _DIAL), maps.tuning[k])
@@ -135,13 +151,13 @@ def draw_spikes_on_path(
     return figure
 
 
-def _recorded_sums(recording: CellRecording, settings: AnalysisSettings) -> tuple[BinnedSums, np.ndarray]:
+def _recorded_sums(recording: CellRecording, settings: MapSettings) -> tuple[BinnedSums, np.ndarray]:
     """The sums of the chosen cells, or if there are none those of all, and the indices of these cells."""
     if len(recording.cell) == 0 and recording.sums is not None:
         return recording.sums, np.arange(len(recording.sums.place))
     if len(recording.cell) == 0:
         raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
-    edges = arena_edges(recording.truth, settings.maps.place_bins)
-    bins = settings.maps.heading_bins
+    edges = arena_edges(recording.truth, settings.place_bins)
+    bins = settings.heading_bins
     sums = bin_activity(recording.time, recording.truth, recording.activity, *edges, bins)
     return sums, recording.cell

@@ -23,7 +23,7 @@ from robot.touch_source import TOUCH
 NAMES = ("dead_reckoning", "own_arrays", "own_loop", "own_metric", "taxel_array")
 STEPS = (
     "one_packet", "path_integration", "two_packets", "view_templates", "first_loop", "places_that_look_alike",
-    "whisker_images", "grid_filter", "a_bag", "sensor_live", "come_back",
+    "whisker_images", "grid_filter", "a_bag", "sensor_live", "come_back", "cells_of_a_rat",
 )  # fmt: skip
 FOLDER = Path(ratslam.examples.__file__).parent
 PICTURES = FOLDER.parents[1] / "docs" / "examples"

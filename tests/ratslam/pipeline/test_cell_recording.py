@@ -144,7 +144,7 @@ def test_a_run_without_cells_has_the_same_files_and_no_cells(result, walk, tmp_p
     plain = run(walk, tmp_path / "plain", None)
     assert plain.cells is None
     names = [{path.name for path in one.directory.iterdir()} for one in (result, plain)]
-    assert names[0] - names[1] == {"cells.npz"}
+    assert names[0] - names[1] == {"cells.npz", "cells.png"}
     for name in ("steps.csv", "trajectory.tum", "map.json", "map.npz"):
         assert (plain.directory / name).read_bytes() == (result.directory / name).read_bytes(), name
 
