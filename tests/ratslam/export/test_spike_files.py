@@ -10,6 +10,7 @@ import numpy as np
 import pynwb
 import pytest
 
+from evaluation.cells.analysis import AnalysisSettings, analyse_cells
 from evaluation.cells.recording import write_recording
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.cli import main
@@ -139,3 +140,15 @@ def test_a_missing_library_is_named(recording, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"pip install 'ratslam\[nwb\]'"):
         write_nwb(tmp_path / "run.nwb", recording, draw_spikes(recording, 1.0), "digest")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_scores_are_a_line_for_each_cell_in_hz(run, recording, tmp_path):
+    recording.truth[:] = np.random.default_rng(1).random(recording.truth.shape)
+    write_recording(run / "cells.npz", recording)
+    assert main(["export", str(run), "-o", str(tmp_path / "cells.csv"), "--peak-rate", "30"]) == 0
+    table = np.genfromtxt(tmp_path / "cells.csv", delimiter=",", names=True)
+    network = PoseCellConfig(cells_xy=7, cells_heading=8)
+    gain = 30 / settled_peak(network)
+    scores = analyse_cells(recording, AnalysisSettings(gain=gain))
+    np.testing.assert_array_equal(table["cell"], CELLS)
+    np.testing.assert_array_equal(table["mean_rate"], scores.mean_rate)
