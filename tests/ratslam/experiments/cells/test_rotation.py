@@ -58,7 +58,8 @@ def test_a_planted_rotation_is_found(turn: float) -> None:
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2, np.pi])
 def test_a_packet_that_follows_odometry_has_not_turned(turn: float) -> None:
     found = rotation_of(planted(0.0), SHORT, turn)
-    assert max(abs(found.heading), abs(found.place), abs(found.cells)) < 1e-6
+    assert max(abs(found.heading), abs(found.place)) < 1e-6
+    assert abs(found.cells) < 0.2  # the rows before and after hold other headings
 
 
 @pytest.fixture(scope="module")
