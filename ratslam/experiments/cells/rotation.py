@@ -205,7 +205,8 @@ def draw_rotation(result: RotationResult, png: Path) -> None:
     for number, (kind, label) in enumerate(KINDS.items()):
         values, shift = result.degrees(kind), SHIFT * (number - 1)
         turns = [each + shift for each in ANGLES]
-        middle = np.nanmedian(values[together], axis=1)
+        known = [each[np.isfinite(each)] for each in values[together]]
+        middle = [np.median(each) if len(each) else np.nan for each in known]
         left.plot(turns, middle, "_", ms=12, mew=2, color=COLOURS[number], label=label)
         spread_dots(left, turns, values[together].tolist(), COLOURS[number])
     left.plot(ANGLES, ANGLES, "--", color=style.INK, lw=0.9, label="with the cues", zorder=1)
