@@ -143,7 +143,7 @@ def draw_anchoring(result: AnchoringResult, png: Path) -> None:
     line = "Median error in the test: " + ", ".join(
         f"{test} {m:.2f} m, {rad:.2f} rad" for test, (m, rad) in during.items()
     )
-    figure, axes = panel_grid("Anchoring of the packet by views", f"{line} (shuffled: control).", 2, 2)
+    figure, axes = panel_grid("Anchoring of the packet by views", f"{line}.", 2, 2)
     for column, path in enumerate(PATHS):
         for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
             panel = axes[quantity][column]
