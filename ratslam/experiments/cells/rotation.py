@@ -38,7 +38,7 @@ LEAST = 0.01
 """Least activity of a cell, summed over the time of each part, s, for a preferred direction."""
 USUAL = 3
 """Seeds: each is a walk and a draw of the noise of odometry, common to the turns."""
-KINDS = {"heading": "heading of packet", "place": "place of packet", "cells": "preferred directions"}
+KINDS = {"heading": "packet heading", "place": "packet place", "cells": "cells"}
 """Fields of `Rotation` with their labels."""
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 """Of the kinds."""
