@@ -59,7 +59,8 @@ def draw_boxes(
     bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
     figure.text(
         MARGIN / style.WIDTH, (top - 0.08) / height,
-        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited", fontsize=7.5, color=style.LABEL_GREY,
+        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited",
+        fontsize=7.5, color=style.LABEL_GREY,
     )  # fmt: skip
     axes = _draw_histograms(figure, pairs)
     style.add_legend(figure, axes, columns=3)

@@ -184,9 +184,11 @@ NOT_SHOWN = (
 def draw_result(result: TorusResult, png: Path) -> None:
     """Maps and autocorrelograms in both boxes, and the scores beside their controls."""
     large, _, small, torus = result
+    values = (large.shape.spacing, large.square.score, large.hexagonal.score)
+    spacing, square, hexagonal = (float(np.nanmedian(each)) for each in values)
     line = (
-        f"Torus {torus:.2f} m. Larger box: spacing {np.nanmedian(large.shape.spacing):.2f} m, "
-        f"square score {np.nanmedian(large.square.score):.2f}, grid score {np.nanmedian(large.hexagonal.score):.2f} (medians)."
+        f"Torus {torus:.2f} m. Larger box, medians: spacing {spacing:.2f} m, square score {square:.2f}, "
+        f"grid score {hexagonal:.2f}."
     )
     boxes = [
         BoxMaps(f"box {_ratio(each, torus)} of the torus", each.size, each.bin, each.maps)
