@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.cells.autocorrelogram import autocorrelogram
-from evaluation.cells.fields import count_fields
+from evaluation.cells.fields import count_by_cell, find_fields
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, Lattice, lattice_scores
 from evaluation.cells.grid_spacing import LatticeShape, measure_lattice
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
@@ -38,6 +38,8 @@ SECONDS = 900.0, 200.0
 """In the large and in the small box."""
 SMOOTHING = 0.075
 """Standard deviation of the Gaussian over rate maps, m."""
+FIELD = 0.02
+"""Smallest field that counts, m^2."""
 COLUMNS = 64
 """Places on the torus whose cells are recorded."""
 SHUFFLES = 100
@@ -130,7 +132,8 @@ def measure_cells(
     ]
     maps = _maps(activity, bins, bin)
     lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
-    return LatticeFigures(size, bin, maps, *scores, lattice, count_fields(maps, np.zeros(shape)))
+    fields = find_fields(maps, least_bins=round(FIELD / bin**2))
+    return LatticeFigures(size, bin, maps, *scores, lattice, count_by_cell(fields, len(maps)))
 
 
 def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:
