@@ -22,9 +22,8 @@ CELLS = 529 + np.arange(6) * 2690  # of 36 x 21 x 21 over heading, y, x
 def main() -> None:
     prepare_precision("float64")
     errors = {"speed_white": 0.1, "heading_white": 0.05}  # of its path integration: sqrt(s), rad/sqrt(s)
-    rat = RatSimulation(
-        RatSimulationConfig(path={"file": "sargolini"}, seconds=300, rate_hz=10, odometry=errors)
-    )
+    settings = {"path": {"file": "sargolini"}, "seconds": 300, "rate_hz": 10, "odometry": errors}
+    rat = RatSimulation(RatSimulationConfig.model_validate(settings))
     network = DrivenNetwork(PoseCellConfig(cell_size=0.05), rat.truth[0])  # a torus of 21 x 0.05 = 1.05 m
     activity = []
     for step, (motion, pose) in enumerate(zip(rat.odometry, rat.truth, strict=True)):

@@ -124,10 +124,13 @@ def fit_session(recording: CellRecording, seconds: float, side: float, columns: 
         ]
         all_maps.append([rate_maps(each) for each in sums])
     bins = recording.shape[2]
-    fits = [fit_maps(maps[0 + k], maps[1 + k], bins) for maps in all_maps for k in (0, 1)]
+    again, moved, single_again, single_moved = (
+        fit_maps(maps[k], maps[k + 1], bins) for maps in all_maps for k in (0, 1)
+    )
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
-    return BoxSession(np.array(all_maps[0]), *fits, float(turn))
+    maps = np.array(all_maps[0])
+    return BoxSession(maps, again, moved, single_again, single_moved, float(turn))
 
 
 def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> MapFit:
@@ -140,7 +143,7 @@ def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> MapFit:
         correlate_shifts(lay_on_torus(first, bins, 0.0), lay_on_torus(each, bins, 0.0))[:, 0, 0]
         for each in (second, other)
     ]
-    best = [align_maps(first, each, bins, ANGLES) for each in (second, other)]
+    best = [align_maps(first, each, bins, ANGLES.tolist()) for each in (second, other)]
     return MapFit(still[0], best[0], still[1], best[1])
 
 

@@ -73,7 +73,7 @@ def _draw_histograms(figure: style.Figure, pairs: Sequence[MapPairs]) -> style.A
     for k, pair in enumerate(pairs):
         axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
         for (name, values), colour in zip(pair.correlations.items(), COLOURS, strict=True):
-            axes.hist(values, BINS, color=colour, alpha=0.65, label=name)
+            axes.hist(values, BINS.tolist(), color=colour, alpha=0.65, label=name)
             axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
         axes.grid(color=style.LINE_GREY, lw=0.7)
         axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))

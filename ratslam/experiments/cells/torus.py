@@ -126,14 +126,14 @@ def measure_cells(
     def score(lattice: Lattice, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
         return lattice_scores(autocorrelogram(smooth_rates(rates, seconds, SMOOTHING / bin)), lattice)
 
-    scores = [
+    hexagonal, square = (
         shuffled_scores(activity, bins, partial(score, lattice), shuffles, seed)
         for lattice in (HEXAGONAL, SQUARE)
-    ]
+    )
     maps = _maps(activity, bins, bin)
     lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
     fields = find_fields(maps, least_bins=round(FIELD / bin**2))
-    return LatticeFigures(size, bin, maps, *scores, lattice, count_by_cell(fields, len(maps)))
+    return LatticeFigures(size, bin, maps, hexagonal, square, lattice, count_by_cell(fields, len(maps)))
 
 
 def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:

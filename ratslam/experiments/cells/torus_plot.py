@@ -29,6 +29,10 @@ class BoxMaps(NamedTuple):
     maps: np.ndarray
 
 
+SCORES = np.linspace(-1.5, 1.5, 61).tolist()
+"""Limits of the bins of lattice scores."""
+
+
 def draw_torus(
     title: str, line: str, boxes: Sequence[BoxMaps], scores: Mapping[str, ShuffledScores],
     spacing: np.ndarray, torus: float, png: Path,
@@ -68,7 +72,7 @@ def draw_torus(
 
 
 def _draw_row(
-    figure: style.Figure, bottom: float, tall: float, images: np.ndarray, extent: tuple[float, ...],
+    figure: style.Figure, bottom: float, tall: float, images: np.ndarray, extent: tuple[float, float, float, float],
     colours: tuple[str, float, float],
 ) -> None:  # fmt: skip
     name, low, high = colours
@@ -78,8 +82,8 @@ def _draw_row(
         axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
         axes.tick_params(labelsize=7, pad=1)
         labels = axes.get_xticklabels()
-        labels[0].set_ha("left")
-        labels[-1].set_ha("right")
+        labels[0].set_horizontalalignment("left")
+        labels[-1].set_horizontalalignment("right")
         if column == 0:
             axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
     left = style.LEFT + len(images) * (WIDE + GAP)
@@ -101,15 +105,13 @@ def _draw_histograms(
     for axes, (name, found) in zip(panels, scores.items(), strict=False):
         known = found.score[np.isfinite(found.score)]
         shuffled = found.shuffled[np.isfinite(found.shuffled)]
-        axes.hist(shuffled, np.linspace(-1.5, 1.5, 61), density=True, color=style.GREY, label="shuffled")
-        axes.hist(
-            known, np.linspace(-1.5, 1.5, 61), density=True, color=style.BLUE, alpha=0.7, label="columns"
-        )
+        axes.hist(shuffled, SCORES, density=True, color=style.GREY, label="shuffled")
+        axes.hist(known, SCORES, density=True, color=style.BLUE, alpha=0.7, label="columns")
         axes.set_xlim(-1.5, 1.5)
         style.name_axes(axes, f"{name}, larger box", "density" if axes is panels[0] else "")
     known = spacing[np.isfinite(spacing)]
     near = np.linspace(torus - 0.1, torus + 0.1, 41)
-    panels[-1].hist(np.clip(known, near[0], near[-1]), near, color=style.BLUE)
+    panels[-1].hist(np.clip(known, near[0], near[-1]), near.tolist(), color=style.BLUE)
     panels[-1].axvline(torus, color=style.VERMILLION, lw=1.4)
     panels[-1].set_title("red: side of the torus", fontsize=8, color=style.LABEL_GREY, loc="left")
     style.name_axes(panels[-1], "spacing, larger box (m)", "columns")
