@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,22 +12,25 @@ from jax import lax
 
 from ratslam.attractor import window
 from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, Level, to_full_torus
+from ratslam.attractor.levels import Activity, Block, Level
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Array
 
 
-class ProbedCells(NamedTuple):
-    """Activity after one step.
+class HeldCells(NamedTuple):
+    """The windows of the level that holds the activity.
+
+    A window of 16^3 cells is read and summed in a fraction of the time that the whole torus takes.
 
     Attributes:
-        chosen: [C] float32 of the chosen cells. every: [K * N * N] float32 of all cells over heading, y, x,
-            zeros where the step is not due; None if no step is.
+        level: int32. origin: [M, 3] int32 first cell of each window over x, y, heading, then zeros, for the
+            level with most windows. cells: [K * N * N] float32, the windows flattened, then zeros.
     """
 
-    chosen: Array
-    every: Array | None
+    level: Array
+    origin: Array
+    cells: Array
 
 
 def choose_cells(
@@ -55,32 +60,33 @@ def choose_cells(
     return ((at[:, 2] * rings[1] + at[:, 1]) * rings[0] + at[:, 0]).astype(np.int32)
 
 
-def is_due(number: Array, interval: int) -> Array:
-    """Whether all cells are read after the step of this number (from 0): the last of each `interval`."""
-    return (number + 1) % interval == 0
+def hold_cells(levels: tuple[Level, ...], activity: Activity) -> HeldCells:
+    """The activity at its own level."""
+    size = int(np.prod(levels[-1].window.shape))
+    most = max(level.windows for level in levels)
+
+    def held_at(k: int) -> tuple[Array, Array]:
+        block = activity.blocks[k]
+        cells = block.activity.reshape(-1).astype(jnp.float32)
+        origin = jnp.pad(block.origin, ((0, most - levels[k].windows), (0, 0)))
+        return origin, jnp.pad(cells, (0, size - len(cells)))
+
+    choices = [partial(held_at, k) for k in range(len(levels))]
+    return HeldCells(activity.level, *lax.switch(activity.level, choices))
 
 
-def probe_cells(
-    levels: tuple[Level, ...], activity: Activity, number: Array, cell: np.ndarray, interval: int | None
-) -> ProbedCells:
-    """The activity after a step.
-
-    Args:
-        number: of the step, int32. cell: [C] chosen cells in the flattened network. interval: steps between
-            two readings of all cells; None: they are never read.
-    """
-    chosen = activity_of(levels, activity, cell).astype(jnp.float32)
-    if interval is None:
-        return ProbedCells(chosen, None)
-    count = int(np.prod(window.ring_sizes(levels[-1].window)))
-    return ProbedCells(
-        chosen,
-        lax.cond(
-            is_due(number, interval),
-            lambda: to_full_torus(levels, activity).reshape(-1).astype(jnp.float32),
-            lambda: jnp.zeros(count, jnp.float32),
-        ),
-    )
+def active_cells(levels: tuple[Level, ...], held: HeldCells) -> tuple[np.ndarray, np.ndarray]:
+    """Indices [n] of the active cells in the flattened network and their activity [n] float32, on the host; a
+    cell comes twice where two windows overlap."""
+    level = levels[int(held.level)]
+    shape = (level.windows, *level.window.shape)
+    at = np.flatnonzero(held.cells[: math.prod(shape)])
+    copy, *inside = np.unravel_index(at, shape)
+    x, y, heading = window.ring_sizes(level.window).tolist()
+    own = [
+        (held.origin[copy, 2 - k] + inside[k]) % ring for k, ring in enumerate((heading, y, x))
+    ]
+    return (own[0] * y + own[1]) * x + own[2], held.cells[at]
 
 
 def activity_of(levels: tuple[Level, ...], activity: Activity, cell: np.ndarray) -> Array:

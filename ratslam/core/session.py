@@ -25,11 +25,32 @@ from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
 from tactile.base.types import Observation
 
-Probe = Callable[[State, Any], Any]
-"""A pure function of the state after a step and of the number of the step (int32, from 0 in the map) to a
-NamedTuple of arrays, which is compiled with the kernel."""
 CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
+
+
+class Probe(NamedTuple):
+    """Pure functions of the state to an array or a tuple of arrays, which are compiled with the kernel.
+
+    Attributes:
+        each: is called after every step, for `Step.probed`. seldom: after the last of each `interval` steps,
+            counted from the first in the map, for `Step.seldom`; None: never.
+    """
+
+    each: Callable[[State], Any]
+    seldom: Callable[[State], Any] | None = None
+    interval: int = 1
+
+    def rows(self) -> int:
+        """The largest number of intervals that a chunk has part in."""
+        return (CHUNK - 2) // self.interval + 2
+
+    def spread(self, rows: PackedRecords | None, number: int, count: int) -> Iterator[Any]:
+        """The records of `seldom` for `count` steps from step `number` on, None where it was not called."""
+        records = [] if rows is None else list(rows.records(self.rows()))
+        for k in range(number + 1, number + count + 1):
+            due = rows is not None and k % self.interval == 0
+            yield records[k // self.interval - 1 - number // self.interval] if due else None
 
 
 class Step(NamedTuple):
@@ -37,7 +58,8 @@ class Step(NamedTuple):
 
     Attributes:
         estimate, evidence: of the backend, host NumPy. pose: [3] in the map frame at that time, m, m, rad.
-        doubt: `Map.doubt` at that time. probed: record of the session's probe, host NumPy; None without one.
+        doubt: `Map.doubt` at that time. probed, seldom: records of the session's probe, host NumPy; None
+            without one.
     """
 
     estimate: Estimate
@@ -45,6 +67,7 @@ class Step(NamedTuple):
     pose: np.ndarray
     doubt: float
     probed: Any = None
+    seldom: Any = None
 
 
 class Session:
@@ -53,8 +76,8 @@ class Session:
     Args:
         seed: of the backend's random stream. reserve: rows of memory allocated at the start, so that a live
             session does not recompile while it runs. precision: dtype of the kernel's floating state.
-        probe: looks at the state after every step, for `Step.probed`; the results are the same with and
-            without it, and without it nothing else is computed.
+        probe: looks at the state after the steps, for `Step.probed` and `Step.seldom`; the results are the
+            same with and without it, and without it nothing else is computed.
 
     Raises:
         ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
@@ -75,8 +98,8 @@ class Session:
         self._layout: Layout | None = None
         # Compiled as one: each operation by itself would be compiled too.
         self._init = jax.jit(backend.init, static_argnums=1)
-        kernel = backend.kernel if probe is None else with_probe(backend.kernel, probe)
-        self._run_chunk = jax.jit(partial(run_chunk, kernel), donate_argnums=0)
+        run = run_chunk if probe is None else partial(run_probed_chunk, probe)
+        self._run_chunk = jax.jit(partial(run, backend.kernel), donate_argnums=0)
         self.restart(seed)
 
     def restart(self, seed: int = 0) -> None:
@@ -178,23 +201,26 @@ class Session:
         chunk = allocate(self._layout, CHUNK)
         for k, observation in enumerate(observations):
             chunk.write(k, observation)
-        results, steps = self._compute(chunk, count), []
+        steps = []
         for observation, (estimate, evidence, *probed) in zip(
-            observations, results.records(count), strict=True
+            observations, self._compute(chunk, count), strict=True
         ):
             estimate = self.map.update(observation, estimate, evidence)
             steps.append(Step(estimate, evidence, self.map.pose(estimate), self.map.doubt(), *probed))
         self.steps += count
         return steps
 
-    def _compute(self, chunk: PackedRecords, count: int) -> PackedRecords:
-        """Replaces the state by that after the first `count` observations; returns the results of each."""
+    def _compute(self, chunk: PackedRecords, count: int) -> Iterator[tuple[Any, ...]]:
+        """Replaces the state by that after the first `count` observations; returns the results of each and
+        the records of the probe."""
         if self._probe is None:
             self.state, results = self._run_chunk(self.state, chunk, np.int32(count))
-        else:
-            carry = self.state, np.int32(self.steps)
-            (self.state, _), results = self._run_chunk(carry, chunk, np.int32(count))
-        return results
+            return results.records(count)
+        self.state, results, rows = self._run_chunk(
+            self.state, chunk, np.int32(count), np.int32(self.steps % self._probe.interval)
+        )
+        seldom = self._probe.spread(rows, self.steps, count)
+        return ((*each, other) for each, other in zip(results.records(count), seldom, strict=True))
 
 
 def capacity_at(row: int, reserve: int = 0) -> int:
@@ -203,24 +229,51 @@ def capacity_at(row: int, reserve: int = 0) -> int:
     return 1 << (max(end, reserve, 256) - 1).bit_length()
 
 
-def with_probe(kernel: Any, probe: Probe) -> Any:
-    """The kernel with the number of the step beside its state and the probe's record after its results."""
-
-    def step(carry: Any, observation: Observation) -> Any:
-        state, number = carry
-        state, *results = kernel(state, observation)
-        # The barrier keeps the probe out of the kernel's loops, which would round otherwise with it.
-        return (state, number + 1), *results, probe(lax.optimization_barrier(state), number)
-
-    return step
-
-
 def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tuple[Any, PackedRecords]:
     """The kernel over the first `count` observations of a chunk.
 
     Returns:
         the state after them, and what the kernel returns beside it for each step; further rows are zero.
     """
+    body, results = _loop(kernel, state, chunk)
+    return lax.fori_loop(0, count, body, (state, results))
+
+
+def run_probed_chunk(
+    probe: Probe, kernel: Any, state: Any, chunk: PackedRecords, count: Any, begun: Any
+) -> tuple[Any, PackedRecords, PackedRecords | None]:
+    """`run_chunk` with the record of `probe.each` after the kernel's results, and the records of
+    `probe.seldom`, one for each interval that the chunk has part in: at its end, or at that of the chunk.
+
+    Args:
+        begun: steps of the first interval before this chunk.
+    """
+
+    def step(state: Any, observation: Observation) -> Any:
+        state, *results = kernel(state, observation)
+        # The barrier keeps the probe out of the kernel's loops, which would round otherwise with it.
+        return state, *results, probe.each(lax.optimization_barrier(state))
+
+    body, results = _loop(step, state, chunk)
+    seldom, interval = probe.seldom, probe.interval
+    if seldom is None:
+        return *lax.fori_loop(0, count, body, (state, results)), None
+
+    def advance(k: Any, carry: Any) -> Any:
+        steps, rows = carry
+        first = jnp.maximum(k * interval - begun, 0)
+        last = jnp.minimum((k + 1) * interval - begun, count)
+        steps = lax.fori_loop(first, last, body, steps)
+        return steps, rows.put(k, seldom(steps[0]))
+
+    rows = allocate(layout_of(jax.eval_shape(seldom, state)), probe.rows(), jnp.zeros)
+    intervals = (begun + count + interval - 1) // interval
+    (state, results), rows = lax.fori_loop(0, intervals, advance, ((state, results), rows))
+    return state, results, rows
+
+
+def _loop(kernel: Any, state: Any, chunk: PackedRecords) -> tuple[Any, PackedRecords]:
+    """The body of a loop over the observations of a chunk, and its empty results."""
     kernel = jax.jit(kernel, inline=True)  # traced once for both uses below
 
     def body(k: Any, carry: Any) -> Any:
@@ -229,4 +282,4 @@ def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tupl
         return state, results.put(k, tuple(output))
 
     _, *output = jax.eval_shape(kernel, state, jax.eval_shape(chunk.at, jnp.int32(0)))
-    return lax.fori_loop(0, count, body, (state, allocate(layout_of(tuple(output)), CHUNK, jnp.zeros)))
+    return body, allocate(layout_of(tuple(output)), CHUNK, jnp.zeros)

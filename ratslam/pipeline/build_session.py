@@ -24,7 +24,7 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
 
     A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
     configurations give equal capacities, and so equal bits. A configuration with `cells` gives steps with
-    `ProbedCells`.
+    the records of `probe_of`.
 
     Raises:
         InputError: see `ratslam.backends.registry.build` and `plan_recording`.

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.cell_probe import choose_cells, probe_cells
+from ratslam.attractor.cell_probe import activity_of, choose_cells, hold_cells
+from ratslam.attractor.levels import Level
 from ratslam.attractor.recording_config import CellSumsConfig
 from ratslam.backends.classic import ClassicBackend
 from ratslam.backends.recall import RecallBackend
@@ -63,10 +64,19 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
 
 
 def probe_of(backend: Backend, plan: RecordingPlan) -> Probe:
-    """The probe of a session of this method: its steps have `ProbedCells`."""
+    """The probe of a session of this method: its steps have the activity of the chosen cells [C], float32, and
+    where all cells are summed `HeldCells`."""
+    levels = levels_of(backend)
+    each = lambda state: activity_of(levels, state.cells.activity, plan.cell).astype(np.float32)  # noqa: E731
+    if plan.sums is None:
+        return Probe(each)
+    return Probe(each, lambda state: hold_cells(levels, state.cells.activity), plan.sums.interval)
+
+
+def levels_of(backend: Backend) -> tuple[Level, ...]:
+    """The window levels of a method with pose cells."""
     assert isinstance(backend, ClassicBackend | RecallBackend)
-    levels, interval = backend.window_levels, None if plan.sums is None else plan.sums.interval
-    return lambda state, number: probe_cells(levels, state.cells.activity, number, plan.cell, interval)
+    return backend.window_levels
 
 
 def _plan_sums(sums: CellSumsConfig, plan: RecordingPlan, source: Source) -> SumsPlan:

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.cells.recording import NAME, CellRecording, write_recording
-from ratslam.attractor.cell_probe import is_due
+from ratslam.attractor.cell_probe import active_cells
+from ratslam.attractor.levels import Level
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import CHUNK, Step
-from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
+from ratslam.pipeline.cell_plan import RecordingPlan, levels_of, plan_recording
 from ratslam.pipeline.cell_sums import CellSums
 from robot.sources.source import Sample, Source
 
@@ -42,22 +43,18 @@ class CellRecorder:
     Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
 
     Args:
-        directory: of the run, where `cells.rows` and `cells.npz` are written.
+        directory: of the run, where `cells.rows` and `cells.npz` are written. levels: of the network.
     """
 
-    def __init__(self, directory: Path, plan: RecordingPlan) -> None:
-        self._directory, self._plan = directory, plan
+    def __init__(self, directory: Path, plan: RecordingPlan, levels: tuple[Level, ...]) -> None:
+        self._directory, self._plan, self._levels = directory, plan, levels
         self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
         self._filled = 0
         self._sums: CellSums | None = None
         (directory / ROWS).touch(exist_ok=False)
 
-    def add(self, number: int, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
-        """Adds up to one chunk of steps.
-
-        Args:
-            number: of the first step in the map. samples: of the source, one a step.
-        """
+    def add(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        """Adds up to one chunk of steps, and the samples of the source that they belong to."""
         if self._filled + len(steps) > BUFFERED:
             self._write()
         rows = self._rows[self._filled : self._filled + len(steps)]
@@ -67,10 +64,10 @@ class CellRecorder:
         rows["packet"] = [step.evidence.packet for step in steps]
         rows["energy"] = [step.evidence.energy for step in steps]
         rows["place"] = [step.estimate.place for step in steps]
-        rows["activity"] = [step.probed.chosen for step in steps]
+        rows["activity"] = [step.probed for step in steps]
         self._filled += len(steps)
         if self._plan.sums is not None:
-            self._add_sums(number, samples, steps)
+            self._add_sums(samples, steps)
 
     def finish(self) -> None:
         """Writes cells.npz with all rows and the sums, and removes cells.rows.
@@ -88,13 +85,13 @@ class CellRecorder:
         write_recording(self._directory / NAME, recording)
         path.unlink()
 
-    def _add_sums(self, number: int, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+    def _add_sums(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
         assert self._plan.sums is not None
         if self._sums is None:
             self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.shape)), samples[0].time)
-        for k, (sample, step) in enumerate(zip(samples, steps, strict=True), number):
-            if is_due(k, self._plan.sums.interval):
-                self._sums.add(sample.time, sample.truth, step.probed.every)
+        for sample, step in zip(samples, steps, strict=True):
+            if step.seldom is not None:
+                self._sums.add(sample.time, sample.truth, *active_cells(self._levels, step.seldom))
 
     def _write(self) -> None:
         with (self._directory / ROWS).open("ab") as file:
@@ -111,4 +108,4 @@ def open_cell_recorder(
         InputError: see `plan_recording`.
     """
     plan = plan_recording(config, source, backend)
-    return None if plan is None else CellRecorder(directory, plan)
+    return None if plan is None else CellRecorder(directory, plan, levels_of(backend))

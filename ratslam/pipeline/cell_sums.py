@@ -23,22 +23,21 @@ class CellSums:
         self._place_seconds = np.zeros(self._height * self._width)
         self._heading_seconds = np.zeros(plan.heading_bins)
 
-    def add(self, time: float, truth: np.ndarray | None, activity: np.ndarray) -> None:
+    def add(self, time: float, truth: np.ndarray | None, cell: np.ndarray, activity: np.ndarray) -> None:
         """Adds a step, for the time since the one before.
 
         Args:
             time: s. truth: [3] true pose. Without one, or outside the bins, the step and its time are left
-                out. activity: [cells].
+                out. cell: [n] active cells, where one may come twice. activity: [n] of them.
         """
         elapsed, self._until = time - self._until, time
         at = None if truth is None else self._bins(truth)
         if at is None:
             return
         place, heading = at
-        active = np.flatnonzero(activity)  # a packet fills a few hundred cells of a network of any size
-        share = elapsed * activity[active].astype(np.float64)
-        self._place[place, active] += share
-        self._heading[heading, active] += share
+        share = elapsed * activity.astype(np.float64)
+        np.add.at(self._place[place], cell, share)
+        np.add.at(self._heading[heading], cell, share)
         self._place_seconds[place] += elapsed
         self._heading_seconds[heading] += elapsed
 

@@ -97,7 +97,7 @@ class Runner:
         steps = list(self.session.replay(observations))
         took = time.perf_counter() - began
         if self._cells is not None:
-            self._cells.add(self.session.steps - len(steps), samples, steps)
+            self._cells.add(samples, steps)
         self._views += [(o.view, o.alive) for o in observations] if self._source.whiskers else []
         self._images += [eight_bit(o.view) if bool(o.view_seen) else None for o in observations]
         odometry = []

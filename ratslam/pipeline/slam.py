@@ -109,7 +109,7 @@ class Slam:
             step = self.session.step(match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
             self.estimate = pose_estimate(step, entry.outcome(step.evidence))
-            self._cells = None if step.probed is None else step.probed.chosen
+            self._cells = step.probed
         return self.estimate
 
     def trajectory(self) -> np.ndarray:

@@ -104,7 +104,7 @@ def record(config: LoopConfig, walk: InMemorySource, samples: Sequence[Sample], 
             part = samples[first : first + CHUNK]
             steps = list(session.replay([sample.reading for sample in part]))
             if recorder is not None:
-                recorder.add(first, part, steps)
+                recorder.add(part, steps)
         ended = process_time()
         if recorder is not None:
             recorder.finish()

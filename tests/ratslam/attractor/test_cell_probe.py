@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor.cell_probe import activity_of, choose_cells, probe_cells
+from ratslam.attractor.cell_probe import active_cells, activity_of, choose_cells, hold_cells
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.attractor.levels import Activity, Block, to_full_torus, window_levels
 from tactile.base.errors import InputError
@@ -39,18 +39,15 @@ def test_chosen_and_all_cells_are_those_of_the_torus(levels, number):
     everything = np.arange(len(torus), dtype=np.int32)
     np.testing.assert_array_equal(activity_of(levels, activity, everything), torus)
     chosen = choose_cells(50, CONFIG, seed=number)
-    probed = jax.jit(lambda step: probe_cells(levels, activity, step, chosen, 5))
-    for step in range(6):
-        found = probed(jnp.int32(step))
-        np.testing.assert_array_equal(found.chosen, torus[chosen].astype(np.float32))
-        due = step == 4
-        np.testing.assert_array_equal(found.every, due * torus.astype(np.float32))
+    np.testing.assert_array_equal(activity_of(levels, activity, chosen), torus[chosen])
+    held = jax.device_get(jax.jit(lambda: hold_cells(levels, activity))())
+    cell, active = active_cells(levels, held)
+    assert (active > 0).all()
+    np.testing.assert_allclose(np.bincount(cell, active, len(torus)), torus, rtol=1e-6)
 
 
-def test_without_sums_and_without_chosen_cells_nothing_is_read():
-    probed = probe_cells(LEVELS, random_activity(LEVELS, 0), jnp.int32(0), np.zeros(0, np.int32), None)
-    assert probed.chosen.shape == (0,)
-    assert probed.every is None
+def test_no_chosen_cells_give_no_numbers():
+    assert activity_of(LEVELS, random_activity(LEVELS, 0), np.zeros(0, np.int32)).shape == (0,)
 
 
 def test_cells_are_drawn_by_the_seed_without_repetition():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ratslam
+from ratslam.attractor.cell_probe import active_cells
 from ratslam.attractor.levels import to_full_torus
 from ratslam.backends.registry import Sensors
 from ratslam.config.run_config import LoopConfig
@@ -63,15 +64,18 @@ def live(walk):
 
 
 def test_recorded_activity_is_that_of_the_state_after_each_step(live):
-    _, steps, torus = live
+    session, steps, torus = live
     assert {int(step.evidence.window_level) for step in steps} == {0, 1}, "both window levels"
     single = torus.astype(np.float32)
-    drawn = np.array([step.probed.chosen for step in steps])
+    drawn = np.array([step.probed for step in steps])
     assert drawn.shape == (STEPS, 40)
     assert (drawn > 0).any()
     for k, step in enumerate(steps):
-        assert set(step.probed.chosen.tolist()) <= set(single[k].tolist())
-        np.testing.assert_array_equal(step.probed.every, single[k] if k % 5 == 4 else 0.0)
+        assert set(step.probed.tolist()) <= set(single[k].tolist())
+        assert (step.seldom is not None) == (k % 5 == 4)
+        if step.seldom is not None:
+            cell, active = active_cells(session.backend.window_levels, step.seldom)
+            np.testing.assert_array_equal(np.bincount(cell, active, len(single[k])), single[k])
 
 
 def leaves(steps):
@@ -86,8 +90,8 @@ def test_replay_equals_live_and_recording_changes_no_bit(live, walk):
     again = list(session.replay(readings))
     assert session.compilations() == 1
     for one, other in zip(steps, again, strict=True):
-        np.testing.assert_array_equal(one.probed.chosen, other.probed.chosen)
-        np.testing.assert_array_equal(one.probed.every, other.probed.every)
+        np.testing.assert_array_equal(one.probed, other.probed)
+        jax.tree.map(np.testing.assert_array_equal, one.seldom, other.seldom)
     plain = session_of(walk, None)
     off = list(plain.replay(readings))
     assert off[0].probed is None
