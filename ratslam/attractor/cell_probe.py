@@ -83,9 +83,7 @@ def active_cells(levels: tuple[Level, ...], held: HeldCells) -> tuple[np.ndarray
     at = np.flatnonzero(held.cells[: math.prod(shape)])
     copy, *inside = np.unravel_index(at, shape)
     x, y, heading = window.ring_sizes(level.window).tolist()
-    own = [
-        (held.origin[copy, 2 - k] + inside[k]) % ring for k, ring in enumerate((heading, y, x))
-    ]
+    own = [(held.origin[copy, 2 - k] + inside[k]) % ring for k, ring in enumerate((heading, y, x))]
     return (own[0] * y + own[1]) * x + own[2], held.cells[at]
 
 

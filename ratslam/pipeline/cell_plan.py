@@ -64,8 +64,8 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
 
 
 def probe_of(backend: Backend, plan: RecordingPlan) -> Probe:
-    """The probe of a session of this method: its steps have the activity of the chosen cells [C], float32, and
-    where all cells are summed `HeldCells`."""
+    """The probe of a session of this method: its steps have the activity of the chosen cells [C], float32,
+    and where all cells are summed `HeldCells`."""
     levels = levels_of(backend)
     each = lambda state: activity_of(levels, state.cells.activity, plan.cell).astype(np.float32)  # noqa: E731
     if plan.sums is None:

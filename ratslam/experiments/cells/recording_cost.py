@@ -1,30 +1,31 @@
 """The recording table: what the recording of pose cells adds to a step, as a share of a step without it.
 
-The sessions take turns on one core, so that they share its state; only ratios carry over to other machines.
-Times are processor times. Compiling is not included; the file at the end is a column of its own.
+The sessions of all rows advance in turn, a chunk at a time, on one core, so that they share its state and
+that of other processes; only ratios carry over to other machines. The time of each chunk is the median of
+the rounds. Compiling is not included; the file at the end is a column of its own.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from time import process_time
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from evaluation.metrics.resources import peak_memory, reset_peak_memory
 from ratslam.config.run_config import LoopConfig
 from ratslam.core.packing import PackedRecords, allocate, layout_of
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, run_chunk
+from ratslam.experiments.cells.figure import CellFigure
+from ratslam.experiments.cells.timing import on_one_core, time_call
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_recorder import open_cell_recorder
+from ratslam.pipeline.cell_recorder import CellRecorder, open_cell_recorder
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses
 from robot.sources.source import Sample
@@ -40,87 +41,156 @@ RECORDINGS: Mapping[str, Mapping[str, Any] | None] = {
     "both": {"chosen": 64, "sums": {}},
 }
 """Sections `cells` of the rows."""
+GOALS: Mapping[str, str] = {
+    "64 chosen cells at every step": "10 %",
+    "sums of all cells at 10 Hz": "30 %, 400 MB",
+}
+"""Goals of the rows: largest share of a step added, and memory."""
+ROUNDS, STEPS = 5, 30_000
+"""Repeats, and steps of the walk: 600 s."""
 RATE = 50.0
 """Steps per second."""
 SPEED, TURNING = 0.2, 4.0
 """Of the walk: m/s, and standard deviation of the turning rate, rad/s."""
 Chunk = tuple[PackedRecords, int]
 """Packed observations and their number."""
-COLUMNS = ("recording", "step us", "added us", "of the kernel alone", "of a step", "file s", "memory MB")
+COLUMNS = (
+    "recording", "step us", "added us", "of a step", "of a step, wall", "of the kernel alone", "goal",
+    "file s", "memory MB",
+)  # fmt: skip
 
 
-class Recorded(NamedTuple):
-    """Processor time of a step, us, and of the file at the end, s; most memory above the start, MB."""
+class RecordingCost(NamedTuple):
+    """Times of R rounds of N chunks, each of processor and wall time, s.
 
-    step: float
-    file: float
-    memory: float
+    Attributes:
+        steps: of the walk. kernel: [R, N, 2] of the compiled kernel alone. sessions: [R, rows, N, 2]. file:
+            [R, rows, 2] at the end. memory: [rows] most of a session alone above that at its start, MB.
+        circumstances: a sentence about machine and load.
+    """
+
+    steps: int
+    kernel: np.ndarray
+    sessions: np.ndarray
+    file: np.ndarray
+    memory: np.ndarray
+    circumstances: str
 
 
-def recording_cost(rounds: int = 5, steps: int = 30_000) -> Iterator[str]:
-    """The lines of the table, after all rounds; pins the process to one core meanwhile.
+class _Recording:
+    """One row: a session and, in a round, its recorder."""
+
+    def __init__(self, cells: Mapping[str, Any] | None, walk: InMemorySource) -> None:
+        self._config, self._walk = LoopConfig.model_validate({**SETTINGS, "cells": cells}), walk
+        self.session = build_session(self._config, walk)
+        self._recorder: CellRecorder | None = None
+
+    def begin(self, folder: Path) -> None:
+        """Starts from an empty map."""
+        self.session.restart()
+        self._recorder = open_cell_recorder(self._config, self._walk, self.session.backend, folder)
+
+    def advance(self, samples: Sequence[Sample]) -> None:
+        """Maps and records a chunk."""
+        steps = list(self.session.replay([sample.reading for sample in samples]))
+        if self._recorder is not None:
+            self._recorder.add(samples, steps)
+
+    def finish(self) -> None:
+        """Writes the file."""
+        if self._recorder is not None:
+            self._recorder.finish()
+
+
+def measure_cost(rounds: int = ROUNDS, steps: int = STEPS) -> RecordingCost:
+    """Measures the cost of all recordings.
 
     Args:
-        rounds: repeats, of which the median is taken. steps: of the walk, at 50 Hz.
+        rounds: repeats. steps: of the walk, at 50 Hz.
     """
     prepare_precision("float64")
     walk = box_walk(0, steps)
     samples = list(walk)
-    configs = {
-        name: LoopConfig.model_validate({**SETTINGS, "cells": cells}) for name, cells in RECORDINGS.items()
-    }
-    sessions = {name: build_session(config, walk) for name, config in configs.items()}
+    parts = [samples[first : first + CHUNK] for first in range(0, steps, CHUNK)]
     chunks = pack([sample.reading for sample in samples])
-    kernel = jax.jit(partial(run_chunk, sessions["nothing"].backend.kernel), donate_argnums=0)
-    with one_core():
-        for session in sessions.values():
-            session.warm(samples[0].reading)
-        time_kernel(kernel, sessions["nothing"], chunks[:1])
-        alone, taken = [], []
-        for _ in range(rounds):
-            alone.append(time_kernel(kernel, sessions["nothing"], chunks) / steps)
-            taken.append(
-                [record(configs[name], walk, samples, session) for name, session in sessions.items()]
-            )
-    step_alone = 1e6 * float(np.median(alone))
-    medians = np.median(np.array(taken), axis=0)
-    plain = medians[0, 0]
-    yield f"{steps} steps, {rounds} rounds; a step: kernel alone {step_alone:.0f} us, all {plain:.0f} us\n"
+    rows = [_Recording(cells, walk) for cells in RECORDINGS.values()]
+    plain = rows[0].session
+    kernel = jax.jit(partial(run_chunk, plain.backend.kernel), donate_argnums=0)
+    with on_one_core() as found:
+        time_kernel(kernel, plain, chunks[:1])
+        memory = [_most_memory(row, parts) for row in rows]
+        taken = [(time_kernel(kernel, plain, chunks), *_time_rows(rows, parts)) for _ in range(rounds)]
+    return RecordingCost(
+        steps, *map(np.array, zip(*taken, strict=True)), np.array(memory), circumstances=found.text
+    )  # fmt: skip
+
+
+def cost_table(result: RecordingCost) -> Iterator[str]:
+    """The lines of the table."""
+    kernel, _ = _each_step(result.kernel, result.steps)
+    steps = _each_step(result.sessions, result.steps)
+    file = np.median(result.file, axis=0)[:, 0]
+    yield (
+        f"21 x 21 x 36 cells, {result.steps} steps at {RATE:.0f} Hz, {len(result.kernel)} rounds. Without "
+        f"recording a step takes {steps[0, 0]:.0f} us of processor time, {steps[0, 1]:.0f} us on the wall; "
+        f"its kernel alone {kernel:.0f} us. Processor times unless stated. {result.circumstances}\n"
+    )
     yield markdown_header(COLUMNS)
-    for name, (step, file, memory) in zip(sessions, medians.tolist(), strict=True):
-        more = step - plain
-        shares = (f"{100 * more / part:.1f} %" for part in (step_alone, plain))
-        yield markdown_row([name, f"{step:.0f}", f"{more:.1f}", *shares, f"{file:.2f}", f"{memory:.0f}"])
+    for k, name in enumerate(RECORDINGS):
+        more = steps[k] - steps[0]
+        shares = (*(more / steps[0]), more[0] / kernel)
+        yield markdown_row(
+            [
+                name, f"{steps[k, 0]:.0f}", f"{more[0]:.1f}", *(f"{100 * share:.1f} %" for share in shares),
+                GOALS.get(name, ""), f"{file[k]:.2f}", f"{result.memory[k]:.0f}",
+            ]
+        )  # fmt: skip
 
 
-def record(config: LoopConfig, walk: InMemorySource, samples: Sequence[Sample], session: Session) -> Recorded:
-    """The cost of one session from the start."""
-    session.restart()
+def _each_step(times: np.ndarray, steps: int) -> np.ndarray:
+    """[..., 2] us a step of times [R, ..., N, 2] of chunks."""
+    return 1e6 * np.median(times, axis=0).sum(axis=-2) / steps
+
+
+def _most_memory(row: _Recording, parts: Sequence[Sequence[Sample]]) -> float:
     with tempfile.TemporaryDirectory() as folder:
-        before = begin_peak()
-        recorder = open_cell_recorder(config, walk, session.backend, Path(folder))
-        began = process_time()
-        for first in range(0, len(samples), CHUNK):
-            part = samples[first : first + CHUNK]
-            steps = list(session.replay([sample.reading for sample in part]))
-            if recorder is not None:
-                recorder.add(part, steps)
-        ended = process_time()
-        if recorder is not None:
-            recorder.finish()
-        closed = process_time()
-        return Recorded(1e6 * (ended - began) / len(samples), closed - ended, peak() - before)
+        row.session.restart()
+        row.session.warm(parts[0][0].reading)
+        reset_peak_memory()
+        before = peak_memory()
+        row.begin(Path(folder))
+        for part in parts:
+            row.advance(part)
+        row.finish()
+        return (peak_memory() - before) * 2**20 / 1e6
 
 
-def time_kernel(kernel: Callable[..., Any], session: Session, chunks: Sequence[Chunk]) -> float:
-    """Processor time of the compiled kernel alone over packed observations, from the start, s."""
+def _time_rows(rows: Sequence[_Recording], parts: Sequence[Sequence[Sample]]) -> tuple[Any, Any]:
+    """Times of all rows [rows, N, 2] and of their files [rows, 2]; each chunk begins with another row."""
+    times = np.empty((len(rows), len(parts), 2))
+    with tempfile.TemporaryDirectory() as folder:
+        for k, row in enumerate(rows):
+            (Path(folder) / str(k)).mkdir()
+            row.begin(Path(folder) / str(k))
+        for n, part in enumerate(parts):
+            for k in np.roll(np.arange(len(rows)), n).tolist():
+                times[k, n] = time_call(partial(rows[k].advance, part))
+        return times, np.array([time_call(row.finish) for row in rows])
+
+
+def time_kernel(kernel: Callable[..., Any], session: Session, chunks: Sequence[Chunk]) -> np.ndarray:
+    """Times [N, 2] of the compiled kernel alone over packed observations, from the start."""
     session.restart()
-    state = session.state
-    began = process_time()
-    for chunk, count in chunks:
+    state, times = session.state, []
+
+    def advance(chunk: PackedRecords, count: int) -> None:
+        nonlocal state
         state, _ = kernel(state, chunk, np.int32(count))
-    jax.block_until_ready(state)
-    return process_time() - began
+        jax.block_until_ready(state)
+
+    for chunk, count in chunks:
+        times.append(time_call(partial(advance, chunk, count)))
+    return np.array(times)
 
 
 def pack(observations: Sequence[Observation]) -> list[Chunk]:
@@ -164,28 +234,9 @@ def box_walk(seed: int, steps: int) -> InMemorySource:
     )
 
 
-@contextmanager
-def one_core() -> Iterator[None]:
-    """Pins the process to one of its cores."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(cores)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
-
-
-def begin_peak() -> float:
-    """Forgets the peak of resident memory so far; returns the resident memory, MB."""
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    return _status("VmRSS")
-
-
-def peak() -> float:
-    """Peak of resident memory since `begin_peak`, MB."""
-    return _status("VmHWM")
-
-
-def _status(name: str) -> float:
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:")) / 1000
+FIGURE = CellFigure(
+    "What recording costs",
+    lambda task: measure_cost(task.sessions or ROUNDS),
+    lambda result: list(cost_table(result)),
+    None,
+)
