@@ -86,12 +86,14 @@ class Calibration(NamedTuple):
     """How often shuffled cells exceed the 95th percentile of their own shuffles.
 
     Attributes:
-        cells: that have a score and a percentile. share: of them above the percentile.
+        cells: that have a score and a percentile. share: of them above the percentile. tied: share of them
+            at it, as happens to a score of few values; it is missing in `share`.
         low, high: binomial 95 % band of the share round 5 %. shuffled_mean: mean score of all shuffles.
     """
 
     cells: int
     share: float
+    tied: float
     low: float
     high: float
     shuffled_mean: float
@@ -141,6 +143,7 @@ def calibrate(
     return Calibration(
         cells=cells,
         share=float(result.above[valid].mean()) if cells else np.nan,
+        tied=float((result.score == result.percentile)[valid].mean()) if cells else np.nan,
         low=float(low) / max(cells, 1),
         high=float(high) / max(cells, 1),
         shuffled_mean=float(known.mean()) if known.size else np.nan,

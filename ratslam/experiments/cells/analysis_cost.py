@@ -50,7 +50,9 @@ def measure_analysis(
     """
     recording = record_rat("rat", 2 * cells, sums=True, seconds=seconds, seed=seed)
     chosen = with_active_cells(recording, cells)
-    shuffle = partial(shuffled_scores, chosen.activity, place_bins(chosen), PLACE_SCORES["grid score"], shuffles, seed)
+    shuffle = partial(
+        shuffled_scores, chosen.activity, place_bins(chosen), PLACE_SCORES["grid score"], shuffles, seed
+    )
     calls: dict[str, Callable[[], object]] = {
         MAPS: partial(map_and_tune, recording),
         ALL: partial(analyse_all_cells, recording),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from itertools import batched
 from pathlib import Path
 from typing import Literal
 
@@ -40,7 +39,9 @@ def record_rat(
         with tempfile.TemporaryDirectory() as folder:
             recorder = open_cell_recorder(config, source, session.backend, Path(folder))
             assert recorder is not None
-            for samples in batched(source, CHUNK):
+            every = list(source)
+            for first in range(0, len(every), CHUNK):
+                samples = every[first : first + CHUNK]
                 recorder.add(samples, list(session.replay([sample.reading for sample in samples])))
             recorder.finish()
             return read_recording(Path(folder) / NAME)
