@@ -24,8 +24,8 @@ COLUMNS = (
 
 
 class NetworkCost(NamedTuple):
-    """sets, steps: measured. taken: time by row. memory: most of the process meanwhile, MB. circumstances: machine
-    and load."""
+    """sets, steps: measured. taken: time by row. memory: most of the process meanwhile, MB. circumstances:
+    machine and load."""
 
     sets: int
     steps: int
@@ -63,8 +63,8 @@ def network_table(result: NetworkCost) -> Iterator[str]:
     count = result.sets * result.steps
     how = "measured" if result.sets >= SETS else f"extrapolated from {result.sets} sets"
     yield (
-        f"The study `--preset cells` in float32 on the path of a rat, {result.steps} steps at 50 Hz; views at 10 "
-        f"Hz. Compiling is not included. Minutes are {how}. {result.circumstances}\n"
+        f"The study `--preset cells` in float32 on the path of a rat, {result.steps} steps at 50 Hz; views "
+        f"at 10 Hz. Compiling is not included. Minutes are {how}. {result.circumstances}\n"
     )
     yield markdown_header(COLUMNS)
     for name, taken in result.taken.items():

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from evaluation.cells.recording import NAME, CellRecording, read_recording
+from evaluation.cells.recording import CellRecording
 from ratslam.config.run_config import load_config
-from ratslam.core.session import CHUNK
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_recorder import open_cell_recorder
+from ratslam.experiments.cells.rat_sessions import RatSessions
 from ratslam.pipeline.source import open_observations
 
 Way = Literal["rat", "random walk"]
@@ -35,16 +31,7 @@ def record_rat(
     own += ["cells.sums={}"] if sums else []
     own += ["rat_simulation.walk={}"] if way == "random walk" else []
     with open_observations(load_config("rat_box", own)) as (config, source):
-        session = build_session(config, source)
-        with tempfile.TemporaryDirectory() as folder:
-            recorder = open_cell_recorder(config, source, session.backend, Path(folder))
-            assert recorder is not None
-            every = list(source)
-            for first in range(0, len(every), CHUNK):
-                samples = every[first : first + CHUNK]
-                recorder.add(samples, list(session.replay([sample.reading for sample in samples])))
-            recorder.finish()
-            return read_recording(Path(folder) / NAME)
+        return RatSessions(config).run(source).recording
 
 
 def with_active_cells(recording: CellRecording, cells: int) -> CellRecording:

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from ratslam.attractor.cell_probe import is_due
+from ratslam.attractor.cell_probe import active_cells
+from ratslam.attractor.levels import Level
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.session import Session, Step
 from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
+from ratslam.pipeline.cell_plan import RecordingPlan, levels_of, plan_recording
 from ratslam.pipeline.cell_sums import CellSums
 from ratslam.pipeline.source import read_observations
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
@@ -62,7 +63,7 @@ class RatSessions:
         observations = [observation for _, observation in rows]
         steps = list(self._session.replay(observations))
         motion = np.array([each.odometry[:4] for each in observations], float)
-        return RatRun(_recording(plan, samples, steps), motion)
+        return RatRun(_recording(plan, levels_of(self._session.backend), samples, steps), motion)
 
 
 def rat_config(*assignments: str) -> RunConfig:
@@ -86,7 +87,9 @@ def slice_start(seed: int, seconds: float, whole: float = 600.0) -> float:
     return float(stream(seed, "cells.slice").uniform(0.0, whole - seconds - 1.0))
 
 
-def _recording(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellRecording:
+def _recording(
+    plan: RecordingPlan, levels: tuple[Level, ...], samples: list[Sample], steps: list[Step]
+) -> CellRecording:
     unknown = np.full(3, np.nan)
     return CellRecording(
         shape=plan.shape,
@@ -97,15 +100,17 @@ def _recording(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) ->
         energy=np.array([step.evidence.energy for step in steps]),
         place=np.array([step.estimate.place for step in steps], np.int32),
         cell=plan.cell,
-        activity=np.array([step.probed.chosen for step in steps], np.float32),
-        sums=None if plan.sums is None else _sums(plan, samples, steps).result(),
+        activity=np.array([step.probed for step in steps], np.float32),
+        sums=None if plan.sums is None else _sums(plan, levels, samples, steps).result(),
     )
 
 
-def _sums(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellSums:
+def _sums(
+    plan: RecordingPlan, levels: tuple[Level, ...], samples: list[Sample], steps: list[Step]
+) -> CellSums:
     assert plan.sums is not None
     sums = CellSums(plan.sums, int(np.prod(plan.shape)), samples[0].time)
-    for number, (sample, step) in enumerate(zip(samples, steps, strict=True)):
-        if is_due(number, plan.sums.interval):
-            sums.add(sample.time, sample.truth, step.probed.every)
+    for sample, step in zip(samples, steps, strict=True):
+        if step.seldom is not None:
+            sums.add(sample.time, sample.truth, *active_cells(levels, step.seldom))
     return sums

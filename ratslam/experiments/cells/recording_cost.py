@@ -120,9 +120,8 @@ def measure_cost(rounds: int = ROUNDS, steps: int = STEPS) -> RecordingCost:
         time_kernel(kernel, plain, chunks[:1])
         memory = [_most_memory(row, parts) for row in rows]
         taken = [(time_kernel(kernel, plain, chunks), *_time_rows(rows, parts)) for _ in range(rounds)]
-    return RecordingCost(
-        steps, *map(np.array, zip(*taken, strict=True)), np.array(memory), circumstances=found.text
-    )  # fmt: skip
+    alone, sessions, file = (np.array(times) for times in zip(*taken, strict=True))
+    return RecordingCost(steps, alone, sessions, file, np.array(memory), circumstances=found.text)
 
 
 def cost_table(result: RecordingCost) -> Iterator[str]:

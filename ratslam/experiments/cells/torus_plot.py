@@ -72,7 +72,8 @@ def draw_torus(
 
 
 def _draw_row(
-    figure: style.Figure, bottom: float, tall: float, images: np.ndarray, extent: tuple[float, float, float, float],
+    figure: style.Figure, bottom: float, tall: float, images: np.ndarray,
+    extent: tuple[float, float, float, float],
     colours: tuple[str, float, float],
 ) -> None:  # fmt: skip
     name, low, high = colours

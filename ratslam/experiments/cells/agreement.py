@@ -1,0 +1,186 @@
+"""The table of agreement: scores of recorded cells beside those of opexebo and pynapple."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+
+from evaluation.cells.autocorrelogram import autocorrelogram
+from evaluation.cells.border import score_borders
+from evaluation.cells.coherence import correlate, neighbour_means
+from evaluation.cells.fields import find_fields
+from evaluation.cells.grid_score import lattice_scores
+from evaluation.cells.head_direction import mean_vector_length, peak_rate
+from evaluation.cells.information import (
+    information,
+    information_above_mean,
+    information_rate,
+    selectivity,
+    sparsity,
+)
+from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps, tuning_curves
+from evaluation.cells.recording import BinnedSums
+from ratslam.experiments.cells.figure import CellFigure, CellTask
+from ratslam.experiments.cells.rat_recording import SECONDS, record_rat, with_active_cells
+from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from tactile.base.errors import InputError
+
+CELLS, GOAL = 100, 1e-6
+"""Cells compared, and the largest difference wanted."""
+COLUMNS = ("score", "package", "cells", "largest difference", "goal", "largest score")
+HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
+
+
+class Agreement(NamedTuple):
+    """One score. mine, theirs: [n] of the same cells, NaN where undefined."""
+
+    score: str
+    package: str
+    mine: np.ndarray
+    theirs: np.ndarray
+
+    def difference(self) -> float:
+        """The largest difference; infinite where only one is undefined."""
+        both = np.isnan(self.mine) & np.isnan(self.theirs)
+        apart = np.abs(self.mine - self.theirs)[~both]
+        return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
+
+
+def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
+    """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps.
+
+    Args:
+        task: its sessions are the number of cells. seconds: of the session.
+
+    Raises:
+        InputError: a package is not installed.
+    """
+    opexebo, pynapple = _require("opexebo"), _require("pynapple")
+    count = task.sessions or CELLS
+    recording = with_active_cells(record_rat("rat", 2 * count, seconds=seconds, seed=task.first), count)
+    rates = recording.activity * float(np.prod(recording.shape))
+    edges = arena_edges(recording.truth, 20)
+    sums = bin_activity(recording.time, recording.truth, rates, *edges, 36)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # the packages warn of their own divisions and of deprecated calls
+        return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
+
+
+def agreement_table(result: list[Agreement]) -> Iterator[str]:
+    """The lines of the table."""
+    yield (
+        "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
+        "each package gets the same maps, in its own convention (`evaluation/cells/README.md`).\n"
+    )
+    yield markdown_header(COLUMNS)
+    for one in result:
+        found = f"{one.difference():.1e}"
+        largest = f"{np.nanmax(np.abs(one.mine)):.3g}" if np.isfinite(one.mine).any() else "-"
+        yield markdown_row([one.score, one.package, len(one.mine), found, f"{GOAL:.0e}", largest])
+
+
+def _require(name: str) -> ModuleType:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return import_module(name)
+        except ImportError as error:
+            raise InputError(name, "is not installed", "the package to compare with", HOW[name]) from error
+
+
+def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+    analysis, maps, curves = opexebo.analysis, rate_maps(sums, 1.5), tuning_curves(sums)
+    masked = [np.ma.masked_invalid(each) for each in maps]
+    seconds = np.ma.masked_where(np.isnan(maps[0]), sums.seconds)
+    stats = [analysis.rate_map_stats(each, seconds) for each in masked]
+    named: dict[str, tuple[Callable[..., np.ndarray], str]] = {
+        "information above the mean": (information_above_mean, "spatial_information_content"),
+        "sparsity": (sparsity, "sparsity"),
+        "selectivity": (selectivity, "selectivity"),
+        "peak of the map": (peak_rate, "peak_rate"),
+    }
+    for name, (score, key) in named.items():
+        yield Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
+    plain = np.nan_to_num(rate_maps(sums, 0.0))
+    framed = neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
+    theirs = _numbers(analysis.rate_map_coherence(np.ma.masked_invalid(each)) for each in plain)
+    yield Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
+    tuned = [analysis.tuning_curve_stats(np.ma.masked_invalid(each)) for each in curves]
+    vector = mean_vector_length(curves, sums.heading_seconds)
+    yield Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
+    fields = find_fields(maps)
+    theirs = _numbers(_border(analysis, maps, fields, cell) for cell in range(len(maps)))
+    yield Agreement("border score", "opexebo", score_borders(maps, fields), theirs)
+    images = autocorrelogram(np.nan_to_num(maps))
+    theirs = _numbers(
+        np.abs(analysis.autocorrelation(each) - image).max()
+        for each, image in zip(np.nan_to_num(maps), images, strict=True)
+    )
+    yield Agreement("autocorrelogram", "opexebo", np.zeros(len(maps)), theirs)
+    with _scalar_radius():
+        theirs = _numbers(analysis.grid_score(image)[0] for image in images)
+    yield Agreement("grid score", "opexebo", lattice_scores(images), theirs)
+
+
+def _border(analysis: Any, maps: np.ndarray, fields: Any, cell: int) -> float:
+    own = np.flatnonzero(fields.cell == cell) + 1
+    if not len(own):
+        return np.nan
+    hidden = np.isnan(maps[cell])
+    each = [
+        {"field_map": np.ma.masked_where(hidden, (fields.label[cell] == number).astype(float))}
+        for number in own
+    ]
+    labels = np.searchsorted(own, fields.label[cell], side="right")
+    map = np.ma.masked_invalid(maps[cell])
+    return float(analysis.border_score(map, labels, each, "square", search_width=maps.shape[1])[0])
+
+
+def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+    xarray = import_module("xarray")
+    for what, rates, seconds in (
+        ("place", rate_maps(sums, 1.5), sums.seconds),
+        ("heading", tuning_curves(sums), sums.heading_seconds),
+    ):
+        known = np.where(np.isfinite(rates[0]), seconds, 0.0)
+        names = [f"axis{k}" for k in range(seconds.ndim)]
+        table = xarray.DataArray(
+            rates, dims=["unit", *names], coords={"unit": np.arange(len(rates))}, attrs={"occupancy": known}
+        )
+        theirs = pynapple.compute_mutual_information(table)
+        for name, score, column in (
+            ("information", information, "bits/spike"),
+            ("information rate", information_rate, "bits/sec"),
+        ):
+            found = np.asarray(theirs[column], float)
+            yield Agreement(f"{name}, {what}", "pynapple", score(rates, seconds), found)
+
+
+def _numbers(values: Iterator[Any]) -> np.ndarray:
+    return np.array([float(value) for value in values])
+
+
+@contextmanager
+def _scalar_radius() -> Iterator[None]:
+    """opexebo's radius of the central field is an array of one number, which NumPy no longer takes as int."""
+    module = sys.modules["opexebo.analysis.grid_score"]
+    radius = vars(module)["_findCentreRadius"]
+
+    def scalar(image: np.ndarray, **options: Any) -> Any:
+        return np.asarray(radius(image, **options)).item()
+
+    with patch.object(module, "_findCentreRadius", scalar):
+        yield
+
+
+FIGURE = CellFigure(
+    "Agreement with other packages", compare_scores, lambda result: list(agreement_table(result)), None
+)
