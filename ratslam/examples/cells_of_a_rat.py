@@ -14,6 +14,7 @@ from evaluation.plots.cell_plot import draw_cells, map_sums
 from ratslam.attractor.config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.rats.driven_network import DrivenNetwork
+from robot.simulation.rat.rat_odometry import RatOdometryConfig
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
 
 CELLS = 529 + np.arange(6) * 2690  # of 36 x 21 x 21 over heading, y, x
@@ -21,9 +22,8 @@ CELLS = 529 + np.arange(6) * 2690  # of 36 x 21 x 21 over heading, y, x
 
 def main() -> None:
     prepare_precision("float64")
-    errors = {"speed_white": 0.1, "heading_white": 0.05}  # of its path integration: sqrt(s), rad/sqrt(s)
-    settings = {"path": {"file": "sargolini"}, "seconds": 300, "rate_hz": 10, "odometry": errors}
-    rat = RatSimulation(RatSimulationConfig.model_validate(settings))
+    errors = RatOdometryConfig(speed_white=0.1, heading_white=0.05)  # sqrt(s), rad/sqrt(s)
+    rat = RatSimulation(RatSimulationConfig(seconds=300, rate_hz=10, odometry=errors))
     network = DrivenNetwork(PoseCellConfig(cell_size=0.05), rat.truth[0])  # a torus of 21 x 0.05 = 1.05 m
     activity = []
     for step, (motion, pose) in enumerate(zip(rat.odometry, rat.truth, strict=True)):

@@ -200,7 +200,7 @@ def draw_result(result: BoxResult, png: Path) -> None:
     fitted = np.roll(other, found.shift[::-1], axis=(1, 2))
     turned = f"B turned\n{np.degrees(found.angle):.0f}°, shifted"
     rows = {"A": first, "A again": again, "B": plain, turned: fitted}
-    still, best = (pair.correlations["A with B"].mean() for pair in pairs)
+    still, best = (_mean(pair.correlations["A with B"]) for pair in pairs)
     line = (
         f"Box {result.side:g} m, torus {result.torus:g} m (ratio {result.side / result.torus:.2f}). Mean "
         f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
@@ -214,8 +214,13 @@ def _correlations(fits: list[MapFit], field: str) -> np.ndarray:
     return joined[np.isfinite(joined)]
 
 
+def _mean(values: np.ndarray) -> float:
+    """The mean; NaN of none, as in a short session."""
+    return float(values.mean()) if len(values) else np.nan
+
+
 def _range(fits: list[MapFit], field: str) -> str:
-    means = [_correlations([each], field).mean() for each in fits]
+    means = [_mean(_correlations([each], field)) for each in fits]
     return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
 

@@ -59,7 +59,7 @@ def draw_boxes(
     bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
     figure.text(
         MARGIN / style.WIDTH, (top - 0.08) / height,
-        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited",
+        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited or outside the box",
         fontsize=7.5, color=style.LABEL_GREY,
     )  # fmt: skip
     axes = _draw_histograms(figure, pairs)
@@ -74,7 +74,8 @@ def _draw_histograms(figure: style.Figure, pairs: Sequence[MapPairs]) -> style.A
         axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
         for (name, values), colour in zip(pair.correlations.items(), COLOURS, strict=True):
             axes.hist(values, BINS.tolist(), color=colour, alpha=0.65, label=name)
-            axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
+            if len(values):
+                axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
         axes.grid(color=style.LINE_GREY, lw=0.7)
         axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
         axes.set_title(f"{pair.title}", fontsize=9.5, color=style.INK, loc="left")
