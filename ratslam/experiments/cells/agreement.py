@@ -117,14 +117,10 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement
     vector = mean_vector_length(curves, sums.heading_seconds)
     yield Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
     fields = find_fields(maps)
-    theirs = _numbers(_border(analysis, maps, fields, cell) for cell in range(len(maps)))
-    yield Agreement("border score", "opexebo", score_borders(maps, fields), theirs)
+    own = np.unique(fields.cell)
+    theirs = _numbers(_border(analysis, maps, fields, cell) for cell in own)
+    yield Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
     images = autocorrelogram(np.nan_to_num(maps))
-    theirs = _numbers(
-        np.abs(analysis.autocorrelation(each) - image).max()
-        for each, image in zip(np.nan_to_num(maps), images, strict=True)
-    )
-    yield Agreement("autocorrelogram", "opexebo", np.zeros(len(maps)), theirs)
     with _scalar_radius():
         theirs = _numbers(analysis.grid_score(image)[0] for image in images)
     yield Agreement("grid score", "opexebo", lattice_scores(images), theirs)
@@ -132,8 +128,6 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement
 
 def _border(analysis: Any, maps: np.ndarray, fields: Any, cell: int) -> float:
     own = np.flatnonzero(fields.cell == cell) + 1
-    if not len(own):
-        return np.nan
     hidden = np.isnan(maps[cell])
     each = [
         {"field_map": np.ma.masked_where(hidden, (fields.label[cell] == number).astype(float))}

@@ -46,10 +46,10 @@ def draw_boxes(
         )  # fmt: skip
         for column, rates in enumerate(maps[:SHOWN]):
             axes = style.add_axes(figure, MARGIN + column * step, bottom, SIDE, SIDE)
+            peak = max(np.nanmax(rates), np.finfo(float).tiny)
             image = axes.imshow(
-                rates / np.nanmax(rates), origin="lower", extent=(0, torus, 0, torus), cmap="viridis",
-                vmin=0, vmax=1,
-            )  # fmt: skip
+                rates / peak, origin="lower", extent=(0, torus, 0, torus), cmap="viridis", vmin=0, vmax=1
+            )
             axes.set(xticks=[], yticks=[])
             if k == 0:
                 axes.set_title(f"column {column + 1}", fontsize=7.5, color=style.LABEL_GREY, pad=3)

@@ -88,11 +88,11 @@ def _compare(task: _Task) -> ShuffledRow:
 def shuffle_table(result: ShuffleCheck) -> Iterator[str]:
     """The lines of the table."""
     yield (
-        f"Pose cells of sessions of {result.seconds:.0f} s in a box of 1 m, {result.shuffles} shuffles of "
-        "each cell, with rates in units of activity. Goal: the share of shuffled cells above the 95th percentile "
-        "of their own shuffles lies in the binomial 95 % band round 5 %. Of 26 shares, one or two are "
-        "outside by chance. Tied: share at the percentile, which is not above it. Control: of the first "
-        f"{result.true_cells} cells as recorded, the share above theirs.\n"
+        f"Pose cells of sessions of {result.seconds:.0f} s in a box of 1 m, {result.shuffles} shuffles "
+        "of each cell, with rates in units of activity. Goal: the share of shuffled cells above the "
+        "95th percentile of their own shuffles lies in the binomial 95 % band round 5 %. Of 26 "
+        "shares, one or two are outside by chance. Tied: share at the percentile, which is not above "
+        f"it. Control: of the first {result.true_cells} cells as recorded, the share above theirs.\n"
     )
     yield markdown_header(COLUMNS)
     for row in result.rows:
