@@ -80,8 +80,8 @@ def map_and_tune(recording: CellRecording) -> None:
 def analysis_table(result: AnalysisCost) -> Iterator[str]:
     """The lines of the table."""
     yield (
-        f"A session of a rat of 600 s at 20 Hz in 20 x 20 place and 36 heading bins; {result.shuffles} "
-        f"shuffles of each cell. {result.circumstances}\n"
+        f"A session of a rat of {SECONDS:.0f} s at 20 Hz in 20 x 20 place and 36 heading bins; "
+        f"{result.shuffles} shuffles of each cell. {result.circumstances}\n"
     )
     yield markdown_header(COLUMNS)
     for name, taken in result.times.items():

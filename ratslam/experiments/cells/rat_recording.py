@@ -13,8 +13,8 @@ from ratslam.pipeline.source import open_observations
 
 Way = Literal["rat", "random walk"]
 """The path of a real rat (Sargolini et al. 2006, packaged), or a random walk."""
-SECONDS = 600.0
-"""Duration of the packaged path, s."""
+SECONDS = 599.0
+"""Duration of a session, s: nearly that of the packaged path."""
 
 
 def record_rat(

@@ -49,7 +49,8 @@ def draw_torus(
     for box in boxes:
         tall = WIDE * box.size[1] / box.size[0]
         shown = box.maps[:SHOWN]
-        rates = shown / np.nanmax(shown, axis=(1, 2), keepdims=True)
+        peak = np.nanmax(shown, axis=(1, 2), keepdims=True)
+        rates = shown / np.maximum(peak, np.finfo(float).tiny)  # a silent column stays 0
         lags = autocorrelogram(shown)
         x, y = box.size
         reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
