@@ -162,7 +162,12 @@ def table_boxes(result: BoxResult) -> list[str]:
         rows = (
             ("A with A, no shift", "high", again, "still"),
             ("A with B, no shift", "about 0: the sheet has turned and shifted", moved, "still"),
-            ("A with B, best common turn and shift", "as A with A: cells do not remap", moved, "best"),
+            (
+                "A with B, best common turn and shift",
+                "far above the control: the sheet turns and shifts as a whole",
+                moved,
+                "best",
+            ),
         )
         for figure, goal, fits, field in rows:
             control = f"{_range(fits, f'shuffled_{field}')} shuffled identities"

@@ -35,7 +35,7 @@ class NetworkCost(NamedTuple):
 
 
 def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> NetworkCost:
-    """Measures a study in float32 on the path of a rat, without its compiling.
+    """Measures a study in float32 on a random walk in a box of 1 m, without its compiling.
 
     Args:
         sets: parameter sets. steps: at 50 Hz.
@@ -45,7 +45,7 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> NetworkCost:
         for name in GOALS:
             own = [f"views={str(name == 'with views').lower()}", f"steps={steps}", f"sets={sets}"]
             own += [f"rat_simulation.seconds={steps / 50}", "rat_simulation.rate_hz=50", "seed=0"]
-            own += ["rat_simulation.views.every=5", "session.reserve=2048"]
+            own += ["rat_simulation.walk={}", "rat_simulation.views.every=5", "session.reserve=2048"]
             tasks = tasks_of(cell_study(Path("rat_box"), own))
             first = tasks[0]._replace(parameters=tasks[0].parameters[:1], size=1)
             score_task(first)
@@ -63,7 +63,7 @@ def network_table(result: NetworkCost) -> Iterator[str]:
     count = result.sets * result.steps
     how = "measured" if result.sets >= SETS else f"extrapolated from {result.sets} sets"
     yield (
-        f"The study `--preset cells` in float32 on the path of a rat, {result.steps} steps at 50 Hz; views "
+        f"The study `--preset cells` in float32 on a random walk, {result.steps} steps at 50 Hz; views "
         f"at 10 Hz. Compiling is not included. Minutes are {how}. {result.circumstances}\n"
     )
     yield markdown_header(COLUMNS)
