@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
-from scipy.stats import gamma, norm
 
 from robot.simulation.rat.rat_path import RatPath
 from tactile.base.config import Settings
@@ -47,6 +46,8 @@ def walk_randomly(
     Speeds have a gamma distribution of the given mean and standard deviation: the quantiles of a normal
     Ornstein-Uhlenbeck process. A longer walk of the same seed begins with the shorter one.
     """
+    from scipy.stats import gamma, norm  # slow to import
+
     count = int(np.ceil(seconds * rate_hz)) + 1
     draws = stream(seed, "rat walk").standard_normal((count, 2))
     z = ornstein_uhlenbeck(draws, np.array([config.speed_time, config.turn_time]), 1 / rate_hz)

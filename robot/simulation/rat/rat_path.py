@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
 
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors
 from robot.sources.input_files import raise_errors
@@ -88,6 +86,9 @@ def sample_path(path: RatPath, config: MotionConfig, rate_hz: float, smoothing: 
     Args:
         smoothing: standard deviation of the Gaussian, s.
     """
+    from scipy.interpolate import PchipInterpolator  # slow to import
+    from scipy.ndimage import gaussian_filter1d
+
     start = path.time[0]
     count = int(np.floor((path.time[-1] - start) * rate_hz + 1e-6)) + 1
     time = np.minimum(start + np.arange(count) / rate_hz, path.time[-1])
@@ -120,4 +121,6 @@ def heading_of_motion(position: np.ndarray, config: MotionConfig, rate_hz: float
     heading = np.unwrap(np.arctan2(velocity[last, 1], velocity[last, 0]))
     if not config.heading_smoothing:
         return heading
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
     return gaussian_filter1d(heading, config.heading_smoothing * rate_hz, mode="nearest")
