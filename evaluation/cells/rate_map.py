@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
-from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_array
 
 from evaluation.cells.recording import BinnedSums
@@ -308,4 +307,6 @@ def _visited(seconds: np.ndarray, least_seconds: float) -> np.ndarray:
 def _kernel(bins: int, sigma: float, mode: str) -> np.ndarray:
     """[bins, bins] matrix that smooths a column of `bins` values."""
     eye = np.eye(bins)
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
     return gaussian_filter1d(eye, sigma, axis=0, mode=mode, truncate=4.0) if sigma > 0 else eye
