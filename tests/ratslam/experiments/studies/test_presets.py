@@ -37,7 +37,7 @@ def preset(name, path=SQUARE, *overrides, **options):
     return preset_study(name, path, overrides, **options)
 
 
-@pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers", "growth"}))
+@pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers", "growth", "cells"}))
 def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
     study, _ = preset(name, SQUARE, "session.seed=7", "recall.modes=3")
     assert study.name == f"square-{name}"
