@@ -13,7 +13,10 @@ import pytest
 
 # One thread, so that two runs add in the same order; read when numpy and jax are first imported.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+
+from ratslam.core.xla_flags import add_xla_flags
+
+os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
 
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # Workers share compiled kernels and runs; every run of the suite starts without any.

@@ -65,7 +65,7 @@ def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepR
         exact &= _packets_apart(level, block)
         cells, dead = _attract(level, block, inputs.pose)
         block, complete = _integrate(level, block._replace(activity=cells), inputs, s)
-        return s + 1, block, exact & complete, died | dead
+        return s + 1, block, exact & complete & (~dead | level.window.is_torus), died | dead
 
     carry = (jnp.int32(0), block, exact, jnp.bool_(False))
     _, block, exact, died = lax.while_loop(goes_on, substep, carry)
@@ -98,8 +98,8 @@ def _inject(level: Level, block: Block, inputs: StepInput) -> tuple[Block, Array
 
 
 def _attract(level: Level, block: Block, seed: Array) -> tuple[Array, Array]:
-    """Activity after excitation and inhibition, normalised over all windows; where it dies out, unit activity
-    at `seed` [3] instead. And bool: it died out.
+    """Activity after excitation and inhibition, normalised over all windows; and bool: it died out. Where it
+    does, the torus gets unit activity at `seed` [3] instead; smaller windows leave that to the torus.
 
     Uniform activity always dies out: both kernels sum to 1, so excitation and inhibition cancel.
     """
@@ -113,7 +113,8 @@ def _attract(level: Level, block: Block, seed: Array) -> tuple[Array, Array]:
         )
         return jnp.zeros_like(cells).at[0].set(one)
 
-    return lax.cond(dead, reseed, lambda: cells / jnp.where(dead, 1.0, total)), dead
+    normalised = cells / jnp.where(dead, 1.0, total)
+    return lax.cond(dead, reseed, lambda: normalised) if level.window.is_torus else normalised, dead
 
 
 def _integrate(level: Level, block: Block, inputs: StepInput, s: Array) -> tuple[Block, Array]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import shtab
 
 from ratslam.config.packaged import packaged_configs
+from ratslam.core.xla_flags import add_xla_flags
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -149,15 +150,13 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:
-    """Sets the variables that JAX reads at import: one thread (more double the latency) and a disk cache.
+    """Sets the variables that JAX reads at import: `ratslam.core.xla_flags`, and a disk cache.
 
     Args:
         keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
             sessions in one process.
     """
-    flag = "--xla_cpu_multi_thread_eigen=false"
-    if flag not in os.environ.get("XLA_FLAGS", ""):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
+    os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from importlib import import_module
 from types import ModuleType
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import numpy as np
 
@@ -29,14 +24,19 @@ from evaluation.cells.information import (
 from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps, tuning_curves
 from evaluation.cells.recording import BinnedSums
 from ratslam.experiments.cells.figure import CellFigure, CellTask
+from ratslam.experiments.cells.other_packages import (
+    border_score,
+    grid_score,
+    load_package,
+    mutual_information,
+    quiet,
+)
 from ratslam.experiments.cells.rat_recording import SECONDS, record_rat, with_active_cells
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from tactile.base.errors import InputError
 
 CELLS, GOAL = 100, 1e-6
 """Cells compared, and the largest difference wanted."""
 COLUMNS = ("score", "package", "cells", "largest difference", "goal", "largest score")
-HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
 
 
 class Agreement(NamedTuple):
@@ -63,14 +63,13 @@ def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
     Raises:
         InputError: a package is not installed.
     """
-    opexebo, pynapple = _require("opexebo"), _require("pynapple")
+    opexebo, pynapple = load_package("opexebo"), load_package("pynapple")
     count = task.sessions or CELLS
     recording = with_active_cells(record_rat("rat", 2 * count, seconds=seconds, seed=task.first), count)
     rates = recording.activity * float(np.prod(recording.shape))
     edges = arena_edges(recording.truth, 20)
     sums = bin_activity(recording.time, recording.truth, rates, *edges, 36)
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # the packages warn of their own divisions and of deprecated calls
+    with quiet():
         return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
 
 
@@ -85,15 +84,6 @@ def agreement_table(result: list[Agreement]) -> Iterator[str]:
         found = f"{one.difference():.1e}"
         largest = f"{np.nanmax(np.abs(one.mine)):.3g}" if np.isfinite(one.mine).any() else "-"
         yield markdown_row([one.score, one.package, len(one.mine), found, f"{GOAL:.0e}", largest])
-
-
-def _require(name: str) -> ModuleType:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return import_module(name)
-        except ImportError as error:
-            raise InputError(name, "is not installed", "the package to compare with", HOW[name]) from error
 
 
 def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
@@ -118,61 +108,26 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement
     yield Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
     fields = find_fields(maps)
     own = np.unique(fields.cell)
-    theirs = _numbers(_border(analysis, maps, fields, cell) for cell in own)
+    theirs = _numbers(border_score(opexebo, maps, fields, cell) for cell in own)
     yield Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
     images = autocorrelogram(np.nan_to_num(maps))
-    with _scalar_radius():
-        theirs = _numbers(analysis.grid_score(image)[0] for image in images)
+    theirs = _numbers(grid_score(opexebo, image) for image in images)
     yield Agreement("grid score", "opexebo", lattice_scores(images), theirs)
 
 
-def _border(analysis: Any, maps: np.ndarray, fields: Any, cell: int) -> float:
-    own = np.flatnonzero(fields.cell == cell) + 1
-    hidden = np.isnan(maps[cell])
-    each = [
-        {"field_map": np.ma.masked_where(hidden, (fields.label[cell] == number).astype(float))}
-        for number in own
-    ]
-    labels = np.searchsorted(own, fields.label[cell], side="right")
-    map = np.ma.masked_invalid(maps[cell])
-    return float(analysis.border_score(map, labels, each, "square", search_width=maps.shape[1])[0])
-
-
 def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
-    xarray = import_module("xarray")
     for what, rates, seconds in (
         ("place", rate_maps(sums, 1.5), sums.seconds),
         ("heading", tuning_curves(sums), sums.heading_seconds),
     ):
-        known = np.where(np.isfinite(rates[0]), seconds, 0.0)
-        names = [f"axis{k}" for k in range(seconds.ndim)]
-        table = xarray.DataArray(
-            rates, dims=["unit", *names], coords={"unit": np.arange(len(rates))}, attrs={"occupancy": known}
-        )
-        theirs = pynapple.compute_mutual_information(table)
-        for name, score, column in (
-            ("information", information, "bits/spike"),
-            ("information rate", information_rate, "bits/sec"),
-        ):
-            found = np.asarray(theirs[column], float)
-            yield Agreement(f"{name}, {what}", "pynapple", score(rates, seconds), found)
+        theirs = mutual_information(pynapple, rates, seconds)
+        mine = information(rates, seconds), information_rate(rates, seconds)
+        yield Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
+        yield Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
 
 
 def _numbers(values: Iterator[Any]) -> np.ndarray:
     return np.array([float(value) for value in values])
-
-
-@contextmanager
-def _scalar_radius() -> Iterator[None]:
-    """opexebo's radius of the central field is an array of one number, which NumPy no longer takes as int."""
-    module = sys.modules["opexebo.analysis.grid_score"]
-    radius = vars(module)["_findCentreRadius"]
-
-    def scalar(image: np.ndarray, **options: Any) -> Any:
-        return np.asarray(radius(image, **options)).item()
-
-    with patch.object(module, "_findCentreRadius", scalar):
-        yield
 
 
 FIGURE = CellFigure(

@@ -32,11 +32,13 @@ GOALS = {MAPS: "5", ALL: "", GRID: "60"}
 
 
 class AnalysisCost(NamedTuple):
-    """times: by row. cells: of each row. shuffles: of a cell. circumstances: machine and load."""
+    """times: by row. cells: of each row. shuffles: of a cell. seconds: of the session.
+    circumstances: machine and load."""
 
     times: dict[str, Taken]
     cells: dict[str, int]
     shuffles: int
+    seconds: float
     circumstances: str
 
 
@@ -63,7 +65,7 @@ def measure_analysis(
         times[GRID] = time_call(shuffle)
     every = int(np.prod(recording.shape))
     counts = {MAPS: every, ALL: every, GRID: len(chosen.cell)}
-    return AnalysisCost(times, counts, shuffles, found.text)
+    return AnalysisCost(times, counts, shuffles, seconds, found.text)
 
 
 def map_and_tune(recording: CellRecording) -> None:
@@ -80,7 +82,7 @@ def map_and_tune(recording: CellRecording) -> None:
 def analysis_table(result: AnalysisCost) -> Iterator[str]:
     """The lines of the table."""
     yield (
-        f"A session of a rat of {SECONDS:.0f} s at 20 Hz in 20 x 20 place and 36 heading bins; "
+        f"A session of a rat of {result.seconds:.0f} s at 20 Hz in 20 x 20 place and 36 heading bins; "
         f"{result.shuffles} shuffles of each cell. {result.circumstances}\n"
     )
     yield markdown_header(COLUMNS)

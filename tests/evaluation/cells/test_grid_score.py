@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,30 +13,17 @@ from hypothesis import strategies as st
 from evaluation.cells.autocorrelogram import autocorrelogram
 from evaluation.cells.centre_field import centre_radii
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
+from ratslam.experiments.cells.other_packages import grid_score, quiet
 from tactile.base.errors import InputError
 from tests.evaluation.cells.lattice_maps import lattice_map, mixed_maps
 
 
 @pytest.fixture
-def opexebo_score(monkeypatch: pytest.MonkeyPatch) -> Callable[[np.ndarray], float]:
-    """The grid score of opexebo of an autocorrelogram.
-
-    Its radius is an array of one number, which newer NumPy refuses to convert to int.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+def opexebo_score() -> Callable[[np.ndarray], float]:
+    """The grid score of opexebo of an autocorrelogram."""
+    with quiet():
         opexebo = pytest.importorskip("opexebo")
-    module = sys.modules["opexebo.analysis.grid_score"]
-    radius = vars(module)["_findCentreRadius"]
-    scalar = lambda image, **options: np.asarray(radius(image, **options)).item()  # noqa: E731
-    monkeypatch.setattr(module, "_findCentreRadius", scalar)
-
-    def score(image: np.ndarray) -> float:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return opexebo.analysis.grid_score(image)[0]
-
-    return score
+    return partial(grid_score, opexebo)
 
 
 def compare(score: Callable[[np.ndarray], float], count: int, shape: tuple[int, int], seed: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
@@ -24,6 +23,7 @@ from evaluation.cells.information import (
 )
 from evaluation.cells.rate_map import bin_activity, rate_maps, smooth_plane, smooth_rates, tuning_curves
 from evaluation.cells.recording import BinnedSums
+from ratslam.experiments.cells.other_packages import border_score, mutual_information, quiet
 from tactile.base.random_streams import stream
 from tests.evaluation.cells.box_walk import EDGES, mixed_cells, random_walk
 
@@ -33,15 +33,12 @@ RATE = 8.0
 
 
 def _import(name: str) -> ModuleType:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with quiet():
         return pytest.importorskip(name)
 
 
 def _quietly(function: Callable[..., Any], *args: Any, **keys: Any) -> Any:
-    """The packages warn of their own divisions and of deprecated calls."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
+    with quiet():
         return function(*args, **keys)
 
 
@@ -155,21 +152,7 @@ def test_border_score_is_that_of_opexebo(opexebo: ModuleType, sums: BinnedSums, 
     rates[8, 3:6, 0] = np.nan  # the border cell, with gaps beside its wall
     fields = find_fields(rates, share)
     for cell, score in enumerate(score_borders(rates, fields)):
-        own = np.flatnonzero(fields.cell == cell) + 1
-        hidden = np.isnan(rates[cell])
-        each = [
-            {"field_map": np.ma.masked_where(hidden, (fields.label[cell] == number).astype(float))}
-            for number in own
-        ]
-        labels = np.searchsorted(own, fields.label[cell], side="right")
-        other, _ = _quietly(
-            opexebo.analysis.border_score,
-            np.ma.masked_invalid(rates[cell]),
-            labels,
-            each,
-            "square",
-            search_width=20,
-        )
+        other = border_score(opexebo, rates, fields, cell)
         assert_allclose(score, other, atol=1e-6)
 
 
@@ -190,14 +173,9 @@ def test_separate_fields_are_those_of_opexebo(opexebo: ModuleType, spots: list[t
 
 
 def test_information_is_that_of_pynapple(sums: BinnedSums) -> None:
-    nap, xr = _import("pynapple"), _import("xarray")
+    pynapple = _import("pynapple")
     curves, maps = tuning_curves(sums), rate_maps(sums, 1.5)
     for rates, seconds in ((maps, sums.seconds), (curves, sums.heading_seconds)):
-        known = np.where(np.isfinite(rates[0]), seconds, 0.0)
-        names = [f"axis{k}" for k in range(seconds.ndim)]
-        table = xr.DataArray(
-            rates, dims=["unit", *names], coords={"unit": np.arange(10)}, attrs={"occupancy": known}
-        )
-        found = _quietly(nap.compute_mutual_information, table)
+        found = mutual_information(pynapple, rates, seconds)
         assert_allclose(information(rates, seconds), found["bits/spike"], atol=1e-6)
         assert_allclose(information_rate(rates, seconds), found["bits/sec"], atol=1e-6)
