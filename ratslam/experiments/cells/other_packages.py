@@ -61,7 +61,7 @@ def border_score(opexebo: ModuleType, maps: np.ndarray, fields: Fields, cell: in
 
 
 def mutual_information(pynapple: ModuleType, rates: np.ndarray, seconds: np.ndarray) -> dict[str, np.ndarray]:
-    """pynapple's information of rates [C, ...] with occupancy [...] s: [C] columns `bits/spike`, `bits/sec`."""
+    """pynapple's information of rates [C, ...] with occupancy [...] s: columns `bits/spike`, `bits/sec`."""
     known = np.where(np.isfinite(rates[0]), seconds, 0.0)
     names = [f"axis{k}" for k in range(seconds.ndim)]
     coordinates = {"unit": np.arange(len(rates))}
