@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from ratslam.cli.common import (
@@ -74,8 +75,9 @@ def add_commands(commands: Commands) -> None:
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
-    add_maps(names)
-    add_cells(names)
+    add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", "start", 32000)
+    title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
+    add_rows(names, "cells", _cells, title, "drift", 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -84,25 +86,26 @@ def add_commands(commands: Commands) -> None:
     train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
 
 
-def add_maps(names: Commands) -> None:
-    """Registers the rows of saved maps."""
-    maps = names.add(
-        "maps", _maps, "maps found again, continued, merged and changed",
-        "reproduce maps --rows start --sessions 1 -o runs/maps",
+def add_rows(
+    names: Commands, name: str, command: Callable[..., int], title: str, row: str, first: int
+) -> None:
+    """Registers a set of tables and figures, of which each is a row.
+
+    Args:
+        title: line of the help. row: for the example. first: default seed of the first session.
+    """
+    parser = names.add(name, command, title, f"reproduce {name} --rows {row} --sessions 1 -o runs/{name}")
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+    parser.add_argument(
+        "--sessions", type=positive_integer, metavar="N",
+        help="sessions or repeats per row (default: of the row)",
     )  # fmt: skip
-    maps.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
-    maps.add_argument(
-        "--sessions",
-        type=positive_integer,
-        metavar="N",
-        help="sessions per row (default: of the row, 2 to 20)",
-    )
-    add_count(maps, "--first", 32000, "seed of the first maze; each session has the next one")
-    maps.add_argument(
-        "-o", "--output", type=Path, default=Path("runs") / "maps", metavar="DIR",
-        help="folder for maps.md, a picture per row, and the maps, which are used again (default runs/maps)",
+    add_count(parser, "--first", first, "seed of the first session; each has the next one")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
+        help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
-    add_workers(maps, 1)
+    add_workers(parser, 1)
 
 
 def add_figure(names: Commands, name: str, title: str) -> None:
@@ -118,27 +121,6 @@ def add_figure(names: Commands, name: str, title: str) -> None:
     add_set(parser)
     add_workers(parser)
     parser.set_defaults(name=name)
-
-
-def add_cells(names: Commands) -> None:
-    """Registers the figures of pose cells."""
-    cells = names.add(
-        "cells", _cells, "pose cells: drift, anchoring, cues, maps, scores, with controls",
-        "reproduce cells --rows drift --sessions 1 -o runs/cells",
-    )  # fmt: skip
-    cells.add_argument("--rows", nargs="+", metavar="ROW", help="only these figures")
-    cells.add_argument(
-        "--sessions",
-        type=positive_integer,
-        metavar="N",
-        help="sessions or repeats per row (default: of the row)",
-    )
-    add_count(cells, "--first", 40000, "seed of the first session; each has the next one")
-    cells.add_argument(
-        "-o", "--output", type=Path, default=Path("runs") / "cells", metavar="DIR",
-        help="folder for cells.md and a picture per figure (default runs/cells)",
-    )  # fmt: skip
-    add_workers(cells, 1)
 
 
 def _figure(arguments: argparse.Namespace) -> int:

@@ -98,5 +98,5 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.raw:
         arguments.set.append("simulation.raw=true")
     count, interrupted = simulate(read_config(arguments), arguments.output)
-    print(f"{arguments.output}: {count} whisks")
+    print(f"{arguments.output}: {count} steps")
     return INTERRUPTED if interrupted else 0

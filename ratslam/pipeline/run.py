@@ -74,7 +74,7 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
         config: with absolute paths. path: the new file.
 
     Returns:
-        the number of whisks written, and whether Ctrl-C ended it early.
+        the number of steps written, and whether Ctrl-C ended it early.
 
     Raises:
         InputError: the configuration has no simulation, it cannot be simulated, or the file exists.

@@ -168,7 +168,7 @@ def test_an_interrupted_session_is_a_complete_file(tmp_path):
     source = Recording(path)
     assert not source.truncated
     assert 16 < source.length < 30_000
-    assert f"{source.length} whisks" in out
+    assert f"{source.length} steps" in out
     assert source.info.simulation.seed == 0
 
 

@@ -41,14 +41,11 @@ def test_a_packet_in_light_throughout_is_anchored(result: AnchoringResult) -> No
     assert all((times >= 0).all() for times in result.again.values())
 
 
-def test_shuffled_views_do_not_anchor(result: AnchoringResult) -> None:
+def test_shuffled_views_mislead(result: AnchoringResult) -> None:
+    """On the path of the rat; on the walk no view is recalled within these 8 s."""
     rows = slice(round(SHORT.test * RATE), round(SHORT.back * RATE))
-    light, dark, shuffled = (
-        np.sum([result.error[path, test][:, rows].mean(axis=(0, 1)) for path in PATHS], axis=0)
-        for test in TESTS
-    )
-    assert (shuffled > light).all(), (light, dark, shuffled)
-    assert (shuffled > 0.8 * dark).all(), (light, dark, shuffled)
+    light, _, shuffled = (result.error["sargolini", test][:, rows].mean(axis=(0, 1)) for test in TESTS)
+    assert (shuffled > 1.5 * light).all(), (light, shuffled)
 
 
 def test_table_and_picture(result: AnchoringResult, tmp_path: Path) -> None:
