@@ -33,6 +33,7 @@ def draw_scores(
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+    size = float(np.clip(40 / np.sqrt(len(score)), 4, 10))
     rows = -(-len(parameters) // _COLUMNS)
     height = style.TOP + rows * (_PANEL + _GAP_UP)
     figure = style.new_figure(height, title, line)
@@ -42,7 +43,7 @@ def draw_scores(
         left = style.LEFT + column * (width + _GAP_ACROSS)
         bottom = height - style.TOP - _PANEL - row * (_PANEL + _GAP_UP)
         axes = style.add_axes(figure, left, bottom, width, _PANEL)
-        axes.plot(values, score, ".", color=BLUE, ms=4, mew=0, alpha=0.6)
+        axes.plot(values, score, ".", color=BLUE, ms=size, mew=0, alpha=0.6)
         axes.grid(color=style.LINE_GREY, lw=0.7)
         if score.min() > 0:
             axes.set_yscale("log")

@@ -78,7 +78,7 @@ def save_cells(report: CellReport, folder: Path) -> list[Path]:
 def _figures(report: CellReport) -> dict:
     study, scores = report.study, report.scores
     columns, line = _columns(report), _describe(study)
-    parameters = {f"{name} {UNITS[name]}".strip(): columns[name] for name in PARAMETERS}
+    parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
     rows = [MapRow(name, scores.maps[k]) for name, k in _chosen(report).items()]
     course = study.course
     return {
@@ -87,7 +87,11 @@ def _figures(report: CellReport) -> dict:
             f"Decoding error: {study.name}", line, parameters, scores.decoding, "decoding error (m)"
         ),
         "maps.png": draw_rate_maps(
-            f"Rate maps by drift: {study.name}", line, rows, course.x_edges, course.y_edges
+            f"Rate maps by drift: {study.name}",
+            f"Least, median and most drift of {len(scores.drift)} sets; above each map its largest activity",
+            rows,
+            course.x_edges,
+            course.y_edges,
         ),
     }
 

@@ -1,4 +1,7 @@
-"""The course of a cell study: odometry and true poses of a session, and the templates that it sees."""
+"""The course of a cell study: the true path of a session, and the templates that it sees.
+
+Networks get the motions between the true poses, so that all errors of the odometry are those of the study.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from ratslam.attractor.config import PoseCellConfig, rings, units
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
+from robot.sources.odometry import from_poses
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -44,11 +48,11 @@ class StudyCourse(NamedTuple):
 
 
 class _Session(NamedTuple):
-    """truth: [T, 3] m, m, rad. motion: [T, 4] m, m, rad, s. template: [T] int32, -1 before the first view.
+    """truth: [T, 3] m, m, rad. seconds: [T] of each step. template: [T] int32, -1 before the first view.
     relative: [T] heading minus that of the template, rad. energy: [T] injected."""
 
     truth: np.ndarray
-    motion: np.ndarray
+    seconds: np.ndarray
     template: np.ndarray
     relative: np.ndarray
     energy: np.ndarray
@@ -68,7 +72,7 @@ def read_course(
             times. seed: of the unit noise, the same for every network.
 
     Raises:
-        InputError: a pose or a motion is unknown or not finite, a step exceeds half the torus, the robot
+        InputError: a pose or a duration is unknown or not finite, a step exceeds half the torus, the robot
             stays in one place, no views are there, or a cell is none of the network.
     """
     config = config.model_copy(update={"backend": "classic"})
@@ -77,14 +81,13 @@ def read_course(
         name = source.name
     network = config.pose_cells
     _check(name, network, session, views)
-    motion, expected = session.motion.copy(), expected_poses(network, session.truth)
-    motion[0, :3] = 0.0  # the course begins at its first pose
-    unit = stream(seed, "cells.noise").standard_normal((len(motion), 2))
-    unit[:, 1] *= np.sqrt(motion[:, 3])
+    expected = expected_poses(network, session.truth)
+    unit = stream(seed, "cells.noise").standard_normal((len(expected), 2))
+    unit[:, 1] *= np.sqrt(session.seconds)
     template = np.maximum(session.template, 0)
     newest = np.maximum.accumulate(np.r_[-1, session.template])
     course = CellCourse(
-        motion[:, :3], unit, template, session.template > newest[:-1],
+        _motions(session), unit, template, session.template > newest[:-1],
         session.relative / units(network, np.dtype(float))[2], session.energy,
     )  # fmt: skip
     bin, x_edges, y_edges = place_bins(session.truth, bins)
@@ -92,7 +95,7 @@ def read_course(
     most = network.cells_heading * network.cells_xy**2
     if cells.max() >= most:
         raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, motion[:, 3], x_edges, y_edges, cells)
+    return StudyCourse(name, network, course, expected, bin, session.seconds, x_edges, y_edges, cells)
 
 
 def expected_poses(config: PoseCellConfig, truth: np.ndarray) -> np.ndarray:
@@ -126,7 +129,7 @@ def cells_on_the_way(config: PoseCellConfig, expected: np.ndarray) -> np.ndarray
 def _drive(source: Source, steps: int) -> _Session:
     """The session without its views."""
     rows = [
-        (sample.truth, observation.odometry[:4])
+        (sample.truth, observation.odometry[3])
         for sample, observation in islice(read_observations(source), steps)
     ]
     nothing = np.zeros(len(rows))
@@ -139,7 +142,7 @@ def _watch(config: RunConfig, source: Source, steps: int) -> _Session:
 
     def observations() -> Iterator[Observation]:
         for sample, observation in islice(read_observations(source), steps):
-            rows.append((sample.truth, observation.odometry[:4]))
+            rows.append((sample.truth, observation.odometry[3]))
             yield observation
 
     seen = [step.evidence for step in build_session(config, source).replay(observations())]
@@ -156,20 +159,26 @@ def _poses(name: str, rows: list) -> tuple[np.ndarray, np.ndarray]:
     truth = np.array([unknown if pose is None else pose for pose, _ in rows], float)
     if np.isnan(truth).all():
         raise InputError(name, "no true poses", "a source whose true poses are known", "a simulation")
-    return truth, np.array([odometry for _, odometry in rows], float)
+    return truth, np.array([seconds for _, seconds in rows], float)
+
+
+def _motions(session: _Session) -> np.ndarray:
+    """[T, 3] body-frame motions between the true poses."""
+    return from_poses(np.cumsum(session.seconds), session.truth)[:, :3]
 
 
 def _check(name: str, config: PoseCellConfig, session: _Session, views: bool) -> None:
-    for what, values in (("true pose", session.truth), ("odometry", session.motion)):
+    for what, values in (("true pose", session.truth), ("duration", session.seconds[:, None])):
         wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(wrong):
             raise InputError(f"{name}, step {wrong[0]}", f"its {what} is unknown or not finite", "numbers")
-    if session.motion[:, 3].min() < 0 or session.motion[:, 3].sum() <= 0:
+    if session.seconds.min() < 0 or session.seconds.sum() <= 0:
         raise InputError(name, "steps without duration", "durations in s from 0 on")
     if not np.ptp(session.truth[:, :2], axis=0).any():
         raise InputError(name, "the robot stays in one place", "a path through an arena")
-    reach = np.hypot(*session.motion[1:, :2].T)
-    turn, half = np.abs(session.motion[1:, 2]), config.cells_xy * config.cell_size / 2
+    motion = _motions(session)[1:]
+    reach = np.hypot(*motion[:, :2].T)
+    turn, half = np.abs(motion[:, 2]), config.cells_xy * config.cell_size / 2
     fast = np.flatnonzero((reach >= half) | (turn >= np.pi))
     if len(fast):
         k = fast[0]
