@@ -14,10 +14,6 @@ import pytest
 # One thread, so that two runs add in the same order; read when numpy and jax are first imported.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
-from ratslam.core.xla_flags import add_xla_flags
-
-os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
-
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # Workers share compiled kernels and runs; every run of the suite starts without any.
     os.environ["RATSLAM_TEST_FOLDER"] = tempfile.mkdtemp(prefix="ratslam-tests-")
@@ -29,6 +25,8 @@ os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 import jax
 from hypothesis import HealthCheck, settings
 
+from ratslam.core.xla_flags import add_xla_flags
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -36,8 +34,11 @@ jax.config.update("jax_compilation_cache_dir", f"{os.environ['XDG_CACHE_HOME']}/
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
-FEWER_PASSES = "--xla_cpu_use_fusion_emitters=false"
-"""Compiles a session's kernel in about 60 % of the time; its steps take a third longer. Most tests compile
+FEWER_PASSES = (
+    "--xla_cpu_use_fusion_emitters=false"
+    " --xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true,xla_cpu_optimize_for_size=true"
+)
+"""Compiles a session's kernel in about 40 % of the time; its steps take a third longer. Most tests compile
 more than they compute. Soak and benchmarks compile as users do, and so do the programs that tests start with
 the environment of `tests.helpers.environment`."""
 LONGEST = (
@@ -71,10 +72,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     # JAX reads the flags when it first computes; workers and programs that tests start inherit them.
-    flags = os.environ["XLA_FLAGS"]
+    flags = os.environ.get("XLA_FLAGS", "")
     as_users_do = config.getoption("--soak") or config.getoption("--benchmark-only")
     if not as_users_do and FEWER_PASSES not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {FEWER_PASSES}"
+        flags = f"{flags} {FEWER_PASSES}"
+    os.environ["XLA_FLAGS"] = add_xla_flags(flags)
 
 
 @pytest.hookimpl(trylast=True)  # after benchmarks/conftest.py has marked its tests
