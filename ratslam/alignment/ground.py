@@ -43,9 +43,13 @@ class Ground(NamedTuple):
         shift, row = np.nonzero(turned < reach_heading)
         return shift, close[row]
 
-    def is_near(self, pose: np.ndarray, reach: float) -> bool:
-        """Whether a robot at `pose` [3] is compared with a keyframe within `reach`, m."""
-        return bool(reach >= self.reach or len(self.near(pose, reach, self.reach_heading)[0]))
+    def is_near(self, pose: np.ndarray, share: float) -> bool:
+        """Whether a robot at `pose` [3] is compared with a keyframe within this share of both reaches."""
+        return len(self.near(pose, share * self.reach, share * self.reach_heading)[0]) > 0
+
+    def is_passed(self, pose: np.ndarray) -> bool:
+        """Whether a keyframe is within reach of `pose` [3], whatever its heading."""
+        return bool(np.hypot(*(self.poses[:, :2] - pose[:2]).T).min() < self.reach)
 
     def claims(self, shift: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """[n, 3] poses of a robot whose view is that of keyframes [n] at sector shifts [n]."""

@@ -36,9 +36,6 @@ LEAST = 10
 """Least number of keyframes of a piece that is joined."""
 HOPELESS = -60.0
 """Log-odds of the way to either end of a piece below which a placement is dropped."""
-NEAR = 0.5
-"""Largest distance from a keyframe at which a view counts, as a multiple of the ground's reach: beside the
-driven way views differ, although the placement is right."""
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
 COMMON = 1 / 3
@@ -197,7 +194,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     compared = views.compare(views.freeze(taken[onto], pose[onto]), taken[frames], motion)
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
     odds = views.odds(every, archive.poses(pose)[every], np.isin(every, taken[onto]))
-    session = Traverse(compared, motions, NEAR * ground.reach, HOPELESS)
+    session = Traverse(compared, motions, HOPELESS)
     paths = find_placements(ground, odds, session)
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
     if not paths or paths[0].odds.sum() < needed:

@@ -15,7 +15,7 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.piece_joining import spans_beginnings
 
-TIE_EVERY = 8
+TIE_EVERY = 4
 """Keyframes between two trials."""
 YOUNG = 400
 """Number of keyframes of a piece up to which its tie is tried."""
