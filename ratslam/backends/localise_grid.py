@@ -31,6 +31,11 @@ from tactile.whiskers.planar_whiskers import PlanarWhiskers
 DRIVEN = -2.0
 """Log-odds of a surface below which a cell is known to be free, and the robot may stand there."""
 
+ALIKE = 6.0
+"""Log-odds that are needed beyond those settings and places ask for: reports of one place are counted as
+independent, and another place that is alike within the errors of the map keeps fitting. Of 40 sessions of 900
+reports in other arenas, one reached 4 beyond."""
+
 
 class GridLocaliseOutcome(IntEnum):
     """Outcome of a step."""
@@ -51,9 +56,10 @@ class GridLocaliseEvidence(NamedTuple):
 
     Attributes:
         pose: [3] the most likely pose, m, m, rad. covariance: [3, 3] of it. share: of the supposed poses that
-            are the same. log_odds: of the session being there, against the most alike place elsewhere, since the
-            search began. fall: by how much they are below their best. effective_particles: their effective number. failed: bool, the
-            search failed and begins anew. outcome: a `GridLocaliseOutcome`.
+            are the same. log_odds: of the session being there, against the most alike place elsewhere, since
+            the search began. fall: by how much they are below their best. effective_particles: their
+            effective number. failed: bool, the search failed and begins anew. outcome: see
+            `GridLocaliseOutcome`.
     """
 
     pose: Array
@@ -82,14 +88,14 @@ class GridLocaliseBackend(Backend):
     """Localisation in a finished grid map.
 
     Args:
-        made: the finished map, which has contacts. log_odds: at which a pose is found. count: supposed poses.
+        made: the finished map, which has contacts. log_odds: see `LocaliseConfig`. count: supposed poses.
         here: whether the robot is supposed to stand where the map ended.
     """
 
     def __init__(
         self, made: GridMap, log_odds: float, count: int, dtype: Any = np.float64, here: bool = False
     ) -> None:
-        self._needed, self.dtype = log_odds, np.dtype(dtype)
+        self._hopeless, self.dtype = log_odds, np.dtype(dtype)
         path, config = made.trajectory(), made.config
         surfaces = draw_surfaces(config, made.feelers, made.side, path, made.contacts())
         free = surfaces.centres()[surfaces.evidence < DRIVEN]
@@ -99,6 +105,7 @@ class GridLocaliseBackend(Backend):
             )
         expected = expect(surfaces, made.feelers, config.body)
         self._search = Search(config, expected, counted_agreement(), free, count, self.dtype)
+        self._needed = log_odds + float(np.log(self._search.places())) + ALIKE
         self._saved = SavedGrid(made.grid(), path.copy())
         self._start = path[-1] if here else None
         self._whiskers = len(made.feelers.length)
@@ -126,7 +133,7 @@ class GridLocaliseBackend(Backend):
         known, vanished = self._search.weigh(known, features, state.touched)
         found = self._search.best_cluster(known)
         known, worth, drawn = self._search.resample(known, again)
-        failed = (found.log_odds < -self._needed / 2) | (found.fall > self._needed)
+        failed = (found.log_odds < -self._hopeless / 2) | (found.fall > self._hopeless)
         known = lax.cond(failed, lambda: self._search.begin(anew), lambda: known)
 
         outcome = jnp.where(drawn, GridLocaliseOutcome.RESAMPLED, GridLocaliseOutcome.OK)

@@ -57,6 +57,15 @@ class Expectation(NamedTuple):
     side: int
     cell: float
 
+    def places(self, free: int, apart: float, apart_heading: float) -> float:
+        """Number of poses that can be told apart.
+
+        Args:
+            free: number of cells in which the robot may stand. apart, apart_heading: distance, m, and
+                difference in heading, rad, within which two poses are the same.
+        """
+        return max(free * self.cell**2 / (np.pi * apart**2), 1.0) * np.pi / apart_heading
+
     def whisker_classes(self, pose: Array) -> Array:
         """[N, W] class of each whisker at poses [N, 3]."""
         dtype = pose.dtype

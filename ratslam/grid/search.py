@@ -21,8 +21,10 @@ from ratslam.grid.expectation import Expectation
 from ratslam.grid.particles import Particles
 from tactile.base.types import Array, Odometry
 
-CONTACTS, FREES, WALLS, BODIES = 0.6, 0.3, 0.6, 0.3
-"""Weights of new contacts, free whiskers, walls, and the robot's body: consecutive reports are alike."""
+REPEATED = 0.5
+"""Weight of what reports repeat, free whiskers and the robot's body, against new contacts and walls."""
+TEMPER = 0.6
+"""Weight of all of it where supposed poses compete: the map is wrong alike for many reports."""
 SPREAD, TURN = 0.12, 0.01
 """Displacement of a copy: standard deviation in cells of the map, and rad."""
 MIN_EFFECTIVE = 0.5
@@ -85,6 +87,10 @@ class Search:
         self._resampling = config.resampling.model_copy(update=jitter)
         self._extent = expected.side * expected.cell
 
+    def places(self) -> float:
+        """Number of poses that can be told apart."""
+        return self.expected.places(len(self._free), NEAR * self.config.cell, NEAR_HEADING)
+
     def begin(self, key: Array) -> Supposed:
         """Supposed poses at random poses in all free cells."""
         errors, places, turns = jax.random.split(key, 3)
@@ -128,12 +134,12 @@ class Search:
         body = jnp.asarray(agreement.body)[self.expected.body_classes(pose)]
 
         def total(whisker: np.ndarray, walls: np.ndarray) -> Array:
-            met = jnp.where(features.new, CONTACTS * jnp.asarray(whisker[CONTACT])[seen], 0)
-            passed = jnp.where(free, FREES * jnp.asarray(whisker[FREE])[seen], 0)
-            along = jnp.where(features.wall, WALLS * jnp.asarray(walls)[wall], 0)
-            return jnp.sum(met + passed, axis=1) + along
+            met = jnp.where(features.new, jnp.asarray(whisker[CONTACT])[seen], 0)
+            passed = jnp.where(free, REPEATED * jnp.asarray(whisker[FREE])[seen], 0)
+            return jnp.sum(met + passed, axis=1) + jnp.where(features.wall, jnp.asarray(walls)[wall], 0)
 
-        likelihood = total(agreement.whisker, agreement.wall) + jnp.where(features.valid, BODIES * body, 0)
+        likelihood = TEMPER * total(agreement.whisker, agreement.wall)
+        likelihood += jnp.where(features.valid, TEMPER * REPEATED * body, 0)
         swarm, vanished = particles.weigh(known.swarm, likelihood)
         odds = known.odds + total(agreement.odds, agreement.wall_odds)
         return Supposed(swarm, odds, jnp.maximum(known.best, odds)), vanished
