@@ -70,10 +70,11 @@ class Expectation(NamedTuple):
         """[N, W] class of each whisker at poses [N, 3]."""
         dtype = pose.dtype
         cell, inside = self._cells(_placed(pose, jnp.asarray(self.base, dtype)))
-        turned = (pose[:, 2:] + jnp.asarray(self.angle, dtype)) * (HEADINGS / (2 * np.pi))
+        turned = (pose[:, 2:] + jnp.asarray(self.angle, dtype)[None]) * (HEADINGS / (2 * np.pi))
         heading = jnp.round(turned).astype(jnp.int32) % HEADINGS
         index = heading * self.side**2 + cell
-        return jnp.where(inside, jnp.asarray(self.whiskers)[self.length, index], UNEXPLORED).astype(jnp.int32)
+        found = jnp.asarray(self.whiskers)[self.length[None], index]
+        return jnp.where(inside, found, UNEXPLORED).astype(jnp.int32)
 
     def body_classes(self, pose: Array) -> Array:
         """[N] class of the robot's body at poses [N, 3]."""
@@ -135,5 +136,5 @@ def _body_table(surfaces: Surfaces, radius: float) -> np.ndarray:
 def _placed(pose: Array, points: Array) -> Array:
     """[N, K, 2] points [K, 2] of base_link at poses [N, 3]."""
     c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
-    right, up = points[:, 0], points[:, 1]
+    right, up = points[None, :, 0], points[None, :, 1]
     return jnp.stack([pose[:, :1] + c * right - s * up, pose[:, 1:2] + s * right + c * up], axis=-1)

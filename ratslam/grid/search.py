@@ -106,7 +106,7 @@ class Search:
         errors, places = jax.random.split(key)
         spread = jnp.array([self.config.cell, self.config.cell, NEAR_HEADING / 2], self.dtype)
         draws = lax.optimization_barrier(jax.random.normal(places, (self.count, 3), self.dtype))
-        at = jnp.asarray(pose, self.dtype) + spread * draws
+        at = jnp.asarray(pose, self.dtype)[None] + spread[None] * draws
         return self._suppose(errors, at, odds)
 
     def _suppose(self, key: Array, pose: Array, odds: float) -> Supposed:
@@ -134,8 +134,8 @@ class Search:
         body = jnp.asarray(agreement.body)[self.expected.body_classes(pose)]
 
         def total(whisker: np.ndarray, walls: np.ndarray) -> Array:
-            met = jnp.where(features.new, jnp.asarray(whisker[CONTACT])[seen], 0)
-            passed = jnp.where(free, REPEATED * jnp.asarray(whisker[FREE])[seen], 0)
+            met = jnp.where(features.new[None], jnp.asarray(whisker[CONTACT])[seen], 0)
+            passed = jnp.where(free[None], REPEATED * jnp.asarray(whisker[FREE])[seen], 0)
             return jnp.sum(met + passed, axis=1) + jnp.where(features.wall, jnp.asarray(walls)[wall], 0)
 
         likelihood = TEMPER * total(agreement.whisker, agreement.wall)
@@ -169,7 +169,8 @@ class Search:
         ).T
         heading = jnp.floor(pose[:, 2] / turn).astype(jnp.int32) % BINS_AROUND
         index = (row * across + column) * BINS_AROUND + heading
-        most = jnp.argmax(jnp.zeros(across * across * BINS_AROUND, self.dtype).at[index].add(share))
+        binned = jnp.zeros(across * across * BINS_AROUND, self.dtype).at[index].add(share)
+        most = lax.argmax(binned, 0, np.int32)
         within = jnp.where(index == most, share, 0.0)
         mean, _ = particles.weighted_mean(pose, within / jnp.sum(within))
         for _ in range(2):

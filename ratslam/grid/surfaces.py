@@ -49,7 +49,7 @@ class Surfaces(NamedTuple):
         """[...] a layer [S, S] at points [..., 2] (m), bilinear; 0 at the rim and outside."""
         place = point / self.cell + (self.side - 1) / 2
         low = np.floor(place).astype(int)
-        inside = ((low >= 0) & (low < self.side - 1)).all(axis=-1)
+        inside = np.asarray(((low >= 0) & (low < self.side - 1)).all(axis=-1))
         column, row = np.moveaxis(np.where(inside[..., None], low, 0), -1, 0)
         right, up = np.moveaxis(place - np.floor(place), -1, 0)
         below = layer[row, column] * (1 - right) + layer[row, column + 1] * right
