@@ -12,6 +12,11 @@ import ratslam
 from ratslam.cli import main
 
 REPORTS = 600
+MOUNTS = ", ".join(
+    f"{{x: {x}, y: {y}, direction_deg: {turn}}}"
+    for x, y, turn in ((0.1, 0.08, 50), (0.13, 0.03, 15), (0.13, 0, 0), (0.13, -0.03, -15), (0.1, -0.08, -50))
+)
+"""Of a robot with five whiskers."""
 SETTINGS = f"""
 create_simulation: {{arena: {{side: 1.25, seed: 104}}, reports: {REPORTS}, seed: 104}}
 backend: grid
@@ -71,7 +76,7 @@ def test_a_loop_localises_to_the_same_bits(arena: Path, found: Path) -> None:
             "touch.reports.length is 0.12 and was 0.14",
         ),
         (
-            "create_simulation: {whiskers: {mounts: [{x: 0.13, y: 0.03, direction_deg: 15}, {x: 0.13, y: -0.03, direction_deg: -15}]}, reports: 5}",
+            f"create_simulation: {{whiskers: {{mounts: [{MOUNTS}]}}, reports: 5}}",
             "and was (1, 4, 1) when the map was made",
         ),
         ("{create_simulation: {reports: 5}, touch: {reports: {walls: none}}}", "touch.reports.walls is none"),
