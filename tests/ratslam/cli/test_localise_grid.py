@@ -10,6 +10,10 @@ import pytest
 
 import ratslam
 from ratslam.cli import main
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.localise import localising
+from ratslam.pipeline.saved_map import read_map
+from tactile.base.types import Odometry, observation
 
 REPORTS = 600
 MOUNTS = ", ".join(
@@ -65,6 +69,18 @@ def test_a_loop_localises_to_the_same_bits(arena: Path, found: Path) -> None:
             estimate = slam.step(sample)
             assert [float(row[name]) for name in ("x", "y", "heading")] == estimate.pose.tolist()
     assert slam.map.localisation().state.name.lower() == "searching"  # type: ignore[attr-defined]
+
+
+def test_a_known_start_is_just_believed(arena: Path) -> None:
+    config = ratslam.load_config(arena / "arena.yaml", ["localise.start=here"])
+    saved = read_map(arena / "map")
+    session = build_session(localising(config, saved), saved.source)
+    still = observation(Odometry(0.0, 0.0, 0.0, 0.5), view_shape=saved.source.view_shape, whiskers=4)
+    estimate = session.step(still._replace(alive=np.zeros(4, bool)))
+    last = ratslam.Result(arena / "map").trajectory[-1]
+    assert np.hypot(*(estimate.pose - last)[:2]) < 0.1
+    assert not estimate.estimate.lost
+    assert 0.2 < session.map.localisation().mass < 0.8  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
