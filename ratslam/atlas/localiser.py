@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +17,7 @@ from ratslam.atlas.placement import NOTHING_RECALLED
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
+from ratslam.core.localisation import Localisation, LocalisedPose, pieces_of, write_course
 from ratslam.core.types import Action, Estimate
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.map import KeyframeMap
@@ -34,34 +34,6 @@ LARGEST_EXPONENT = 700.0
 """Of a double, rounded down."""
 UNCERTAIN = 2 * LONGEST
 """Keyframes before a pose is lost at which it may have been wrong already."""
-
-
-class Localisation(IntEnum):
-    """Whether the robot's pose in the map is known."""
-
-    SEARCHING = 0
-    """Not yet: the views so far fit several places, or none."""
-    FOUND = 1
-    """The pose is known."""
-    LOST = 2
-    """It was known, but the views since do not fit it, or none showed known ground for too long."""
-    NOT_THIS_MAP = 3
-    """So many views fit nowhere that the session is most likely not in this map, or in a part that was never
-    driven."""
-
-
-class LocalisedPose(NamedTuple):
-    """Attributes:
-    state: see `Localisation`. pose: [3] the most likely pose in the map, m, m, rad; by odometry alone where
-        none is supposed. covariance: [3, 3] of it, were it the right one. mass: its probability against all
-        other poses and against not being in this map. log_odds: of the session being there.
-    """
-
-    state: Localisation
-    pose: np.ndarray
-    covariance: np.ndarray
-    mass: float
-    log_odds: float
 
 
 class Place(NamedTuple):
@@ -166,11 +138,7 @@ class Localiser(Checkpointed, Map):
     def pieces(self) -> np.ndarray:
         """[T] the piece of each step: all steps where the pose was found are one, and so is each stretch
         between."""
-        found = self._states.rows == Localisation.FOUND
-        begins = np.diff(found.astype(int), prepend=0) < 0
-        kinds = np.where(found, -1, np.cumsum(begins))
-        _, first, row = np.unique(kinds, return_index=True, return_inverse=True)
-        return np.argsort(np.argsort(first))[row]  # numbered as they appear
+        return pieces_of(self._states.rows)
 
     def graph(self) -> networkx.DiGraph:
         """The graph of the finished map."""
@@ -296,9 +264,4 @@ class Localiser(Checkpointed, Map):
         self._views.forget(0)
 
     def _write(self, path: Path) -> None:
-        lines = ["step,state,mass,log_odds,sd"]
-        rows = zip(self._states.rows.tolist(), self._record.rows.tolist(), strict=True)
-        for step, (state, (mass, log_odds, deviation)) in enumerate(rows):
-            name = Localisation(state).name.lower()
-            lines.append(f"{step},{name},{mass!r},{log_odds!r},{deviation!r}")
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_course(path, self._states.rows, self._record.rows)

@@ -57,6 +57,8 @@ class LocaliseConfig(Settings):
     """The map: a file map.npz; `python -m ratslam localise` sets it."""
     log_odds: PositiveFloat = 15.0
     """Log-odds at which a pose is found, beyond the logarithm of the number of places in the map."""
+    particles: Annotated[int, Field(ge=100, le=1_000_000)] = 20_000
+    """Number of supposed poses in a map of `backend: grid`."""
     start: Start = "unknown"
     """Where the robot stands at first: `here`, where the map ended, which is believed until what is seen
     contradicts it, or anywhere."""
@@ -74,6 +76,13 @@ class GridBackendConfig(Settings):
 
     grid: GridConfig = GridConfig()
     """The grid particle filter."""
+
+
+class GridLocaliseBackendConfig(GridBackendConfig):
+    """Sections of `backend: localise_grid`: those that the map was made with, and its file."""
+
+    localise: LocaliseConfig = LocaliseConfig()
+    """Localisation in a finished map."""
 
 
 def select_settings(config: Settings, kind: type[BackendConfig]) -> BackendConfig:

@@ -9,17 +9,19 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 
 from ratslam.attractor import pose_cells
-from ratslam.backends import grid, localise
+from ratslam.backends import grid, localise, localise_grid
 from ratslam.backends.classic import ClassicBackend, ClassicEvidence
 from ratslam.backends.config import (
     ClassicBackendConfig,
     GridBackendConfig,
+    GridLocaliseBackendConfig,
     LocaliseBackendConfig,
     RecallBackendConfig,
     select_settings,
 )
 from ratslam.backends.grid import GridEvidence
 from ratslam.backends.localise import LocaliseEvidence, LocaliseOutcome
+from ratslam.backends.localise_grid import GridLocaliseEvidence, GridLocaliseOutcome
 from ratslam.backends.recall import RecallBackend, RecallEvidence
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
@@ -88,6 +90,12 @@ BACKENDS = Registry(
             LocaliseOutcome,
             lambda config, sensors, dtype: localise.build(config, sensors.view_shape, dtype),
         ),
+        "localise_grid": BackendEntry(
+            GridLocaliseBackendConfig,
+            GridLocaliseEvidence,
+            GridLocaliseOutcome,
+            lambda config, sensors, dtype: localise_grid.build(config, sensors.feelers, dtype),
+        ),
         "grid": BackendEntry(
             GridBackendConfig,
             GridEvidence,
@@ -97,6 +105,8 @@ BACKENDS = Registry(
     },
 )
 """Every method, by its value of `backend` in a configuration."""
+LOCALISING = {"recall": "localise", "grid": "localise_grid"}
+"""The method that localises in the maps of a method."""
 
 
 def build(

@@ -133,7 +133,7 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
     cells = float(np.median(moved)) / config.pose_cells.cell_size if len(moved) else 0.0
     if not len(moved):
         advice.append("the odometry does not move: check its topic or columns")
-    elif config.backend != "grid" and cells > FAST:
+    elif config.backend not in ("grid", "localise_grid") and cells > FAST:
         size = float(f"{2 * float(np.median(moved)):.2g}")
         advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells")
     if closures is not None and not closures.accepted:

@@ -17,13 +17,15 @@ class ContactFeatures(NamedTuple):
     """Contacts of W whiskers and the wall of one observation, in base_link.
 
     Attributes:
-        valid: bool, the observation counts as evidence. free: [W] bool, whiskers without contact. new: [W]
-            bool, whiskers in contact that were not before. touching: [W] bool, whiskers in contact.
-            point: [W, 2] contact points, m. wall: bool, there is a wall estimate. on_wall: [2] the mean
-            contact point projected on the wall, m. direction: of the wall, rad, with standard deviation `sd`.
+        valid: bool, the observation counts as evidence. turning: bool, the robot turns. free: [W] bool,
+            whiskers without contact. new: [W] bool, whiskers in contact that were not before. touching: [W]
+            bool, whiskers in contact. point: [W, 2] contact points, m. wall: bool, there is a wall estimate.
+            on_wall: [2] the mean contact point projected on the wall, m. direction: of the wall, rad, with
+            standard deviation `sd`.
     """
 
     valid: Array
+    turning: Array
     free: Array
     new: Array
     touching: Array
@@ -69,6 +71,7 @@ def contact_features(
     middle = among @ point / jnp.maximum(jnp.sum(among), 1.0)
     features = ContactFeatures(
         valid=valid,
+        turning=turning,
         free=valid & observation.alive & ~observation.contact,
         new=valid & touching & fresh & ~turning,
         touching=touching,

@@ -54,7 +54,7 @@ class GridMap(Checkpointed, Map):
 
     def occupancy(self) -> np.ndarray:
         """[S, S] probability of an obstacle in each cell; rows are y, columns x, the middle is the start."""
-        return draw_occupancy(self.config, self.feelers, self.side, self.trajectory(), self._contact_log())
+        return draw_occupancy(self.config, self.feelers, self.side, self.trajectory(), self.contacts())
 
     def grid(self) -> GridDrawing:
         corner = np.full(2, -self.side * self.config.cell / 2)
@@ -67,6 +67,7 @@ class GridMap(Checkpointed, Map):
     def _write(self, path: Path) -> None:
         np.savez_compressed(path, **self.grid()._asdict())
 
-    def _contact_log(self) -> ContactLog:
+    def contacts(self) -> ContactLog:
+        """The contacts of all reports."""
         contact, alive = np.moveaxis(self._flags.rows, 2, 0)
         return contact_log(self._motion.rows, contact, alive, self._point.rows, self._wall.rows)

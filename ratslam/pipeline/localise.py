@@ -10,10 +10,13 @@ import numpy as np
 
 from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.atlas.localiser import Localisation, Localiser
+from ratslam.atlas.localiser import Localiser
 from ratslam.backends.config import Start
+from ratslam.backends.registry import LOCALISING
 from ratslam.config.run_config import RunConfig, SourceConfig
 from ratslam.config.strict_yaml import dump, override, parse, validate
+from ratslam.core.localisation import Localisation
+from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.run import print_status, process_source
 from ratslam.pipeline.runner import open_runner
@@ -24,8 +27,7 @@ from tactile.base.errors import InputError
 
 NOT_LOCALISED = {
     "classic": "whose view templates say which view is nearest, and not how likely it is of another place",
-    "grid": "in which the contacts of a session fit several poses, and those of other places fit too",
-    "localise": "which is a session in another map, and no map of its own",
+    **dict.fromkeys(LOCALISING.values(), "which is a session in another map, and no map of its own"),
 }
 """Why nothing can be localised in the maps of a method."""
 
@@ -71,16 +73,18 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
     Raises:
         InputError: the map was made by a method in whose maps nothing can be localised.
     """
-    if saved.config.backend != "recall":
+    if saved.config.backend not in LOCALISING:
         found = f"a map made by `backend: {saved.config.backend}`"
         reason = NOT_LOCALISED.get(saved.config.backend)
         if reason:
             found = f"{found}, {reason}"
-        cure = "map the place again with `backend: recall`"
-        raise InputError(str(saved.path), found, "a map made by `backend: recall`", cure)
+        cure = "map the place again with `backend: recall`, or by whiskers with `backend: grid`"
+        raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
     own = {name: getattr(config, name) for name in (*SourceConfig.model_fields, "score", "cells")}
     place = config.localise.model_copy(update={"map": saved.path.resolve()})
-    return saved.config.model_copy(update=own | {"backend": "localise", "localise": place})
+    return saved.config.model_copy(
+        update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
+    )
 
 
 def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ()) -> RunConfig:
@@ -134,7 +138,7 @@ def localise(
         interrupted = process_source(runner, source)
         card = runner.finish(interrupted)
         made = runner.session.map
-        assert isinstance(made, Localiser)
-        changes = read_changes(directory / NAME)
+        assert isinstance(made, Localiser | GridLocaliser)
+        changes = read_changes(directory / NAME) if isinstance(made, Localiser) else []
         summary = LocalisationSummary(made.states(), made.localisation().mass, changes)
     return card, summary, interrupted

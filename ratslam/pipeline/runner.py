@@ -19,7 +19,7 @@ from evaluation.artifacts.closure_views import eight_bit
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.backends.registry import BACKENDS, BackendEntry
+from ratslam.backends.registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
@@ -281,7 +281,7 @@ def _cell(value: Any) -> str:
 def check_finished_map(config: RunConfig, source: Source) -> None:
     """Raises `InputError` if the source cannot be localised in the map that the configuration names, because
     the map is broken or of another sensor."""
-    if config.backend == "localise" and config.localise.map is not None:
+    if config.backend in LOCALISING.values() and config.localise.map is not None:
         saved = read_map(config.localise.map)
         check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
 

@@ -137,7 +137,7 @@ class Slam:
                 run starts anew.
             mode: `localise`: the map stays as it is, and the robot may stand anywhere in it or elsewhere;
                 `slam.map.localisation()` tells whether and where it was found
-                (`ratslam.atlas.localiser.LocalisedPose`), `estimate.lost` whether it was not.
+                (`ratslam.core.localisation.LocalisedPose`), `estimate.lost` whether it was not.
 
         Raises:
             InputError: there is no map, or it cannot be used (`read_map`).

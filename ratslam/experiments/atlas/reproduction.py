@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ratslam.experiments.atlas import changing, continuing, goals, halves, localising, merging
+from ratslam.experiments.atlas import arenas, changing, continuing, goals, halves, localising, merging
 from ratslam.experiments.atlas.methods import Methods
 from ratslam.experiments.atlas.row import MapRow, MapTask
 from ratslam.experiments.studies.executor import run_tasks
@@ -25,6 +25,8 @@ ROWS: dict[str, MapRow] = {
     "wall moved": changing.WALL,
     "door closed": changing.DOOR,
     "buildings": halves.HALVES,
+    "grid": arenas.GRID,
+    "grid large": arenas.GRID_LARGE,
 }
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from ratslam.atlas.localiser import Localisation
 from ratslam.backends.grid import GridOutcome
+from ratslam.backends.localise_grid import GridLocaliseOutcome
 from ratslam.backends.registry import BACKENDS
 from ratslam.checks.backend import CHECKS
 from ratslam.checks.backend_trial import BackendTrial
@@ -48,6 +49,7 @@ METHODS = {
     "classic-labels": pose_cells("classic", "labels"),
     "grid": ("grid", {"grid": DOUBTFUL}),
     "localise": pose_cells("localise", "views", **TOUCH),
+    "localise_grid": ("localise_grid", {"grid": DOUBTFUL}),
 }
 EXAMPLE = "dead-reckoning"
 OFTEN = {"recall-labels", "classic-labels", "signed-touch"}
@@ -65,15 +67,18 @@ def trial_of(name):
         return BackendTrial(dead_reckoning.ENTRY, dead_reckoning.Config())
     method, settings = METHODS[name]
     if name == "localise":
-        settings = settings | {"localise": {"map": str(touch_map()), "log_odds": 3.0}}
+        settings = settings | {"localise": {"map": str(map_of("touch")), "log_odds": 3.0}}
+    if name == "localise_grid":
+        file = str(map_of("grid"))
+        settings = settings | {"localise": {"map": file, "log_odds": 0.5, "particles": 300}}
     entry = BACKENDS.get(method, "backend")
     return BackendTrial(entry, entry.config_class.model_validate(settings))
 
 
-def touch_map():
-    """The file of the map that `touch` makes of the walk of the checks."""
-    file = Path(os.environ["RATSLAM_TEST_FOLDER"]) / f"touch_{os.getpid()}.npz"
-    np.savez(file, **trial_of("touch").arrays)
+def map_of(name):
+    """The file of the map that a method makes of the walk of the checks."""
+    file = Path(os.environ["RATSLAM_TEST_FOLDER"]) / f"{name}_{os.getpid()}.npz"
+    np.savez(file, **trial_of(name).arrays)
     return file
 
 
@@ -113,7 +118,17 @@ def test_the_pose_is_found_and_searched_for_in_these_walks():
     assert 100 < (states == Localisation.FOUND).sum() < 336
 
 
-@pytest.mark.parametrize("name", some(["classic", "classic-labels", "grid", "localise", EXAMPLE]))
+def test_searches_fail_and_resample_in_these_walks():
+    # Otherwise the checks of replay and checkpoints would not cover it.
+    outcomes = np.array([step.evidence.outcome for step in trial_of("localise_grid").steps])
+    assert 5 < (outcomes == GridLocaliseOutcome.RESAMPLED).sum() < 330
+    assert (outcomes == GridLocaliseOutcome.BEGUN_ANEW).sum() > 1
+
+
+FIXED = ["classic", "classic-labels", "grid", "localise", "localise_grid", EXAMPLE]
+
+
+@pytest.mark.parametrize("name", some(FIXED))
 def test_memory_does_not_grow_on_known_ground(name):
     """Otherwise time and memory of long sessions on known ground would grow."""
     trial = trial_of(name)

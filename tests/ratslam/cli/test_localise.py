@@ -127,8 +127,8 @@ def test_another_sensor_is_refused(
     ("backend", "reason"),
     [
         ("classic", "not how likely it is of another place"),
-        ("grid", "the contacts of a session fit several poses"),
         ("localise", "a session in another map"),
+        ("localise_grid", "a session in another map"),
     ],
 )
 def test_maps_of_methods_that_cannot_localise_are_refused(

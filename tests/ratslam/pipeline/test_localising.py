@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ratslam.backends.registry import LOCALISING
 from ratslam.config.run_config import LoopConfig
 from ratslam.pipeline.localise import localising
 from ratslam.pipeline.saved_map import FORMAT, SavedMap
@@ -20,7 +21,7 @@ def map_of(backend):
 
 
 @pytest.mark.parametrize(
-    ("backend", "reason"), [("grid", r"contacts of a session fit several poses"), ("classic", "classic")]
+    ("backend", "reason"), [("localise_grid", "a session in another map"), ("classic", "classic")]
 )
 def test_other_methods_are_refused_with_the_cure(backend, reason):
     saved = map_of(backend)
@@ -29,6 +30,7 @@ def test_other_methods_are_refused_with_the_cure(backend, reason):
     assert "map the place again with `backend: recall`" in str(error.value)
 
 
-def test_a_recall_map_is_not_refused():
-    saved = map_of("recall")
-    assert localising(saved.config, saved).backend == "localise"
+@pytest.mark.parametrize(("backend", "method"), LOCALISING.items())
+def test_other_maps_are_not_refused(backend, method):
+    saved = map_of(backend)
+    assert localising(saved.config, saved).backend == method

@@ -1,0 +1,147 @@
+"""Rows: a whiskered Create that wakes up in a known arena, and in another one of the same size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.localisation import RIGHT, WRONG, is_within
+from ratslam.core.localisation import Localisation
+from ratslam.core.session import Session
+from ratslam.experiments.atlas.arena_sessions import (
+    REPORTS,
+    ArenaDrive,
+    ArenaMap,
+    drive_elsewhere,
+    shuffled_contacts,
+    store_arena_map,
+)
+from ratslam.experiments.atlas.localising import Judged, judge
+from ratslam.experiments.atlas.methods import Localised
+from ratslam.experiments.atlas.pictures import Panel, draw_panels
+from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
+from ratslam.grid.localiser import GridLocaliser
+from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.localise import localising
+from ratslam.pipeline.saved_map import read_map
+from tactile.base.se2 import integrate
+
+SOON = 300
+"""Reports of a short session: about two minutes, 20 contacts."""
+SMALL, LARGE = 1.25, 2.5
+"""Sides of the arenas of Fox et al. 2012, m."""
+
+
+class ArenaFigures(NamedTuple):
+    """One unknown start.
+
+    Attributes:
+        arena: its seed. session: as localised. shuffled: with its contacts in random order. other: [T] bool,
+            a session in another arena is found. foreign: whether that one says at the end that this is not
+            the map. best: whether the most likely pose is right after `SOON` reports and at the end, believed
+            or not. reckoned: [T] error of odometry that starts at the truth, m.
+    """
+
+    arena: int
+    session: Judged
+    shuffled: Judged
+    other: np.ndarray
+    foreign: bool
+    best: tuple[bool, bool]
+    reckoned: np.ndarray
+
+
+def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
+    """One unknown start in the map of an arena."""
+    made, drive = store_arena_map(task.seed, side, task.folder), drive_elsewhere(task.seed, side)
+    session = _session_in(made)
+    known = _localise(session, drive)
+    mixed = _localise(session, shuffled_contacts(drive, task.seed))
+    other = _localise(session, drive_elsewhere(task.seed + 1, side))
+    judged = judge(made.steps, known, drive.truth)
+    right = is_within(judged.error, RIGHT)
+    reckoned = integrate(drive.motion, drive.truth[0]) - drive.truth
+    return ArenaFigures(
+        arena=task.seed,
+        session=judged,
+        shuffled=judge(made.steps, mixed, drive.truth),
+        other=other.found,
+        foreign=bool(other.foreign[-1]),
+        best=(bool(right[SOON - 1]), bool(right[-1])),
+        reckoned=np.hypot(*reckoned[:, :2].T),
+    )
+
+
+def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
+    """The lines of unknown starts."""
+    n = len(found)
+    reports = np.array([one.session.whisks for one in found])
+    mixed = np.array([one.shuffled.whisks for one in found])
+    for within in (SOON, REPORTS):
+        goal = f"{int(np.ceil(0.95 * n))} of {n}" if within == SOON else "-"
+        control = f"{count(mixed <= within)} with shuffled contacts"
+        yield Line(f"found and right within {within} reports", goal, count(reports <= within), control)
+    median = f"{np.median(reports):.0f} ({reports.max():.0f})"
+    yield Line("reports until then, median (worst)", "-", median, "-")
+    for k, within in enumerate((SOON, REPORTS)):
+        right = count([one.best[k] for one in found])
+        yield Line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
+    wrong, control = (count([bool(one.wrong.any()) for one in each]) for each in _both(found))
+    yield Line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
+    for within in (SOON, REPORTS):
+        other = count([bool(one.other[:within].any()) for one in found])
+        yield Line(f"found in another arena within {within} reports", f"0 of {n}", other, "-")
+    yield Line(
+        f"says after {REPORTS} reports that this is not the map",
+        "-",
+        f"{count([one.foreign for one in found])} in another arena",
+        f"{count([bool(one.session.foreign[-1]) for one in found])} in that of the map",
+    )
+    errors = [np.median(one.session.error[one.session.found, 0]) for one in found if one.session.found.any()]
+    reckoned = spread([float(np.median(one.reckoned)) for one in found], 3)
+    yield Line(
+        "error while found, m, median of sessions (worst)",
+        "-",
+        spread(errors, 3),
+        f"{reckoned} odometry from the true start",
+    )
+
+
+def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
+    """Draws the error of all sessions over the reports."""
+    curves = {"sessions": [np.where(one.session.found, one.session.error[:, 0], np.nan) for one in found]}
+    limits = {"right": RIGHT.distance, "wrong": WRONG.distance}
+    panel = Panel("error while found, m", "reports since the start", curves=curves, limits=limits)
+    known = count([one.session.whisks <= REPORTS for one in found])
+    other = count([bool(one.other.any()) for one in found])
+    line = f"Unknown start: found and right in {known}; found in another arena: {other}."
+    draw_panels(png, "Waking up in a known arena", line, None, panel)
+
+
+def _both(found: Sequence[ArenaFigures]) -> tuple[list[Judged], list[Judged]]:
+    return [one.session for one in found], [one.shuffled for one in found]
+
+
+def _session_in(made: ArenaMap) -> Session:
+    saved = read_map(made.path)
+    return build_session(localising(saved.config, saved), saved.source)
+
+
+def _localise(session: Session, drive: ArenaDrive) -> Localised:
+    session.restart()
+    steps = list(session.replay(drive.observations))
+    localiser = session.map
+    assert isinstance(localiser, GridLocaliser)
+    states = localiser.states()
+    pose = np.array([step.pose for step in steps])
+    return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
+
+
+GRID = MapRow("Localise in a grid map from an unknown start", 20, measure_arena, arena_lines, draw_arenas)
+GRID_LARGE = MapRow(
+    "The same in arenas of 2.5 m", 6, partial(measure_arena, side=LARGE), arena_lines, draw_arenas
+)
