@@ -11,10 +11,13 @@ from ratslam.alignment.following import Motion, Supposed, advance
 from ratslam.alignment.gain_odds import LEAVING, GainOdds
 from ratslam.alignment.ground import Ground
 
-
 NEAR = 0.5
-"""Largest distance and turn from a keyframe at which a view of a known path counts, as shares of the ground's
-reaches: beside the driven way, and at headings that were not driven, views differ although the pose is right."""
+"""Largest distance and turn from a keyframe at which a view counts by its gain, as shares of the ground's
+reaches: beside the driven way, and at headings that were not driven, views differ although the pose is
+right."""
+BESIDE = -1.0
+"""Least log-odds of a view on ground that was driven, but not near the way: one in a hundred views of a map's
+own revisits lies there, and three in ten of paths that only look alike."""
 
 
 class Path(NamedTuple):
@@ -26,18 +29,27 @@ class Path(NamedTuple):
     odds: np.ndarray
 
 
-Counts = Callable[[Ground, np.ndarray, float], bool]
-"""Whether a view counts at a pose [3] on a ground, given its gain there, NaN where no keyframe is near."""
+Judge = Callable[[Ground, GainOdds, np.ndarray, float, bool], tuple[float, bool]]
+"""Log-odds of a view, and whether it is on mapped ground; from the ground, its odds, the pose [3], the gain
+of the best keyframe near by (NaN without one), and whether the keyframe before is on mapped ground."""
 
 
-def every_view(ground: Ground, pose: np.ndarray, gain: float) -> bool:
-    """Every view counts."""
-    return True
+def judge_everywhere(
+    ground: Ground, odds: GainOdds, pose: np.ndarray, gain: float, inside: bool
+) -> tuple[float, bool]:
+    """Each view counts by its gain."""
+    return keyframe_odds(odds, gain, inside, True)
 
 
-def views_on_the_way(ground: Ground, pose: np.ndarray, gain: float) -> bool:
-    """Views near the driven way count, and having left it (`NEAR`)."""
-    return not ground.is_passed(pose) if np.isnan(gain) else ground.is_near(pose, NEAR)
+def judge_on_the_way(
+    ground: Ground, odds: GainOdds, pose: np.ndarray, gain: float, inside: bool
+) -> tuple[float, bool]:
+    """Views near the driven way count by their gain, those beside it by little."""
+    if ground.is_near(pose, NEAR):
+        return odds.of(gain), True
+    if ground.is_passed(pose):
+        return (BESIDE if np.isnan(gain) else min(max(odds.of(gain), BESIDE), 0.0)), inside
+    return keyframe_odds(odds, gain, inside, bool(np.isnan(gain)))
 
 
 def follow(
@@ -46,20 +58,21 @@ def follow(
     at: Supposed,
     onwards: Iterable[tuple[Motion, np.ndarray | None]],
     least: float = -np.inf,
-    counts: Counts = every_view,
+    judge: Judge = judge_everywhere,
 ) -> Path:
     """The path from a supposed pose on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
         onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
-            nothing. counts: whether a view counts.
+            nothing. judge: gives the log-odds of each view that shows something.
     """
     poses, covariances, gained = [at.pose], [at.covariance], [0.0]
     total, inside = 0.0, True
     for moved, gains in onwards:
         at, gain = advance(ground, at, moved, gains)
-        shows = gains is not None and counts(ground, at.pose, gain)
-        log_odds, inside = keyframe_odds(odds, gain, inside, shows)
+        log_odds = 0.0
+        if gains is not None:
+            log_odds, inside = judge(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)
         covariances.append(at.covariance)
         gained.append(log_odds)

@@ -15,10 +15,10 @@ import numpy as np
 
 from ratslam.alignment.comparison import Comparison
 from ratslam.alignment.following import Motion
-from ratslam.alignment.gain_odds import LEAVING, GainOdds
+from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import same_pose
-from ratslam.alignment.paths import Path
+from ratslam.alignment.paths import NEAR, Path
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -200,7 +200,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     if not paths or paths[0].odds.sum() < needed:
         return None
     best, *others = paths
-    on = (best.odds != 0) & (best.odds != LEAVING)
+    on = (best.odds != 0) & np.array([ground.is_near(pose, NEAR) for pose in best.poses])
     rivals = [float(path.odds.sum()) for path in others if not _is_like(ground, best, path, on)]
     if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
