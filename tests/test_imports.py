@@ -61,37 +61,32 @@ VIOLATIONS = {
 }
 
 
-@pytest.fixture
-def tree(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the packages and their contracts."""
+    folder = tmp_path_factory.mktemp("tree")
     for name in PACKAGES:
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    return tmp_path
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
 
 
-def _verdicts(tree: Path) -> dict[str, str]:
-    """KEPT or BROKEN for each contract."""
-    code = "from importlinter.cli import lint_imports_command as check; check()"
-    command = [sys.executable, "-c", code, "--no-cache", "--no-logo"]
-    environment = os.environ | {"COLUMNS": "200", "PYTHONPATH": ""}
-    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=60)
-    verdicts = dict(re.findall(r"^(.*) (KEPT|BROKEN)", done.stdout, re.MULTILINE))
-    assert verdicts, done.stdout + done.stderr
-    return verdicts
+@pytest.fixture(scope="module")
+def kept(tree: Path) -> str:
+    """What the linter prints of the packages as they are."""
+    return _linted(tree)
 
 
-def test_contracts_hold(tree: Path) -> None:
-    assert _verdicts(tree) == dict.fromkeys(VIOLATIONS, "KEPT")
+@pytest.fixture(scope="module")
+def broken(tree: Path, kept: str) -> str:
+    """What it prints of the packages with all violations planted."""
+    for violations in VIOLATIONS.values():
+        for importer, imported in violations:
+            _plant(tree, importer, imported)
+    return _linted(tree)
 
 
-@pytest.mark.parametrize(
-    ("contract", "importer", "imported"),
-    [(contract, *violation) for contract, violations in VIOLATIONS.items() for violation in violations],
-)
-def test_a_planted_import_breaks_its_contract(
-    contract: str, importer: str, imported: str, tree: Path
-) -> None:
+def _plant(tree: Path, importer: str, imported: str) -> None:
     for module in (imported, importer):
         folder, _, name = module.rpartition(".")
         if name == "planted":
@@ -99,7 +94,41 @@ def test_a_planted_import_breaks_its_contract(
     path = tree.joinpath(*importer.split("."))
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     path.write_text(f"{path.read_text()}\nimport {imported}\n")
-    assert _verdicts(tree)[contract] == "BROKEN"
+
+
+def _linted(tree: Path) -> str:
+    code = "from importlinter.cli import lint_imports_command as check; check()"
+    command = [sys.executable, "-c", code, "--no-cache", "--no-logo"]
+    environment = os.environ | {"COLUMNS": "200", "PYTHONPATH": ""}
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=60)
+    assert "Contracts" in done.stdout, done.stdout + done.stderr
+    return done.stdout
+
+
+def _verdicts(printed: str) -> dict[str, str]:
+    """KEPT or BROKEN for each contract."""
+    return dict(re.findall(r"^(.*) (KEPT|BROKEN)", printed, re.MULTILINE))
+
+
+def test_contracts_hold(kept: str) -> None:
+    assert _verdicts(kept) == dict.fromkeys(VIOLATIONS, "KEPT"), kept
+
+
+@pytest.mark.parametrize(
+    ("contract", "importer", "imported"),
+    [(contract, *violation) for contract, violations in VIOLATIONS.items() for violation in violations],
+)
+def test_a_planted_import_breaks_its_contract(
+    contract: str, importer: str, imported: str, broken: str
+) -> None:
+    """The section of the contract names the import, or the module that is in no layer."""
+    assert _verdicts(broken)[contract] == "BROKEN"
+    names = "|".join(re.escape(name) for name in VIOLATIONS)
+    parts = re.split(rf"^({names})\n-+\n", broken, flags=re.MULTILINE)
+    section = dict(zip(parts[1::2], parts[2::2], strict=True))[contract]
+    own = imported.split(".")[0] if imported.split(".")[0] not in PACKAGES else imported
+    found = rf"- +{re.escape(importer)} -> {re.escape(own)} \(l\.|listed as layers:\n\n- {re.escape(importer)}\n"
+    assert re.search(found, section), section
 
 
 def _report(code: str) -> Any:

@@ -45,6 +45,12 @@ def test_stock_synthetic(name: str) -> None:
 
 
 def test_stock_intel() -> None:
+    report = compare.stock(load(real(INTEL)), steps=600)
+    assert report.agrees, report.line()
+
+
+@pytest.mark.soak
+def test_stock_intel_whole() -> None:
     report = compare.stock(load(real(INTEL)))
     assert report.agrees, report.line()
 

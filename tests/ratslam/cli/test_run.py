@@ -83,11 +83,11 @@ def test_the_written_configuration_gives_the_same_bytes_from_another_folder(squa
 
 TRACES = (
     "a_square3",
-    "b_figure8_alias",
+    pytest.param("b_figure8_alias", marks=pytest.mark.soak),
     pytest.param("c_corridor_wrap", marks=pytest.mark.soak),
     pytest.param("d1_rotation_generic", marks=pytest.mark.soak),
     pytest.param("e_kidnap", marks=pytest.mark.soak),
-    "j_reverse_stop",
+    pytest.param("j_reverse_stop", marks=pytest.mark.soak),
 )
 
 

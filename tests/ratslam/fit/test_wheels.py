@@ -101,8 +101,9 @@ def test_a_robot_that_hardly_turns_has_no_turn_scale() -> None:
 
 def test_the_bootstrap_is_reproducible() -> None:
     record = drive(11, 600)
-    assert fit_wheels(*record, seed=3) == fit_wheels(*record, seed=3)
-    assert fit_wheels(*record, seed=3).turn_scale != fit_wheels(*record, seed=4).turn_scale
+    found = fit_wheels(*record, seed=3)
+    assert found == fit_wheels(*record, seed=3)
+    assert found.turn_scale != fit_wheels(*record, seed=4).turn_scale
 
 
 @pytest.mark.parametrize("spoil", ["short", "still", "unknown"])

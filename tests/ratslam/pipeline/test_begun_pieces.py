@@ -69,7 +69,7 @@ def test_a_new_piece_lies_apart_until_closures_join_it() -> None:
     assert metric(session.map.trajectory(), walk.truth) < 0.1
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 2))])
 def test_pieces_are_right_within(seed: int) -> None:
     walk, session = carried(seed), empty_session()
     replay(session, walk.readings)
@@ -96,7 +96,15 @@ def test_live_gives_the_bits_of_a_replay() -> None:
     assert same(session.arrays(), whole)
 
 
-@pytest.mark.parametrize("stop", [CARRIED, CARRIED + 5, LEARNED, CARRIED + 60])
+@pytest.mark.parametrize(
+    "stop",
+    [
+        pytest.param(CARRIED, marks=pytest.mark.soak),
+        CARRIED + 5,
+        LEARNED,
+        pytest.param(CARRIED + 60, marks=pytest.mark.soak),
+    ],
+)
 def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
     _, whole = replayed()
     walk, session = carried(), empty_session()
@@ -108,7 +116,8 @@ def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
     assert same(session.arrays(), whole)
 
 
-def test_a_piece_that_stays_untied_continues_from_a_checkpoint() -> None:
+@pytest.mark.parametrize("stop", [LEARNED + 1, pytest.param(CARRIED + 60, marks=pytest.mark.soak)])
+def test_a_piece_that_stays_untied_continues_from_a_checkpoint(stop: int) -> None:
     first, other = carried(), simulate_walk(5, maze=WIDE | {"seed": 31002})
     readings = [*first.readings[:CARRIED], *other.readings[:100]]
     whole = empty_session()
@@ -116,15 +125,14 @@ def test_a_piece_that_stays_untied_continues_from_a_checkpoint() -> None:
     assert np.unique(whole.map.pieces()).tolist() == [0, 1]
     assert len(whole.arrays()["map/tie_odds/ground"]) == 1
     expected, path = whole.arrays(), whole.map.trajectory()
-    for stop in (LEARNED + 1, CARRIED + 60):
-        session = empty_session()
-        replay(session, readings[:stop])
-        saved = session.arrays()
-        session = empty_session()
-        session.restore(saved)
-        list(session.replay(readings[stop:]))
-        assert same(session.arrays(), expected)
-        assert np.array_equal(session.map.trajectory(), path)
+    session = empty_session()
+    replay(session, readings[:stop])
+    saved = session.arrays()
+    session = empty_session()
+    session.restore(saved)
+    list(session.replay(readings[stop:]))
+    assert same(session.arrays(), expected)
+    assert np.array_equal(session.map.trajectory(), path)
 
 
 def test_no_link_leads_from_one_piece_to_the_next() -> None:

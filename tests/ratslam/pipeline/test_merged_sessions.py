@@ -71,7 +71,7 @@ def test_live_gives_the_bits_of_the_replay(first: int) -> None:
 
 
 # Between two chunks, and in mid-chunk while the selection on the unmerged keyframes is in progress.
-@pytest.mark.parametrize("at", [14 * CHUNK, 325])
+@pytest.mark.parametrize("at", [pytest.param(14 * CHUNK, marks=pytest.mark.soak), 325])
 def test_a_checkpoint_continues_to_the_same_bits(at: int, first: int) -> None:
     walk, session = walk_of(0), empty_merging_session(1)
     before = list(session.replay(walk.readings[:at]))
@@ -129,7 +129,7 @@ def unmerged_error(seed: int) -> float:
     return metric(session.map.map_trajectory(), walk.truth)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.soak)])
 def test_the_trajectory_is_as_good_as_without_merges(seed: int, first: int) -> None:
     walk, path = walk_of(seed), replayed(seed, first).path
     assert len(path) == len(walk.readings)

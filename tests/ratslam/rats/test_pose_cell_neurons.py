@@ -135,7 +135,7 @@ def test_bad_input_gets_one_clear_error(environment, params, message):
 
 
 def test_a_leap_beyond_the_network_is_an_error():
-    neurons = PoseCellNeurons(new_agent(scale=100.0), {"pose_cells": CONFIG, "cell": [0]})
+    neurons = PoseCellNeurons(new_agent(scale=100.0, dx=1.0), {"pose_cells": CONFIG, "cell": [0]})
     neurons.Agent.update(forced_next_position=(neurons.Agent.pos + 50.0) % 100.0)
     with pytest.raises(InputError, match=r"m and .* rad in one step; expected at most 192 cells"):
         neurons.update()
