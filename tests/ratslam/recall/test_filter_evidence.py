@@ -263,7 +263,7 @@ def test_background_has_each_ruled_out_frame_once(count, since):
 
 
 def make_session(**settings):
-    parts = {"pose_cells": {"cells_xy": 11, "cells_heading": 12, "engine": "dense"}}
+    parts = {"pose_cells": {"cells_xy": 11, "cells_heading": 12}}
     return Session(RecallBackend(RecallBackendConfig.model_validate(parts), (1, SIZE, 1)), **settings)
 
 
