@@ -16,8 +16,8 @@ NEAR = 0.5
 reaches: beside the driven way, and at headings that were not driven, views differ although the pose is
 right."""
 BESIDE = -1.0
-"""Least log-odds of a view on ground that was driven, but not near the way: one in a hundred views of a map's
-own revisits lies there, and three in ten of paths that only look alike."""
+"""Least log-odds of a view on ground that was driven, but not near the way: one or two in a hundred views of
+a map's own revisits lie there, and three in ten of paths that only look alike."""
 
 
 class Path(NamedTuple):

@@ -3,9 +3,7 @@ session."""
 
 from __future__ import annotations
 
-import zipfile
 from enum import IntEnum
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -15,10 +13,10 @@ from jax import lax
 
 from ratslam.atlas.localiser import Localiser, Place
 from ratslam.backends.config import LocaliseBackendConfig
+from ratslam.backends.finished_map import map_file, restore_map
 from ratslam.backends.map_views import MapViews
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.backend import Backend
-from ratslam.core.checkpoint import with_prefix
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.map import KeyframeMap
@@ -141,28 +139,10 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     Raises:
         InputError: the map cannot be read, or was not made with these settings.
     """
-    settings = config.localise
-    if settings.map is None:
-        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
-    recall = RecallBackend(config, view_shape, dtype)
-    map = read_keyframe_map(recall, settings.map)
-    return LocaliseBackend(recall, map, settings.log_odds, settings.start == "here")
-
-
-def read_keyframe_map(recall: RecallBackend, path: Path) -> KeyframeMap:
-    """The keyframe map in a map file that was made with these settings.
-
-    Raises:
-        InputError: it cannot be read, or was made with others.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}
-        map = recall.new_map()
-        map.restore(with_prefix(arrays, "map/"))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        expected = "a map made by `backend: recall` with the same settings"
-        raise InputError(str(path), str(error) or type(error).__name__, expected) from None
+    settings, recall = config.localise, RecallBackend(config, view_shape, dtype)
+    map = restore_map(map_file(settings), recall.new_map(), "recall")
     if not map.kept_keyframes().count:
-        raise InputError(str(path), "a map without keyframes", "a map in which a session can be found")
-    return map
+        raise InputError(
+            str(settings.map), "a map without keyframes", "a map in which a session can be found"
+        )
+    return LocaliseBackend(recall, map, settings.log_odds, settings.start == "here")

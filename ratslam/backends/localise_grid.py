@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
 from enum import IntEnum
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +12,8 @@ from jax import lax
 
 from ratslam.backends import grid
 from ratslam.backends.config import GridLocaliseBackendConfig
+from ratslam.backends.finished_map import map_file, restore_map
 from ratslam.core.backend import Backend
-from ratslam.core.checkpoint import with_prefix
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.grid.agreement import counted_agreement
 from ratslam.grid.contact_features import contact_features
@@ -160,28 +158,7 @@ def build(
     Raises:
         InputError: the map cannot be read, or was not made with these settings and whiskers.
     """
-    settings = config.localise
-    if settings.map is None:
-        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
-    made = read_grid_map(grid.build(config.grid, feelers, dtype), settings.map)
+    settings, method = config.localise, grid.build(config.grid, feelers, dtype)
+    made = restore_map(map_file(settings), method.new_map(), "grid")
     here = settings.start == "here"
     return GridLocaliseBackend(made, settings.log_odds, settings.particles, dtype, here)
-
-
-def read_grid_map(backend: grid.GridBackend, path: Path) -> GridMap:
-    """The grid map in a map file that was made with these settings.
-
-    Raises:
-        InputError: it cannot be read, or was made with others.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}
-        made = backend.new_map()
-        made.restore(with_prefix(arrays, "map/"))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        expected = "a map made by `backend: grid` with the same settings"
-        raise InputError(str(path), str(error) or type(error).__name__, expected) from None
-    if not len(made.trajectory()):
-        raise InputError(str(path), "a map without reports", "a map in which a session can be found")
-    return made

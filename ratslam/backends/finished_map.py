@@ -1,0 +1,48 @@
+"""Reads the finished map in which a session is localised."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ratslam.backends.config import LocaliseConfig
+from ratslam.core.backend import Map
+from ratslam.core.checkpoint import with_prefix
+from tactile.base.errors import InputError
+
+FinishedMap = TypeVar("FinishedMap", bound=Map)
+
+
+def map_file(config: LocaliseConfig) -> Path:
+    """The file of the map.
+
+    Raises:
+        InputError: the configuration names none.
+    """
+    if config.map is None:
+        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
+    return config.map
+
+
+def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
+    """The map in a map file.
+
+    Args:
+        made: a new map of a backend with the settings of the file. method: its value of `backend`.
+
+    Raises:
+        InputError: the file cannot be read, was made with other settings, or holds a map without a step.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}
+        made.restore(with_prefix(arrays, "map/"))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        expected = f"a map made by `backend: {method}` with the same settings"
+        raise InputError(str(path), str(error) or type(error).__name__, expected) from None
+    if not len(made.trajectory()):
+        raise InputError(str(path), "a map without steps", "a map in which a session can be found")
+    return made
