@@ -121,7 +121,9 @@ class Hypotheses(Checkpointed):
         log_odds = np.zeros(self.count)
         for k in range(self.count):
             at, gained = advance(ground, self.at(k), moved, gain)
-            log_odds[k], inside = keyframe_odds(odds, gained, bool(self.inside.rows[k]), gain is not None)
+            log_odds[k], inside = keyframe_odds(
+                ground, odds, at.pose, gained if gain is not None else None, bool(self.inside.rows[k])
+            )
             self.pose.rows[k], self.covariance.rows[k] = at
             self.inside.rows[k] = inside
         self.log_odds.rows[:] += log_odds

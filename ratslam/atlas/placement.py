@@ -15,7 +15,7 @@ from ratslam.alignment.following import Motion, Supposed
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import HOPELESS, same_pose
-from ratslam.alignment.paths import Path, follow, judge_on_the_way
+from ratslam.alignment.paths import Path, follow
 from tactile.base.se2 import between, compose
 
 CONFIRMING = 3
@@ -72,9 +72,9 @@ class Traverse(NamedTuple):
         at = Supposed(pose, np.diag(ground.variance))
         views, motions = self.views, self.motions
         back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))
-        before = follow(ground, odds, at, back, self.hopeless, judge_on_the_way)
+        before = follow(ground, odds, at, back, self.hopeless)
         onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
-        after = follow(ground, odds, at, onwards, self.hopeless, judge_on_the_way)
+        after = follow(ground, odds, at, onwards, self.hopeless)
         parts = (np.concatenate([one[:0:-1], other]) for one, other in zip(before, after, strict=True))
         return Stretch(k + 1 - len(before.poses), Path(*parts))
 

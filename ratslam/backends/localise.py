@@ -26,6 +26,10 @@ from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
 
+LOG_ODDS = 10.0
+"""At which a pose is found, beyond the logarithm of the number of places, unless the settings say otherwise."""
+
+
 class LocaliseOutcome(IntEnum):
     """Outcome of a step."""
 
@@ -145,4 +149,4 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
         raise InputError(
             str(settings.map), "a map without keyframes", "a map in which a session can be found"
         )
-    return LocaliseBackend(recall, map, settings.log_odds, settings.start == "here")
+    return LocaliseBackend(recall, map, settings.log_odds or LOG_ODDS, settings.start == "here")

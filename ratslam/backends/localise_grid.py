@@ -29,6 +29,9 @@ from tactile.whiskers.planar_whiskers import PlanarWhiskers
 DRIVEN = -2.0
 """Log-odds of a surface below which a cell is known to be free, and the robot may stand there."""
 
+LOG_ODDS = 15.0
+"""At which a pose is found, beyond the logarithm of the number of places, unless the settings say otherwise."""
+
 ALIKE = 6.0
 """Log-odds that are needed beyond those settings and places ask for: reports of one place are counted as
 independent, so a place that is alike within the errors of the map gains as long as it is driven."""
@@ -161,4 +164,4 @@ def build(
     settings, method = config.localise, grid.build(config.grid, feelers, dtype)
     made = restore_map(map_file(settings), method.new_map(), "grid")
     here = settings.start == "here"
-    return GridLocaliseBackend(made, settings.log_odds, settings.particles, dtype, here)
+    return GridLocaliseBackend(made, settings.log_odds or LOG_ODDS, settings.particles, dtype, here)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.alignment.gain_odds import LEAVING
-from ratslam.alignment.paths import BESIDE, NEAR, judge_everywhere, judge_on_the_way
+from ratslam.alignment.paths import BESIDE, NEAR, keyframe_odds
 from tactile.base.se2 import compose, wrap
 from tests.ratslam.alignment.alignment_cases import SEEDS, odds_of, square_loop
 
@@ -21,7 +21,7 @@ def test_views_beside_the_driven_way_count_little_and_never_for_the_pose(
     ground, odds = LOOP.ground, ODDS
     keyframe = ground.poses[seed % len(ground.poses)]
     pose = compose(keyframe, np.array([x, y, turn]))
-    log_odds, inside = judge_on_the_way(ground, odds, pose, gain, True)
+    log_odds, inside = keyframe_odds(ground, odds, pose, gain, True)
     apart = np.hypot(*(ground.poses[:, :2] - pose[:2]).T)
     turned = np.abs(wrap(ground.poses[:, 2] - pose[2]))
     if ((apart < NEAR * ground.reach) & (turned < NEAR * ground.reach_heading)).any():
@@ -31,10 +31,17 @@ def test_views_beside_the_driven_way_count_little_and_never_for_the_pose(
         assert BESIDE <= log_odds <= 0
 
 
-def test_a_heading_that_was_not_driven_does_not_mean_that_the_ground_was_left():
+def test_a_heading_that_was_not_driven_does_not_mean_that_the_ground_was_left() -> None:
     ground = LOOP.ground
     across = compose(ground.poses[5], np.array([0.0, 0.0, 1.0]))
     away = compose(ground.poses[5], np.array([0.0, 5.0, 0.0]))
-    assert judge_on_the_way(ground, ODDS, across, np.nan, True) == (BESIDE, True)
-    assert judge_on_the_way(ground, ODDS, away, np.nan, True) == (LEAVING, False)
-    assert judge_everywhere(ground, ODDS, across, np.nan, True) == (LEAVING, False)
+    assert keyframe_odds(ground, ODDS, across, np.nan, True) == (BESIDE, True)
+    assert keyframe_odds(ground, ODDS, away, np.nan, True) == (LEAVING, False)
+    assert keyframe_odds(ground, ODDS, away, np.nan, False) == (0.0, False)
+
+
+def test_a_view_of_nothing_and_one_of_keyframes_beyond_reach_decide_nothing() -> None:
+    away = compose(LOOP.ground.poses[5], np.array([0.0, 5.0, 0.0]))
+    for inside in (True, False):
+        assert keyframe_odds(LOOP.ground, ODDS, LOOP.ground.poses[5], None, inside) == (0.0, inside)
+        assert keyframe_odds(LOOP.ground, ODDS, away, 3.0, inside) == (0.0, inside)
