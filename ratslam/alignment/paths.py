@@ -18,6 +18,8 @@ right."""
 BESIDE = -1.0
 """Least log-odds of a view on ground that was driven, but not near the way: one or two in a hundred views of
 a map's own revisits lie there, and three in ten of paths that only look alike."""
+AGAIN = 6
+"""Keyframes after which a path that comes back to a place visits it again."""
 
 
 class Path(NamedTuple):
@@ -74,3 +76,16 @@ def keyframe_odds(
     if np.isnan(gain):
         return (LEAVING if inside else 0.0), False
     return 0.0, inside  # the pose is so uncertain that keyframes beyond the reach were compared
+
+
+def counted_once(ground: Ground, path: Path) -> np.ndarray:
+    """[n] the log-odds of each keyframe, evidence for the path only at the first visit of a place.
+
+    A place elsewhere that is alike looks alike at each visit, and from every heading; one that is not,
+    contradicts at each.
+    """
+    apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
+    keyframe = np.arange(len(apart))
+    earlier = keyframe[:, None] - keyframe >= AGAIN
+    again = (earlier & (apart < NEAR * ground.reach)).any(axis=1)
+    return np.where(again, np.minimum(path.odds, 0.0), path.odds)

@@ -78,7 +78,9 @@ def test_following_back_ends_where_the_session_began(seed: int) -> None:
 def test_a_hopeless_path_is_not_followed_to_its_end() -> None:
     _, motions, gains = session()
     views = recorded(motions, [np.full_like(gain, -5.0) for gain in gains])
-    path = views.follow_back(LOOP.ground, ODDS, Supposed(LOOP.poses[BEGIN + COUNT - 1], np.diag(VARIANCE)), -6.0)
+    path = views.follow_back(
+        LOOP.ground, ODDS, Supposed(LOOP.poses[BEGIN + COUNT - 1], np.diag(VARIANCE)), -6.0
+    )
     assert path.odds.sum() < -6
     assert len(path.poses) < 8
 
