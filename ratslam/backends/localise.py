@@ -25,9 +25,8 @@ from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
-
 LOG_ODDS = 10.0
-"""At which a pose is found, beyond the logarithm of the number of places, unless the settings say otherwise."""
+"""Log-odds at which a pose is found, beyond the logarithm of the number of places, by default."""
 
 
 class LocaliseOutcome(IntEnum):

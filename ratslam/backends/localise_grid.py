@@ -30,7 +30,7 @@ DRIVEN = -2.0
 """Log-odds of a surface below which a cell is known to be free, and the robot may stand there."""
 
 LOG_ODDS = 15.0
-"""At which a pose is found, beyond the logarithm of the number of places, unless the settings say otherwise."""
+"""Log-odds at which a pose is found, beyond the logarithm of the number of places, by default."""
 
 ALIKE = 6.0
 """Log-odds that are needed beyond those settings and places ask for: reports of one place are counted as
