@@ -20,7 +20,8 @@ from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import same_pose
 from ratslam.alignment.paths import NEAR, Path
 from ratslam.atlas.cross_closures import closures_along
-from ratslam.atlas.placement import Traverse, find_placements
+from ratslam.atlas.map_traverse import MapTraverse
+from ratslam.atlas.placement import find_placements
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
@@ -194,7 +195,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     compared = views.compare(views.freeze(taken[onto], pose[onto]), taken[frames], motion)
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
     odds = views.odds(every, archive.poses(pose)[every], np.isin(every, taken[onto]))
-    session = Traverse(compared, motions, HOPELESS)
+    session = MapTraverse(compared, own, motions, HOPELESS)
     paths = find_placements(ground, odds, session)
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
     if not paths or paths[0].odds.sum() < needed:

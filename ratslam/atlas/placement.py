@@ -6,7 +6,7 @@ not only those that proposed it. The rule is ours."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -53,6 +53,19 @@ class RecalledPose(NamedTuple):
 
 NOTHING_RECALLED = RecalledPose(np.full(3, np.nan), 0, False)
 """Before the first keyframe."""
+
+
+class Followed(Protocol):
+    """A session that can be followed from a supposed pose, see `Traverse`."""
+
+    @property
+    def views(self) -> Comparison: ...
+
+    @property
+    def motions(self) -> list[Motion]: ...
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path with keyframe k at `pose` [3]."""
 
 
 class Traverse(NamedTuple):
@@ -102,7 +115,7 @@ def motions_between(poses: np.ndarray, variance: np.ndarray) -> list[Motion]:
     return [Motion(*one) for one in zip(steps, variance, strict=True)]
 
 
-def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[Path]:
+def find_placements(ground: Ground, odds: GainOdds, session: Followed) -> list[Path]:
     """The different placements of a session that recall proposes and that are not hopeless, those with the
     largest log-odds first."""
     tried: list[Stretch] = []
@@ -124,7 +137,7 @@ def _is_same(ground: Ground, path: Path, other: Path) -> bool:
     return bool(np.mean(together) > 0.5)
 
 
-def _proposals(ground: Ground, session: Traverse) -> Iterator[tuple[int, np.ndarray]]:
+def _proposals(ground: Ground, session: Followed) -> Iterator[tuple[int, np.ndarray]]:
     """Keyframes and their recalled poses [3] that agree with odometry for `CONFIRMING` of them."""
     views, newest = session.views, NOTHING_RECALLED
     for k, moved in enumerate(session.motions):
