@@ -25,7 +25,7 @@ from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
-LOG_ODDS = 10.0
+LOG_ODDS = 11.0
 """Log-odds at which a pose is found, beyond the logarithm of the number of places, by default."""
 
 
