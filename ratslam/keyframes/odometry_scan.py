@@ -21,6 +21,8 @@ REACH = 3.7
 """Standard deviations of the prior beyond which points of the grid are left out."""
 UNLIKELY = -60.0
 """Log ratio of a place that odometry excludes."""
+POINTS = 64
+"""Points of the grid that are computed together: few enough that their paths stay in the processor's cache."""
 
 
 class OdometryScan:
@@ -65,20 +67,26 @@ class OdometryScan:
                 NaN.
         """
         self._extend()
+        ratios = np.full(len(self.grid), np.nan)
+        for first in range(0, len(near), POINTS):
+            points = near[first : first + POINTS]
+            ratios[points] = self._ratios_at(member, points)
+        return ratios
+
+    def _ratios_at(self, member: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """[g] of `log_ratios` at these points of the grid."""
         j, i, shift = (int(value) for value in member[:3])
-        heading = self._total[: j + 1, :1] + self._total[: j + 1, 1:] @ self.grid[near].T
-        position = self._position[: j + 1, near].astype(complex)
+        heading = self._total[: j + 1, :1] + self._total[: j + 1, 1:] @ self.grid[points].T
+        position = self._position[: j + 1, points].astype(complex)
         root = np.linalg.cholesky(np.linalg.inv(self._covariance(i, j, position)))  # of the information
         old = max(j - self._graph.guard, 1)
-        apart = position[:old] - position[j]
+        x, y = position.real[:old] - position.real[j], position.imag[:old] - position.imag[j]
         turned = wrap(heading[:old] - shift * self._graph.sector_angle - heading[j])
-        along = root[:, 0, 0] * apart.real + root[:, 1, 0] * apart.imag + root[:, 2, 0] * turned
-        across = root[:, 1, 1] * apart.imag + root[:, 2, 1] * turned
+        along = root[:, 0, 0] * x + root[:, 1, 0] * y + root[:, 2, 0] * turned
+        across = root[:, 1, 1] * y + root[:, 2, 1] * turned
         distance = along**2 + across**2 + (root[:, 2, 2] * turned) ** 2
         total = np.maximum(np.exp(-distance / 2).sum(axis=0), 1.0)
-        ratios = np.full(len(self.grid), np.nan)
-        ratios[near] = np.maximum(np.log(old) - distance[i] / 2 - np.log(total), UNLIKELY)
-        return ratios
+        return np.maximum(np.log(old) - distance[i] / 2 - np.log(total), UNLIKELY)
 
     def _covariance(self, i: int, j: int, position: np.ndarray) -> np.ndarray:
         """[g, 3, 3] covariance of the motion from keyframe i to j in the frame of the path, with the gate.
