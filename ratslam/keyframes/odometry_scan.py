@@ -10,7 +10,6 @@ import numpy as np
 
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.optimizer import CalibrationPrior
-from tactile.base.se2 import wrap
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241
 """Largest difference of a heading bias of the grid from the prior's, rad per cell, and number of biases."""
@@ -81,7 +80,8 @@ class OdometryScan:
         root = np.linalg.cholesky(np.linalg.inv(self._covariance(i, j, position)))  # of the information
         old = max(j - self._graph.guard, 1)
         x, y = position.real[:old] - position.real[j], position.imag[:old] - position.imag[j]
-        turned = wrap(heading[:old] - shift * self._graph.sector_angle - heading[j])
+        turned = heading[:old] - shift * self._graph.sector_angle - heading[j]
+        turned -= 2 * np.pi * np.rint(turned / (2 * np.pi))
         along = root[:, 0, 0] * x + root[:, 1, 0] * y + root[:, 2, 0] * turned
         across = root[:, 1, 1] * y + root[:, 2, 1] * turned
         distance = along**2 + across**2 + (root[:, 2, 2] * turned) ** 2
