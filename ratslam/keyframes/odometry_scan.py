@@ -21,7 +21,8 @@ REACH = 3.7
 UNLIKELY = -60.0
 """Log ratio of a place that odometry excludes."""
 POINTS = 64
-"""Points of the grid that are computed together: few enough that their paths stay in the processor's cache."""
+"""Points of the grid that are computed together: few enough that their paths stay in the processor's
+cache."""
 
 
 class OdometryScan:
