@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import json
 import os
 import shutil
@@ -19,7 +20,9 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["RATSLAM_TEST_FOLDER"] = tempfile.mkdtemp(prefix="ratslam-tests-")
     atexit.register(shutil.rmtree, os.environ["RATSLAM_TEST_FOLDER"], ignore_errors=True)
 os.environ.setdefault("RATSLAM_TEST_CACHE", os.environ["RATSLAM_TEST_FOLDER"])
-# Programs that tests start cache their kernels there too, apart from the user's.
+# Programs that tests start compile the packages' modules once, and cache their kernels in this folder, apart
+# from the user's.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 
 import jax
@@ -90,6 +93,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=[item for item in items if item in left])
     order = {module: k for k, module in enumerate(LONGEST)}
     items[:] = sorted(chosen, key=lambda item: order.get(_module(item), len(order)))
+
+
+def pytest_collection_finish() -> None:
+    """Takes what lives to the end, which is most, out of the garbage collector's rounds."""
+    gc.collect()
+    gc.freeze()
 
 
 def modules_of_part(part: str, modules: set[str]) -> set[str]:

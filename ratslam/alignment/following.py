@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,8 @@ MOST_REACH, MOST_REACH_HEADING = 3.0, 2.0
 
 
 class Supposed(NamedTuple):
-    """A supposed pose in the map: mean [3] m, m, rad; covariance [3, 3]."""
+    """A supposed pose in the map: mean [3] m, m, rad; covariance [3, 3]. Or P of them: [P, 3] and
+    [P, 3, 3]."""
 
     pose: np.ndarray
     covariance: np.ndarray
@@ -73,11 +74,7 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     at = move(at, moved)
     if gain is None:
         return at, np.nan
-    position, heading = at.deviations()
-    reach = min(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
-    most = MOST_REACH_HEADING * ground.reach_heading
-    reach_heading = min(ground.reach_heading + DEVIATIONS * heading, most)
-    shift, frame = ground.near(at.pose, reach, reach_heading)
+    shift, frame = ground.near(at.pose, *_reaches(ground, *at.deviations()))
     if not len(frame):
         return at, np.nan
     gains = gain[shift, frame].astype(float)
@@ -90,16 +87,43 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
     return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
 
 
+def advance_all(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray) -> tuple[Supposed, np.ndarray]:
+    """`advance` for P supposed poses that move alike, and the gains [P]. Most of many poses fit nowhere: only
+    the others are corrected, one by one."""
+    pose, covariance = (each.copy() for each in move(at, moved))
+    (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(covariance, 0, -1)
+    position = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
+    one, shift, frame = ground.near_all(pose, *_reaches(ground, position, np.sqrt(heading)))
+    best = np.full(len(pose), np.nan)
+    near, first = np.unique(one, return_index=True)
+    if len(near):
+        best[near] = np.maximum.reduceat(gain[shift, frame].astype(float), first)
+    for k in np.flatnonzero(best > 0).tolist():
+        corrected, _ = advance(ground, Supposed(at.pose[k], at.covariance[k]), moved, gain)
+        pose[k], covariance[k] = corrected
+    return Supposed(pose, covariance), best
+
+
+def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
+    """The reaches, m and rad, of a pose with these standard deviations."""
+    reach = np.minimum(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
+    most = MOST_REACH_HEADING * ground.reach_heading
+    return reach, np.minimum(ground.reach_heading + DEVIATIONS * heading, most)
+
+
 def move(at: Supposed, moved: Motion) -> Supposed:
     """A pose moved by odometry, to first order in its noise (Smith and Cheeseman 1986)."""
     if not moved.motion.any() and not moved.variance.any():
         return at
-    cosine, sine = np.cos(at.pose[2]), np.sin(at.pose[2])
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turn, lever = np.zeros((2, *at.covariance.shape))
+    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(at.pose[..., 2])
+    turn[..., 1, 0] = np.sin(at.pose[..., 2])
+    turn[..., 0, 1], turn[..., 2, 2] = -turn[..., 1, 0], 1.0
     ahead = turn @ moved.motion
-    lever = np.eye(3)
-    lever[0, 2], lever[1, 2] = -ahead[1], ahead[0]
-    covariance = lever @ at.covariance @ lever.T + (turn * moved.variance) @ turn.T
+    lever[..., range(3), range(3)] = 1.0
+    lever[..., 0, 2], lever[..., 1, 2] = -ahead[..., 1], ahead[..., 0]
+    covariance = lever @ at.covariance @ np.swapaxes(lever, -1, -2)
+    covariance += (turn * moved.variance) @ np.swapaxes(turn, -1, -2)
     return Supposed(compose(at.pose, moved.motion), covariance)
 
 

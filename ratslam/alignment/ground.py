@@ -43,6 +43,21 @@ class Ground(NamedTuple):
         shift, row = np.nonzero(turned < reach_heading)
         return shift, close[row]
 
+    def near_all(
+        self, poses: np.ndarray, reach: np.ndarray, reach_heading: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`near` for poses [P, 3], each with its reaches [P].
+
+        Returns:
+            the numbers [n] of the poses, in order; the sector shifts [n] and keyframes [n].
+        """
+        x, y, heading = self.poses.T
+        apart = (x - poses[:, :1]) ** 2 + (y - poses[:, 1:2]) ** 2
+        one, frame = np.nonzero(apart < reach[:, None] ** 2)
+        turned = np.abs(wrap(heading[frame, None] + self.turns - poses[one, 2:]))
+        row, shift = np.nonzero(turned < reach_heading[one, None])
+        return one[row], shift, frame[row]
+
     def is_near(self, pose: np.ndarray, share: float) -> bool:
         """Whether a robot at `pose` [3] is compared with a keyframe within this share of both reaches."""
         return len(self.near(pose, share * self.reach, share * self.reach_heading)[0]) > 0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.alignment.following import STILL, Motion, Supposed, advance
+from ratslam.alignment.following import STILL, Motion, Supposed, advance_all
 from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
 from ratslam.alignment.ground import Ground
 from tactile.base.se2 import between, wrap
@@ -40,11 +40,11 @@ class Stretch(NamedTuple):
     motions: list[Motion]
     start: np.ndarray
 
-    def follow(self, pose: np.ndarray, count: int) -> np.ndarray:
-        """[count] gains of the first keyframes, supposed to begin at `pose` [3]."""
-        at, found = Supposed(pose, np.zeros((3, 3))), np.zeros(count)
+    def follow(self, poses: np.ndarray, count: int) -> np.ndarray:
+        """[P, count] gains of the first keyframes, supposed to begin at each of `poses` [P, 3]."""
+        at, found = Supposed(poses, np.zeros((len(poses), 3, 3))), np.zeros((len(poses), count))
         for k in range(count):
-            at, found[k] = advance(self.ground, at, self.motions[k], self.gains[k])
+            at, found[:, k] = advance_all(self.ground, at, self.motions[k], self.gains[k])
         return found
 
 
@@ -62,9 +62,9 @@ def compare_with_itself(ground: Ground, guard: int, gains: Gains, held: np.ndarr
     if count > first + LENGTH + guard:
         for begin in np.linspace(first, count - LENGTH - 1, STRETCHES).astype(int).tolist():
             stretch = _stretch(ground, begin, guard, gains, held)
-            true.append(_continued(stretch.follow(stretch.start, LENGTH)))
-            for pose in _alike(stretch):
-                false.append(_continued(stretch.follow(pose, LENGTH)))
+            here, *elsewhere = stretch.follow(np.stack([stretch.start, *_alike(stretch)]), LENGTH)
+            true.append(_continued(here))
+            false += map(_continued, elsewhere)
     return learn_gain_odds(np.concatenate(true), np.concatenate(false))
 
 
@@ -77,20 +77,17 @@ def _stretch(ground: Ground, begin: int, guard: int, gains: Gains, held: np.ndar
     return Stretch(earlier, found, motions, poses[0])
 
 
-def _alike(stretch: Stretch) -> list[np.ndarray]:
-    """Poses [3] elsewhere on the ground at which the beginning of the stretch fits best."""
+def _alike(stretch: Stretch) -> np.ndarray:
+    """Poses [n, 3] elsewhere on the ground at which the beginning of the stretch fits best."""
     ground = stretch.ground
     shift, frame = (index.reshape(-1) for index in np.indices((len(ground.turns), len(ground.poses))))
     claims = ground.claims(shift, frame)
     apart = np.hypot(*(claims - stretch.start)[:, :2].T)
     same = (apart < ELSEWHERE * ground.reach) & _facing(claims, stretch.start, ground)
     claims = _spread_out(claims[~same], ground)
-    fits = [np.where(np.isfinite(gain), gain, -1.0).sum() for gain in map(_beginning(stretch), claims)]
-    return [claims[k] for k in np.argsort(fits, kind="stable")[::-1][:ALIKE]]
-
-
-def _beginning(stretch: Stretch) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda pose: stretch.follow(pose, FIRST)
+    gains = stretch.follow(claims, FIRST)
+    fits = np.where(np.isfinite(gains), gains, -1.0).sum(axis=1)
+    return claims[np.argsort(fits, kind="stable")[::-1][:ALIKE]]
 
 
 def _spread_out(poses: np.ndarray, ground: Ground) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -102,15 +103,16 @@ def _separate(trial: BackendTrial) -> str:
 
 
 def _checkpoint(trial: BackendTrial) -> str:
-    observations = trial.walk(STEPS)
-    for stop in STOPS:
-        first = trial.fresh()
-        list(first.replay(observations[:stop]))
-        saved = _through_file(first.arrays())
+    expected, observations = trial.steps, trial.walk(STEPS)
+    first, saved = trial.fresh(), []
+    for begin, stop in pairwise((0, *STOPS)):
+        list(first.replay(observations[begin:stop]))
+        saved.append(_through_file(first.arrays()))
+    for stop, arrays in zip(STOPS, saved, strict=True):
         second = trial.fresh()
-        second.restore(saved)
+        second.restore(arrays)
         what = f"a session and one restored after step {stop}"
-        require_equal(trial.steps[stop:], list(second.replay(observations[stop:])), what)
+        require_equal(expected[stop:], list(second.replay(observations[stop:])), what)
         require_equal(trial.arrays, second.arrays(), f"the arrays of {what}")
     return ""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ratslam.keyframes.optimizer import CalibrationPrior
 
@@ -48,15 +47,15 @@ def vote(
     votes = np.logaddexp(0.0, score_odds[:, None] + log_ratios)
     total = log_prior(grid, prior) + votes.sum(axis=0)
     others = total - votes
-    others = others - logsumexp(others, axis=1, keepdims=True)
-    share = np.exp(total - logsumexp(total))
+    others = others - _log_sum(others)[:, None]
+    share = np.exp(total - _log_sum(total))
     bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_bias_sd)
     turn, turn_mean, turn_sd = _belief(share, grid[:, 1], prior.turn_error, LEAST_TURN_ERROR)
     turn_sd = turn_sd if prior.turn_error_sd > 0 else 0.0
     return CalibrationVote(
         CalibrationPrior(bias, bias_sd, turn, turn_sd),
         CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd),
-        score_odds + logsumexp(others + log_ratios, axis=1),
+        score_odds + _log_sum(others + log_ratios),
     )
 
 
@@ -66,6 +65,13 @@ def log_prior(grid: np.ndarray, prior: CalibrationPrior) -> np.ndarray:
     if prior.turn_error_sd > 0:
         log = log - 0.5 * ((grid[:, 1] - prior.turn_error) / prior.turn_error_sd) ** 2
     return log
+
+
+def _log_sum(values: np.ndarray) -> np.ndarray:
+    """[...] logarithm of the sum of the exponentials of finite values [..., G]; scipy's function, which also
+    handles other values, needs several times as long for few of them."""
+    largest = values.max(axis=-1)
+    return largest + np.log(np.exp(values - largest[..., None]).sum(axis=-1))
 
 
 def _belief(

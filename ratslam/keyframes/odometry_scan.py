@@ -10,7 +10,6 @@ import numpy as np
 
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.optimizer import CalibrationPrior
-from tactile.base.se2 import wrap
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241
 """Largest difference of a heading bias of the grid from the prior's, rad per cell, and number of biases."""
@@ -21,6 +20,9 @@ REACH = 3.7
 """Standard deviations of the prior beyond which points of the grid are left out."""
 UNLIKELY = -60.0
 """Log ratio of a place that odometry excludes."""
+POINTS = 64
+"""Points of the grid that are computed together: few enough that their paths stay in the processor's
+cache."""
 
 
 class OdometryScan:
@@ -65,20 +67,27 @@ class OdometryScan:
                 NaN.
         """
         self._extend()
+        ratios = np.full(len(self.grid), np.nan)
+        for first in range(0, len(near), POINTS):
+            points = near[first : first + POINTS]
+            ratios[points] = self._ratios_at(member, points)
+        return ratios
+
+    def _ratios_at(self, member: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """[g] of `log_ratios` at these points of the grid."""
         j, i, shift = (int(value) for value in member[:3])
-        heading = self._total[: j + 1, :1] + self._total[: j + 1, 1:] @ self.grid[near].T
-        position = self._position[: j + 1, near].astype(complex)
+        heading = self._total[: j + 1, :1] + self._total[: j + 1, 1:] @ self.grid[points].T
+        position = self._position[: j + 1, points].astype(complex)
         root = np.linalg.cholesky(np.linalg.inv(self._covariance(i, j, position)))  # of the information
         old = max(j - self._graph.guard, 1)
-        apart = position[:old] - position[j]
-        turned = wrap(heading[:old] - shift * self._graph.sector_angle - heading[j])
-        along = root[:, 0, 0] * apart.real + root[:, 1, 0] * apart.imag + root[:, 2, 0] * turned
-        across = root[:, 1, 1] * apart.imag + root[:, 2, 1] * turned
+        x, y = position.real[:old] - position.real[j], position.imag[:old] - position.imag[j]
+        turned = heading[:old] - shift * self._graph.sector_angle - heading[j]
+        turned -= 2 * np.pi * np.rint(turned / (2 * np.pi))
+        along = root[:, 0, 0] * x + root[:, 1, 0] * y + root[:, 2, 0] * turned
+        across = root[:, 1, 1] * y + root[:, 2, 1] * turned
         distance = along**2 + across**2 + (root[:, 2, 2] * turned) ** 2
         total = np.maximum(np.exp(-distance / 2).sum(axis=0), 1.0)
-        ratios = np.full(len(self.grid), np.nan)
-        ratios[near] = np.maximum(np.log(old) - distance[i] / 2 - np.log(total), UNLIKELY)
-        return ratios
+        return np.maximum(np.log(old) - distance[i] / 2 - np.log(total), UNLIKELY)
 
     def _covariance(self, i: int, j: int, position: np.ndarray) -> np.ndarray:
         """[g, 3, 3] covariance of the motion from keyframe i to j in the frame of the path, with the gate.

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.alignment.following import STILL, Motion, Supposed, advance, move
+from ratslam.alignment.following import STILL, Motion, Supposed, advance, advance_all, move
 from tactile.base.se2 import compose
 from tests.ratslam.alignment.alignment_cases import (
     MOTIONS,
@@ -56,6 +56,24 @@ def test_the_covariance_stays_symmetric_and_positive(pose: np.ndarray, path: lis
         np.testing.assert_allclose(at.covariance, at.covariance.T, rtol=0, atol=1e-15)
         assert np.linalg.eigvalsh(at.covariance).min() > 0
         assert -np.pi <= at.pose[2] <= np.pi
+
+
+@given(st.lists(POSES, min_size=1, max_size=5), PATHS, SEEDS)
+def test_many_poses_advance_as_each_alone(poses: list[np.ndarray], path: list[Motion], seed: int) -> None:
+    stream = np.random.default_rng(seed)
+    around = [compose(pose, stream.normal(0, 0.2, (10, 3))) for pose in poses]
+    ground = ground_at(np.concatenate(around), (0.0, np.pi))
+    alone = [supposed(pose, 0.0) for pose in poses]
+    together = Supposed(np.stack(poses), np.zeros((len(poses), 3, 3)))
+    for moved in [STILL, *path]:
+        gain = stream.normal(0, 2, (2, 10 * len(poses)))
+        together, gains = advance_all(ground, together, moved, gain)
+        pairs = [advance(ground, at, moved, gain) for at in alone]
+        alone = [at for at, _ in pairs]
+        np.testing.assert_array_equal(gains, [best for _, best in pairs])
+        for k, at in enumerate(alone):
+            np.testing.assert_array_equal(together.pose[k], at.pose)
+            np.testing.assert_array_equal(together.covariance[k], at.covariance)
 
 
 @given(POSES, MOTIONS)

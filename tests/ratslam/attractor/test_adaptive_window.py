@@ -75,7 +75,7 @@ def random_motion(n, seed, often, speed, steps):
         assert not np.any(level)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(
     st.sampled_from([21, 41]),
     st.integers(0, 2**32 - 1),
@@ -86,8 +86,7 @@ def test_some_hundred_steps_equal_those_of_the_torus(n, seed, often, speed):
     random_motion(n, seed, often, speed, 200)
 
 
-@settings(max_examples=6)
-@given(
+injections = given(
     st.lists(
         st.tuples(
             st.integers(0, 119),
@@ -101,7 +100,9 @@ def test_some_hundred_steps_equal_those_of_the_torus(n, seed, often, speed):
     st.floats(-1, 1),
     st.floats(-1, 1),
 )
-def test_injections_at_any_distance_from_the_packet_are_exact(planted, speed, turn):
+
+
+def injected(planted, speed, turn):
     """Injections across the faces of windows, a few cells from the packet."""
     motion = np.tile([speed, 0.0, turn], (120, 1))
     recall, energy = np.zeros((120, 3)), np.zeros(120)
@@ -109,6 +110,19 @@ def test_injections_at_any_distance_from_the_packet_are_exact(planted, speed, tu
     for k, x, y, heading, how_much in planted:
         recall[k], energy[k] = (at + [x, y, heading]) % [41, 41, 36], how_much
     compare(41, motion, recall, energy)
+
+
+@settings(max_examples=3)
+@injections
+def test_injections_at_any_distance_from_the_packet_are_exact(planted, speed, turn):
+    injected(planted, speed, turn)
+
+
+@pytest.mark.soak
+@settings(max_examples=30)
+@injections
+def test_many_injections_at_any_distance_from_the_packet_are_exact(planted, speed, turn):
+    injected(planted, speed, turn)
 
 
 @pytest.mark.parametrize(

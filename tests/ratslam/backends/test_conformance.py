@@ -21,7 +21,7 @@ from ratslam.examples import dead_reckoning
 
 def pose_cells(method, source, **more):
     """Both engines of the pose cells."""
-    engine = "window" if method == "recall" and not more else "dense"
+    engine = "window" if method == "classic" else "dense"
     parts = {"pose_cells": {"cells_xy": 11, "engine": engine}, "templates": {"source": source}}
     return method, parts | more
 
@@ -52,8 +52,8 @@ METHODS = {
     "localise_grid": ("localise_grid", {"grid": DOUBTFUL}),
 }
 EXAMPLE = "dead-reckoning"
-OFTEN = {"recall-labels", "classic-labels", "signed-touch"}
-"""Backends that differ from another one only by the kind of views: for `make soak`."""
+OFTEN = {"recall", "recall-labels", "classic-labels", "signed-touch"}
+"""Backends that differ from another one by the kind of views, or do less: for `make soak`."""
 
 
 def some(names):

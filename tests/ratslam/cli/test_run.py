@@ -38,16 +38,27 @@ def square(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    """A config that runs for some seconds, and its uninterrupted run."""
+def corridor_run(tmp_path_factory):
+    """A config that runs for some seconds, its uninterrupted run, and the session of this run."""
     folder = tmp_path_factory.mktemp("corridor")
     config = folder / "long.yaml"
     golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
     config.write_text(
         f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 25, cell_size: 0.02, engine: dense}}\n"
     )
-    assert main(["run", str(config), "-o", str(folder / "whole")]) == 0
-    return config, folder / "whole"
+    with (
+        open_observations(load_config(config)) as (completed, source),
+        open_runner(completed, source, folder / "whole") as runner,
+    ):
+        assert not process_source(runner, source)
+        runner.finish(interrupted=False)
+        return config, folder / "whole", runner.session
+
+
+@pytest.fixture(scope="module")
+def corridor(corridor_run):
+    """The config and the run."""
+    return corridor_run[:2]
 
 
 def start(config, directory):
@@ -150,15 +161,10 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
     assert (whole / "trajectory.tum").read_text().endswith((second / "trajectory.tum").read_text())
 
 
-def test_a_run_of_known_length_compiles_its_kernel_once(corridor, tmp_path):
-    with (
-        open_observations(load_config(corridor[0])) as (config, source),
-        open_runner(config, source, tmp_path / "run") as runner,
-    ):
-        assert not process_source(runner, source)
-        runner.finish(interrupted=False)
-        assert runner.session.backend.rows(runner.session.state) > 256, "fits into the smallest capacity"
-        assert runner.session.compilations() == 1
+def test_a_run_of_known_length_compiles_its_kernel_once(corridor_run):
+    _, _, session = corridor_run
+    assert session.backend.rows(session.state) > 256, "fits into the smallest capacity"
+    assert session.compilations() == 1
 
 
 def check_killed_run(corridor, directory):

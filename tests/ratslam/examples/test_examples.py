@@ -25,6 +25,8 @@ STEPS = (
     "one_packet", "path_integration", "two_packets", "view_templates", "first_loop", "places_that_look_alike",
     "whisker_images", "grid_filter", "a_bag", "sensor_live", "come_back", "cells_of_a_rat",
 )  # fmt: skip
+LONG = {"a_bag", "come_back", "own_metric", "places_that_look_alike", "sensor_live"}
+"""Examples that take longest, on parts of the program that have tests of their own: for `make soak`."""
 FOLDER = Path(ratslam.examples.__file__).parent
 PICTURES = FOLDER.parents[1] / "docs" / "examples"
 
@@ -39,7 +41,10 @@ def own_names() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("own_names")
-@pytest.mark.parametrize("name", [*NAMES, *STEPS])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=pytest.mark.soak) if one in LONG else one for one in (*NAMES, *STEPS)],
+)
 def test_an_example_prints_what_its_docstring_says(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@ and its control written by hand."""
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -32,6 +33,18 @@ DECOYS = many(range(50, 185, 7), 4, 4.0)
 BOTH = FALSE | TRUE
 
 
+@cache
+def loop_map():
+    """The map of the true sequence; tests share it and do not change it."""
+    return drive(new_map(), TRUE)
+
+
+@cache
+def alias_map():
+    """The same of the true sequence and the false one."""
+    return drive(new_map(), BOTH)
+
+
 def verdicts(map):
     """Verdict and log odds of every sequence."""
     table = map.candidates()
@@ -45,7 +58,7 @@ def same(a, b):
 
 
 def test_a_clean_loop_is_accepted():
-    found = drive(new_map(), TRUE)
+    found = loop_map()
     (verdict, odds), *others = verdicts(found).values()
     assert not others
     assert verdict == Verdict.ACCEPTED
@@ -56,7 +69,7 @@ def test_a_clean_loop_is_accepted():
 
 def test_an_alias_that_the_covariance_allows_is_refused():
     """Evidence and covariance accept the alias, and then refuse the true sequence that contradicts it."""
-    before, after = drive(new_map(by_evidence), BOTH), drive(new_map(), BOTH)
+    before, after = drive(new_map(by_evidence), BOTH), alias_map()
     assert [verdict for verdict, _ in verdicts(before).values()] == [Verdict.ACCEPTED, Verdict.OPEN]
     assert [verdict for verdict, _ in verdicts(after).values()] == [Verdict.OPEN, Verdict.ACCEPTED]
     assert np.hypot(*(after.trajectory()[LAP + 5] - after.trajectory()[5])[:2]) < CELL
@@ -68,7 +81,7 @@ def test_sequences_of_the_control_raise_the_evidence_that_is_needed():
         assert odds < MIN_LOG_ODDS
     assert len(weak.closures()) == 0
     assert [verdict for verdict, _ in verdicts(strong).values()] == [Verdict.ACCEPTED]
-    assert [odds for _, odds in verdicts(drive(new_map(), BOTH)).values()] > [
+    assert [odds for _, odds in verdicts(alias_map()).values()] > [
         odds for _, odds in verdicts(weak).values()
     ]
 
@@ -97,7 +110,7 @@ def test_a_pending_verdict_has_its_odds_in_the_table():
     assert (pending[:, 7] == Verdict.OPEN).all()
     assert len(set(pending[:, 9])) == 1
     assert -np.inf < pending[0, 9] < MIN_LOG_ODDS
-    accepted = drive(new_map(), TRUE).candidates()
+    accepted = loop_map().candidates()
     assert (accepted[:, 7] == Verdict.ACCEPTED).all()
     assert (accepted[:, 9] >= MIN_LOG_ODDS).all()
     assert np.isnan(drive(new_map(by_evidence), TRUE).candidates()[:, 9]).all()
@@ -161,7 +174,8 @@ def test_no_evidence_joins_what_a_carried_robot_contradicts(at, length):
 
 
 def test_an_undone_sequence_stays_undone():
-    found = drive(new_map(), TRUE)
+    found = new_map()
+    found.restore(loop_map().arrays())
     found.undo(0)
     assert len(found.closures()) == 0
     assert verdicts(found)[0][0] == Verdict.UNDONE
@@ -170,7 +184,7 @@ def test_an_undone_sequence_stays_undone():
 
 
 def test_recall_gets_the_calibration_of_the_map():
-    found, without = drive(new_map(), TRUE), drive(new_map(turn_error_sd=0.0), TRUE)
+    found, without = loop_map(), drive(new_map(turn_error_sd=0.0), TRUE)
     for map in (found, without):
         graph, feedback = map.keyframes(), map.feedback()
         assert (feedback.bias, feedback.turn_error) == (graph.bias, graph.turn_error)

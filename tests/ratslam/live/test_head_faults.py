@@ -28,7 +28,7 @@ def gaps(recorded: RecordedData) -> int:
     ids=lambda value: value["do"] if isinstance(value, dict) else "",
 )
 def test_a_head_that_stays_away_ends_the_session(bench: Bench, fault: dict, outcome: str) -> None:
-    with bench.in_motion(head={"patience": 3.0, "silence": 1.0}) as session:
+    with bench.in_motion(head={"patience": 1.5, "silence": 1.0}) as session:
         at = bench.moment()
         bench.head(**fault)
         until(bench.still, "the arm stands while the head sends nothing")

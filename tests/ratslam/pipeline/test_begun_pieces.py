@@ -50,20 +50,34 @@ def replayed() -> tuple[list[Step], dict[str, np.ndarray]]:
     return steps, session.arrays()
 
 
+@cache
+def begun() -> tuple[list[Step], dict[str, np.ndarray]]:
+    """The steps of a replay of `carried` to some steps after the beginning of the piece, and the session."""
+    session = empty_session()
+    steps = replay(session, carried().readings[: CARRIED + 12])
+    return steps, session.arrays()
+
+
+def begun_session() -> Session:
+    _, arrays = begun()
+    session = empty_session()
+    session.restore(arrays)
+    return session
+
+
 def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
     assert one.keys() == other.keys()
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
 
 
 def test_a_new_piece_lies_apart_until_closures_join_it() -> None:
-    walk, session = carried(), empty_session()
-    replay(session, walk.readings[: CARRIED + 12])
-    begun = session.map.pieces()
-    assert begun.tolist() == [0] * CARRIED + [1] * 12
+    walk, session = carried(), begun_session()
+    pieces = session.map.pieces()
+    assert pieces.tolist() == [0] * CARRIED + [1] * 12
     path = session.map.trajectory()
     apart = np.hypot(*(path[:CARRIED, None, :2] - path[None, CARRIED:, :2]).transpose(2, 0, 1))
     assert apart.min() > APART / 2 * session.map.cell
-    assert not any(piece[0] != piece[1] for piece in begun[session.map.closures()])
+    assert not any(piece[0] != piece[1] for piece in pieces[session.map.closures()])
     follow(session, walk.readings[CARRIED + 12 :])
     assert not session.map.pieces().any()
     assert metric(session.map.trajectory(), walk.truth) < 0.1
@@ -136,8 +150,7 @@ def test_a_piece_that_stays_untied_continues_from_a_checkpoint(stop: int) -> Non
 
 
 def test_no_link_leads_from_one_piece_to_the_next() -> None:
-    walk, session = carried(), empty_session()
-    steps = replay(session, walk.readings[: CARRIED + 12])
+    session, (steps, _) = begun_session(), begun()
     graph = session.map.graph()
     before = {int(step.estimate.place) for step in steps[:CARRIED]}
     after = {int(step.estimate.place) for step in steps[CARRIED:]}
@@ -158,8 +171,7 @@ def test_a_piece_of_a_map_that_merges_keyframes_is_joined_and_merged() -> None:
 
 
 def test_files_of_the_map_know_its_pieces(tmp_path: Path) -> None:
-    walk, session = carried(), empty_session()
-    replay(session, walk.readings[: CARRIED + 12])
+    session = begun_session()
     for name, write in session.map.files().items():
         write(tmp_path / name)
     nodes = read_json(tmp_path / "map.json").nodes

@@ -28,7 +28,7 @@ from tests.ratslam.pipeline.touch_walks import (
 )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 4))])
 def test_laps_are_closed_and_the_map_is_corrected(seed: int) -> None:
     walk = simulate_walk(seed)
     found = map_walk(walk.readings)
@@ -38,7 +38,7 @@ def test_laps_are_closed_and_the_map_is_corrected(seed: int) -> None:
     assert metric(found.path, walk.truth) < 0.3 * metric(dead_reckoning(walk.readings), walk.truth)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 2))])
 def test_three_whiskers_may_be_dead(seed: int) -> None:
     walk = simulate_walk(seed, dead=(1, 8, 15))
     found = map_walk(walk.readings)
@@ -61,7 +61,7 @@ def test_the_signals_of_dead_whiskers_do_not_change_the_map() -> None:
     assert np.array_equal(found.closures, same.closures)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
 def test_laps_in_the_opposite_direction_are_closed(seed: int) -> None:
     """The opposite whiskers touch the same walls."""
     walk = simulate_walk(seed, path={"circuits": "CCAA"})

@@ -210,7 +210,7 @@ def second_pass(kind, seed, mirrored):
     ]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("kind", ["ordered sectors", "columns", "whiskers"])
 def test_a_path_in_the_mirror_swaps_recall_and_its_control(kind, seed):
     recalled, control = second_pass(kind, seed, False)

@@ -19,10 +19,12 @@ def test_every_figure_has_a_title_and_can_be_measured(name: str) -> None:
     assert callable(figure.measure)
 
 
-def test_scores_agree_with_other_packages() -> None:
+# In make test the same session as below, and so the same compiled kernel.
+@pytest.mark.parametrize(("cells", "seconds"), [(12, 30.0), pytest.param(30, 120.0, marks=pytest.mark.soak)])
+def test_scores_agree_with_other_packages(cells: int, seconds: float) -> None:
     pytest.importorskip("opexebo", reason="compared with")
     pytest.importorskip("pynapple", reason="compared with")
-    found = compare_scores(CellTask(3, 30), seconds=120.0)
+    found = compare_scores(CellTask(3, cells), seconds=seconds)
     assert {one.score: one.difference() for one in found if not one.difference() <= GOAL} == {}
     assert len(list(agreement_table(found))) == 2 + len(found)
 
