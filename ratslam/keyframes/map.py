@@ -24,6 +24,7 @@ from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.calibration import calibration_from_views
+from ratslam.keyframes.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -171,6 +172,9 @@ class KeyframeMap(Checkpointed, Map):
         """The final map of the keyframes that are not merged."""
         if self._kept is None:
             self._kept = self._solve_finally().placed(self._graph)
+            if is_retraced(self.keyframes()) and self.closes_loops:
+                self._solution = retraced_solution(self.keyframes(), self.solution())
+                self._kept = kept_part(self._solution, self._kept, self._graph.taken.rows)
         return self._kept
 
     def graph(self) -> networkx.DiGraph:
