@@ -164,18 +164,23 @@ class KeyframeMap(Checkpointed, Map):
     def solution(self) -> MapSolution:
         """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
-            kept, archive = self.kept_solution(), self.archive
-            self._solution = archive.solve(kept, self._graph) if archive.begun else kept
+            kept = self.kept_solution()
+            if self._solution is None:  # not retraced
+                self._solution = self._unmerged(kept)
         return self._solution
 
     def kept_solution(self) -> MapSolution:
         """The final map of the keyframes that are not merged."""
         if self._kept is None:
             self._kept = self._solve_finally().placed(self._graph)
-            if is_retraced(self.keyframes()) and self.closes_loops:
-                self._solution = retraced_solution(self.keyframes(), self.solution())
+            if self.closes_loops and is_retraced(self.keyframes()):
+                self._solution = retraced_solution(self.keyframes(), self._unmerged(self._kept))
                 self._kept = kept_part(self._solution, self._kept, self._graph.taken.rows)
         return self._kept
+
+    def _unmerged(self, kept: MapSolution) -> MapSolution:
+        """The map `kept` as one of all keyframes."""
+        return self.archive.solve(kept, self._graph) if self.archive.begun else kept
 
     def graph(self) -> networkx.DiGraph:
         """See `Experiences.graph`."""
