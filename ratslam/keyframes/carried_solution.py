@@ -1,11 +1,11 @@
 """The final map of a robot that may be carried: the odometry cut where all views together show it.
 
-While a session goes on, a cut is found from one closure sequence at a time: it lies up to a lap off, or is missing
-where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are selected anew with
-the odometry cut there, and so on in turn, because each makes the other better. Each time it is retraced once on
-all keyframes and once on the earlier ones alone: two stretches at one wrong place bear each other out, but the first
-of them has to fit what was there before. Of all these maps the one that the views and the measurements together find
-most likely is given."""
+While a session goes on, a cut is found from one closure sequence at a time: it lies up to a lap off, or is
+missing where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are
+selected anew with the odometry cut there, and so on in turn, because each makes the other better. Each time
+it is retraced once on all keyframes and once on the earlier ones alone: two stretches at one wrong place bear
+each other out, but the first of them has to fit what was there before. Of all these maps and the one before,
+the one that the views and the measurements together find most likely is given. The method is ours."""
 
 from __future__ import annotations
 
@@ -33,17 +33,19 @@ from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
 ROUNDS = 3
 """Number of times that the robot is retraced."""
 MOST_RETRACED = 2000
-"""Largest number of keyframes of a map that is retraced: each is compared with every other."""
+"""Largest number of keyframes of a map that is retraced: each is compared with every other, and the selections
+take about the square of their number."""
 FEWEST_RETRACED = 100
 """Least number of them: fewer teach nothing about how views fit."""
 
 
 class Case(NamedTuple):
-    """The selection with the odometry cut before keyframes `cuts` [n].
+    """What is selected from once the odometry is cut.
 
     Attributes:
-        log: without the candidates that lie across a cut. sequences: [R] those to select from. breaks: (keyframe,
-            the first of these after it, the last if there is none) of each cut.
+        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem: among
+            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one if
+            there is none.
     """
 
     log: ClosureLog
@@ -58,7 +60,7 @@ class Case(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """A selection, and how likely it is with what all views say, nat."""
+    """A selection, and its log-likelihood with what all views say, nat."""
 
     case: Case
     selection: Selection
@@ -104,6 +106,7 @@ def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> Map
 
 
 def _case(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+    """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
     log = log.copy()
     log.strike_across(cuts)
     sequences = np.flatnonzero(sequences_to_select(graph, log))
@@ -123,9 +126,7 @@ def _retrace(
     """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
     fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
     ground = TrackGround.of_map(graph, fit, fits)
-    found = retrace(
-        ground._replace(fits=compared), learn_odds(ground), cuts, log, graph.sector_angle
-    )
+    found = retrace(ground._replace(fits=compared), learn_odds(ground), cuts, log, graph.sector_angle)
     case = _case(graph, log, found.cuts)
     return _judge(graph, fits, odds, case, case.starts(fit._replace(poses=found.poses)))
 
@@ -133,7 +134,11 @@ def _retrace(
 def _judge(
     graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, starts: list[MapFit]
 ) -> Judged:
-    """The most likely of the selections from these starts."""
+    """The most likely of the selections from these starts.
+
+    Args:
+        fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
+    """
     found = []
     for start in starts:
         selection = optimise_with_cuts(case.problem, start, case.breaks)
@@ -144,6 +149,7 @@ def _judge(
 
 
 def _uncut(graph: KeyframeGraph) -> GrowableArray:
+    """[N] no keyframe cut, see `KeyframeGraph.cut`."""
     cut = GrowableArray((), np.int64)
     cut.replace(np.full(graph.count, -1))
     return cut

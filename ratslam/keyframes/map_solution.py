@@ -102,8 +102,8 @@ def selection_case(
     sequences: np.ndarray,
     place: Callable[[np.ndarray], np.ndarray],
 ) -> SelectionProblem:
-    """The problem of a selection among sequences [R], which the log then holds for accepted, with the odometry
-    broken at `cut`."""
+    """The problem of a selection among sequences [R], which the log then holds for accepted, with the
+    odometry broken at `cut`."""
     for sequence in np.flatnonzero((log.left() > 0) & (log.verdicts() != Verdict.UNDONE)).tolist():
         log.judge(sequence, Verdict.OPEN)
     for sequence in sequences.tolist():

@@ -1,8 +1,9 @@
 """Tracks: a supposed pose followed from keyframe to keyframe, and how well the views fit on the way.
 
-The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed on
-it; none is compared with keyframes of nearly the same time. The rule is that of `ratslam.alignment.following` with
-variances of position and heading alone, in compiled loops, because hundreds of tracks are followed."""
+The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
+on it; none is compared with keyframes of nearly the same time. The rule is that of
+`ratslam.alignment.following` with variances of position and heading alone, in compiled loops, because hundreds
+of tracks are followed."""
 
 from __future__ import annotations
 
@@ -64,14 +65,14 @@ class TrackGround(NamedTuple):
         return cls(fit.poses, turns, fits, motions, variances, spread, reach, REACH_HEADING)
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         return len(self.poses)
 
     def own_fits(self) -> np.ndarray:
         """[N] how well each view fits at the keyframe's own pose, NaN where no keyframe is near."""
         reach = self.reach, self.reach_heading
         looked = (
-            _look(self.poses, self.turns, self.fits[k], self.poses[k], *reach)[0] for k in range(self.count)
+            _look(self.poses, self.turns, self.fits[k], self.poses[k], *reach)[0] for k in range(self.size)
         )
         return np.array(list(looked))
 
@@ -89,7 +90,7 @@ class TrackGround(NamedTuple):
         Returns:
             keyframes [n], poses [n, 3], fits [n] and log-odds [n] of those that come after `frame`.
         """
-        stop = min(max(stop, 0), self.count - 1)
+        stop = min(max(stop, 0), self.size - 1)
         ahead = stop >= frame
         frames = np.arange(frame + 1, stop + 1) if ahead else np.arange(frame - 1, stop - 1, -1)
         motions = self.motions[frames - 1] if ahead else inverse(self.motions[frames])
@@ -101,7 +102,7 @@ class TrackGround(NamedTuple):
 
     def track(self, frame: int, pose: np.ndarray, extent: int, odds: GainOdds) -> Track:
         """The track through a keyframe at a pose [3], at most `extent` keyframes before and after it."""
-        track = Track(np.full((self.count, 3), np.nan), np.full(self.count, -np.inf))
+        track = Track(np.full((self.size, 3), np.nan), np.full(self.size, -np.inf))
         look = _look(self.poses, self.turns, self.fits[frame], pose, self.reach, self.reach_heading)
         track.poses[frame] = pose
         track.odds[frame] = LEAVING if np.isnan(look[0]) else odds.of(look[0])
@@ -117,7 +118,7 @@ class TrackGround(NamedTuple):
     def scan(self, frame: int, places: np.ndarray, length: int) -> np.ndarray:
         """[C] how well the views of a keyframe and those after it, `length` together, fit if the keyframe is
         at each of the places [C, 3]."""
-        last = min(frame + length, self.count)
+        last = min(frame + length, self.size)
         reach = self.reach, self.reach_heading
         return _scan(self.poses, self.turns, self.fits, self.motions, places, frame, last, *reach)
 
@@ -131,8 +132,8 @@ def _turned(angle: float) -> float:
 def _look(
     poses: np.ndarray, turns: np.ndarray, fits: np.ndarray, pose: np.ndarray, reach: float, turn: float
 ) -> tuple[float, float, float, float]:
-    """The best fit [S, N] of the keyframes near a pose, NaN without any, and the mean difference from it of the
-    poses that they claim, weighted by the likelihood (m, m, rad)."""
+    """The best fit [S, N] of the keyframes near a pose, NaN without any, and the mean difference from it of
+    the poses that they claim, weighted by the likelihood (m, m, rad)."""
     best, total, dx, dy, da = -np.inf, 0.0, 0.0, 0.0, 0.0
     for i in range(len(poses)):
         x, y = poses[i, 0] - pose[0], poses[i, 1] - pose[1]

@@ -1,9 +1,9 @@
 """Retracing: where a robot that may be carried was at each keyframe of a finished map, all views considered.
 
 The map's own stretches between breaks, the places that closure sequences claim and, where the map's poses fit
-badly, the places that look alike are followed as tracks in both directions. The sequence of tracks with the largest
-log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967); it is
-cut where it jumps from one track to another. That its states are tracks is ours."""
+badly, the places that look alike are followed as tracks in both directions. The sequence of tracks with the
+largest log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967); odometry
+is cut where it jumps from one track to another. That its states are tracks is ours."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def retrace(
     _search(tracks, ground, odds)
     poses, gained = (np.stack(part) for part in zip(*tracks, strict=True))
     chosen, jumps, total = _best_sequence(poses, gained, ground.reach, ground.reach_heading, JUMP)
-    return Retraced(poses[chosen, np.arange(ground.count)], total, np.flatnonzero(jumps))
+    return Retraced(poses[chosen, np.arange(ground.size)], total, np.flatnonzero(jumps))
 
 
 def _own_tracks(ground: TrackGround, odds: GainOdds, cuts: np.ndarray) -> list[Track]:
     """The stretches of the map between its cuts, followed on beyond them."""
     own, tracks = ground.own_odds(odds), []
-    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), ground.count], strict=True):
-        track = Track(np.full((ground.count, 3), np.nan), np.full(ground.count, -np.inf))
+    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), ground.size], strict=True):
+        track = Track(np.full((ground.size, 3), np.nan), np.full(ground.size, -np.inf))
         track.poses[first:last], track.odds[first:last] = ground.poses[first:last], own[first:last]
         for end, stop in ((last - 1, last - 1 + BEYOND), (first, first - BEYOND)):
             frames, poses, _, gained = ground.follow(end, ground.poses[end], stop, odds)
@@ -115,7 +115,7 @@ def _best_sequence(
     score = odds[:, 0].copy()
     before, jumped = np.zeros((count, tracks), np.int64), np.zeros((count, tracks), np.bool_)
     for k in range(1, count):
-        best, after = np.argmax(score), np.full(tracks, -np.inf)
+        best, after = int(np.argmax(score)), np.full(tracks, -np.inf)
         for t in range(tracks):
             if odds[t, k] == -np.inf:
                 continue

@@ -21,8 +21,8 @@ EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
 
 
 def view_fits(graph: KeyframeGraph) -> np.ndarray:
-    """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another (last
-    axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
+    """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
+    (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
     count, shifts = graph.count, 2 if np.cos(graph.sector_angle) < 0 else 1
     fits = np.empty((count, shifts, count), np.float32)
     every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
@@ -43,7 +43,7 @@ def learn_odds(ground: TrackGround) -> GainOdds:
     alike."""
     true, false = ground.own_fits(), [np.zeros(0)]
     places = ground.places()
-    frames = np.arange(FIRST, ground.count - FIRST - FURTHER, max(ground.count // SAMPLES, 1))
+    frames = np.arange(FIRST, ground.size - FIRST - FURTHER, max(ground.size // SAMPLES, 1))
     for frame in frames.tolist():
         fits = ground.scan(frame, places, FIRST)
         apart = np.hypot(*(places - ground.poses[frame])[:, :2].T)
