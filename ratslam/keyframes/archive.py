@@ -97,8 +97,8 @@ class Archive(Checkpointed):
         return MapSolution(solution.fit._replace(poses=poses), self.log, cut)
 
     def solve(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
-        """A solution of the map as one of all keyframes, solved for if these are not too many; the same before
-        any merge."""
+        """A solution of the map as one of all keyframes, solved for if these are not too many; the same
+        before any merge."""
         if not self.begun:
             return solution
         fit, _, cut = self.follow(solution, graph)

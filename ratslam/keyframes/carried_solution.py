@@ -33,8 +33,7 @@ from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
 ROUNDS = 3
 """Number of times that the robot is retraced."""
 MOST_RETRACED = 2000
-"""Largest number of keyframes of a map that is retraced: each is compared with every other, and the selections
-take about the square of their number."""
+"""Largest number of keyframes of a map that is retraced: each is compared with every other."""
 FEWEST_RETRACED = 100
 """Least number of them: fewer teach nothing about how views fit."""
 

@@ -2,8 +2,8 @@
 
 The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
 on it; none is compared with keyframes of nearly the same time. The rule is that of
-`ratslam.alignment.following` with variances of position and heading alone, in compiled loops, because hundreds
-of tracks are followed."""
+`ratslam.alignment.following` with variances of position and heading alone, in compiled loops, because
+hundreds of tracks are followed."""
 
 from __future__ import annotations
 

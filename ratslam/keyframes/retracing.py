@@ -2,8 +2,8 @@
 
 The map's own stretches between breaks, the places that closure sequences claim and, where the map's poses fit
 badly, the places that look alike are followed as tracks in both directions. The sequence of tracks with the
-largest log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967); odometry
-is cut where it jumps from one track to another. That its states are tracks is ours."""
+largest log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967);
+odometry is cut where it jumps from one track to another. That its states are tracks is ours."""
 
 from __future__ import annotations
 
