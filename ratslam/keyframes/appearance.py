@@ -44,6 +44,8 @@ LOG_ODDS_INTERVAL = 40
 """Keyframes between two estimates of the log-odds of whisker images."""
 NEW_IMAGE_LOG_ODDS = 3.0
 """Log-odds that stand for a whisker image never seen before."""
+SAME_ID_LOG_ODDS = 3.0
+"""Log-odds of one place where the given ids are equal, and against it where they differ."""
 NEUTRAL_MISFIT = 0.5
 """Misfit of a keyframe without others to compare it with."""
 NEUTRAL_IMAGE_MISFIT = float(np.log(2))
@@ -120,6 +122,11 @@ class Appearance(Checkpointed, ABC):
         keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
 
     @abstractmethod
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] log-odds that the view of a keyframe and that of each of the keyframes `others` [n] are of one
+        place, nat; `reversed` as in `misfit`."""
+
+    @abstractmethod
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
         (`reversed` [n] bool); 0 or more."""
@@ -152,6 +159,9 @@ class LabelAppearance(Appearance):
 
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return (self._label.rows[others] != self._label.rows[frame]).astype(float)
+
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return SAME_ID_LOG_ODDS * (1 - 2 * self.unlikeness(frame, others, reversed))
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         if not len(near):
@@ -226,6 +236,10 @@ class ViewAppearance(Appearance):
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Mean absolute differences."""
         return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
+
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """1 for equal views, 0 at the scale of errors, which few different places stay below."""
+        return 1 - self.unlikeness(frame, others, reversed) / max(self._scale[1], 1e-300)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """0..1: the smallest error against the keyframes, relative to twice the scale."""
@@ -311,6 +325,9 @@ class WhiskerAppearance(Appearance):
         return -summed_log_odds(
             self._likeness, pixels.group, self._level.rows, pixels.opposite, frames, others, reversed
         )
+
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return -self._temper * self.unlikeness(frame, others, reversed)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""

@@ -97,7 +97,10 @@ class Archive(Checkpointed):
         return MapSolution(solution.fit._replace(poses=poses), self.log, cut)
 
     def solve(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
-        """A solution of the map as one of all keyframes, solved for if these are not too many."""
+        """A solution of the map as one of all keyframes, solved for if these are not too many; the same
+        before any merge."""
+        if not self.begun:
+            return solution
         fit, _, cut = self.follow(solution, graph)
         log = self.log.copy()
         if self.graph.count <= MOST_SOLVED:

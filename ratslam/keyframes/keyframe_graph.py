@@ -279,6 +279,11 @@ class KeyframeGraph(Checkpointed):
         taken = self.taken.rows
         return self.appearance.unlikeness(taken[frame], taken[others], reversed)
 
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """See `Appearance.log_odds`."""
+        taken = self.taken.rows
+        return self.appearance.log_odds(int(taken[frame]), taken[others], reversed)
+
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """See `Appearance.misfit`."""
         return self.appearance.misfit(int(self.taken.rows[frame]), self.taken.rows[near], reversed)

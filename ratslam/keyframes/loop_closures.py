@@ -242,6 +242,17 @@ class ClosureLog(Checkpointed):
         rows[(rows[:, 0] >= frame) & accepted & (rows[:, 3] != spare) & (rows[:, 3] >= 0), 3] = -1
         self._lines = None
 
+    def strike_across(self, cuts: np.ndarray) -> None:
+        """Strikes out candidates of sequences that lie across breaks of the odometry before keyframes `cuts`
+        [n], ascending: of each sequence all but those of the part with the most."""
+        rows = self._candidate.rows
+        part = np.searchsorted(cuts, rows[:, 0], side="right")
+        for sequence in range(self.sequences):
+            own = np.flatnonzero(rows[:, 3] == sequence)
+            if len(own):
+                rows[own[part[own] != np.bincount(part[own]).argmax()], 3] = -1
+        self._lines = None
+
     def accepted_rows(self) -> np.ndarray:
         """[M] rows of the accepted candidates."""
         if self._lines is None:

@@ -24,6 +24,7 @@ from ratslam.keyframes.acceptance import Acceptance
 from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.calibration import calibration_from_views
+from ratslam.keyframes.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -156,21 +157,24 @@ class KeyframeMap(Checkpointed, Map):
         return self.solution().log.table()
 
     def covariance(self) -> np.ndarray:
-        """[3, 3] covariance of the newest keyframe's pose in the frame of the first one of its piece (m, m,
-        rad)."""
+        """[3, 3] covariance of the newest keyframe's pose in the frame of its piece's first (m, m, rad)."""
         return self._graph.newest_covariance(self.log)
 
     def solution(self) -> MapSolution:
         """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
-            kept, archive = self.kept_solution(), self.archive
-            self._solution = archive.solve(kept, self._graph) if archive.begun else kept
+            kept = self.kept_solution()
+            self._solution = self._solution or self.archive.solve(kept, self._graph)
         return self._solution
 
     def kept_solution(self) -> MapSolution:
         """The final map of the keyframes that are not merged."""
         if self._kept is None:
             self._kept = self._solve_finally().placed(self._graph)
+            if self.closes_loops and is_retraced(self.keyframes()):
+                whole = self.archive.solve(self._kept, self._graph)
+                self._solution = retraced_solution(self.keyframes(), whole)
+                self._kept = kept_part(self._solution, self._kept, self._graph.taken.rows)
         return self._kept
 
     def graph(self) -> networkx.DiGraph:
@@ -262,12 +266,10 @@ class KeyframeMap(Checkpointed, Map):
             motion, length, turn = HALT
         else:
             self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
-        self._begins = False
         self.archive.append(self._graph)
         self._live.advance(self._graph)
-        self._since += length
-        self._turned += turn
-        self._travel = HALT
+        self._since, self._turned = self._since + length, self._turned + turn
+        self._travel, self._begins = HALT, False
         self.appearance.append(observation, motion[2], length)
 
     def _arrive(self, matched: int) -> ExperienceChange:
@@ -289,8 +291,7 @@ class KeyframeMap(Checkpointed, Map):
         follows = continues_sequence(self._graph, self.log, candidate)
         sequence = self.log.add(candidate, follows)
         self.archive.add(candidate, follows, self._graph)
-        judge = self._acceptance.judge
-        changed = self.closes_loops and judge(self._graph, self.log, sequence, candidate)
+        changed = self.closes_loops and self._acceptance.judge(self._graph, self.log, sequence, candidate)
         if self.log.verdict(sequence) == Verdict.ACCEPTED:
             weight = self.log.sequence_weights()[sequence]
             self._graph.pose.rows[-1] = self._live.correct(self._graph, candidate, weight)
@@ -329,8 +330,7 @@ class KeyframeMap(Checkpointed, Map):
         """Every `DOUBT_EVERY` keyframes, judges the present map."""
         graph = self._graph
         if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
-            present = MapSolution(graph.fit(), self.log, graph.cut)
-            self._doubt = worse_than_odometry(graph, present)
+            self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), self.log, graph.cut))
 
     def _best(self) -> MapFit:
         """The map's poses, or those of raw odometry where the map is doubted."""

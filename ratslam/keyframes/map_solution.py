@@ -75,20 +75,48 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
     """The map with the closure sequences that are best accepted together; None if none has the evidence of an
     accepted one: weak sequences count only beside it, as images without information give a few of them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
-    scores = log.scores()
-    candidates = (scores >= config.select_score) & (log.sizes() >= config.select_length)
-    left = log.left() > 0
-    candidates &= left & (log.verdicts() != Verdict.UNDONE) & ~spans_pieces(graph, log)
-    if not (candidates & (scores >= config.min_score)).any():
+    candidates = sequences_to_select(graph, log)
+    if not (candidates & (log.scores() >= config.min_score)).any():
         return None
     place = graph.placement(log).place
     sequences = np.flatnonzero(candidates)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
     earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
     cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
-    for sequence in np.flatnonzero(left & (log.verdicts() != Verdict.UNDONE)).tolist():
-        log.judge(sequence, Verdict.ACCEPTED if candidates[sequence] else Verdict.OPEN)
-    selection = _select(graph, log, cut, sequences, earlier, hypotheses, place)
+    case = selection_case(graph, log, cut, sequences, place)
+    return selected_map(graph, log, cut, sequences, _select(graph, case, sequences, earlier, hypotheses))
+
+
+def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+    """[R] bool, the sequences to select from."""
+    config = graph.config
+    enough = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
+    possible = (log.left() > 0) & (log.verdicts() != Verdict.UNDONE)
+    return enough & possible & ~spans_pieces(graph, log)
+
+
+def selection_case(
+    graph: KeyframeGraph,
+    log: ClosureLog,
+    cut: GrowableArray,
+    sequences: np.ndarray,
+    place: Callable[[np.ndarray], np.ndarray],
+) -> SelectionProblem:
+    """The problem of a selection among sequences [R], which the log then holds for accepted, with the
+    odometry broken at `cut`."""
+    for sequence in np.flatnonzero((log.left() > 0) & (log.verdicts() != Verdict.UNDONE)).tolist():
+        log.judge(sequence, Verdict.OPEN)
+    for sequence in sequences.tolist():
+        log.judge(sequence, Verdict.ACCEPTED)
+    problem, (first, last) = graph.problem(log, cut), log.spans()[sequences].T
+    scores, views_cost = log.scores()[sequences], partial(claims_cost, graph)
+    return SelectionProblem(problem, scores, first, last, views_cost, place)
+
+
+def selected_map(
+    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, selection: Selection
+) -> MapSolution:
+    """The map of a selection among sequences [R]; log and cut take it over."""
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
         log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
     for frame, sequence in selection.cuts:
@@ -101,19 +129,14 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
 
 def _select(
     graph: KeyframeGraph,
-    log: ClosureLog,
-    cut: GrowableArray,
+    case: SelectionProblem,
     sequences: np.ndarray,
     earlier: tuple[tuple[int, int], ...],
     hypotheses: MapHypotheses,
-    place: Callable[[np.ndarray], np.ndarray],
 ) -> Selection:
     """Selects among the sequences `sequences`, starting from the current map and from the hypotheses. The
     odometry is cut only if the robot may be carried."""
-    problem, pose = graph.problem(log, cut), graph.pose.rows
-    present = graph.fit()._replace(poses=pose.copy())
-    first, last = log.spans()[sequences].T
-    case = SelectionProblem(problem, log.scores()[sequences], first, last, partial(claims_cost, graph), place)
+    present = graph.fit()._replace(poses=graph.pose.rows.copy())
     starts = [present, *hypotheses.follow(case, sequences)]
     if not graph.config.may_be_carried:
         return select_closures(case, starts)

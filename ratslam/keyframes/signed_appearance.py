@@ -82,6 +82,9 @@ class SignedAppearance(Appearance):
         first = project(model, images[np.atleast_1d(frame)].T)
         return -log_odds(model, first, project(model, images[others].T))
 
+    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return -self.unlikeness(frame, others, reversed)
+
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""
         if not len(near) or not self._likeness.size:

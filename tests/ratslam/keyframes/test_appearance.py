@@ -135,6 +135,25 @@ def test_log_odds_follow_from_images_and_pairs():
     )
 
 
+@pytest.mark.parametrize("kind", ["touch", "views", "ids"])
+def test_equal_views_are_likelier_of_one_place(kind):
+    """The log-odds of one place fall with the unlikeness of the views, and are above 0 for equal ones."""
+    stream, places = np.random.default_rng(0), np.arange(100) % 50
+    views = images(stream, 50)[places]
+    made = {
+        "touch": lambda: touched(views),
+        "views": lambda: viewed(views, errors=np.full(40, 0.1)),
+        "ids": lambda: labelled(places),
+    }
+    frames, ahead = made[kind](), np.zeros(100, bool)
+    odds = np.array([frames.log_odds(k, np.arange(100), ahead) for k in range(100)])
+    same = places[:, None] == places
+    assert odds[same].min() > 0
+    assert odds[same].mean() > odds[~same].mean() + 0.5
+    order = [frames.unlikeness(7, np.arange(100), ahead), odds[7]]
+    assert (np.diff(order[1][np.argsort(order[0], kind="stable")]) <= 0).all()
+
+
 @given(seeds)
 @settings(max_examples=20)
 def test_an_image_fits_itself_best(seed):

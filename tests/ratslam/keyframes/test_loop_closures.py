@@ -152,6 +152,23 @@ def test_a_break_strikes_out_later_candidates():
     assert log.accepted_rows().tolist() == [5]
 
 
+@given(steps, st.lists(st.integers(50, 85), max_size=3, unique=True))
+def test_no_sequence_lies_across_a_cut(steps, cuts):
+    log, cuts = ClosureLog(), np.sort(np.array(cuts, int))
+    for k, (kind, a, b) in enumerate(steps):
+        if kind == "add":
+            log.add(Candidate(50 + k, k, 0, 0.9, b), a and log.sequences > 0)
+    before = [log.members(sequence)[:, 0] for sequence in range(log.sequences)]
+    log.strike_across(cuts)
+    for sequence, frames in enumerate(before):
+        parts = np.searchsorted(cuts, frames, side="right")
+        largest = np.bincount(parts).max()
+        left = log.members(sequence)[:, 0]
+        assert len(left) == largest
+        assert len(np.unique(np.searchsorted(cuts, left, side="right"))) == 1
+        assert np.isin(left, frames).all()
+
+
 @given(steps)
 def test_summaries_of_sequences_follow_from_their_members(steps):
     log = ClosureLog()

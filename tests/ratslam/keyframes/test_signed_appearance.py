@@ -54,6 +54,10 @@ def test_images_of_one_place_are_more_alike(filled):
     here = filled.unlikeness(frames, frames - 40, ahead)
     elsewhere = filled.unlikeness(frames, (frames - 20) % 40, ahead)
     assert (here < elsewhere).mean() > 0.9
+    others = np.arange(40)
+    odds = filled.log_odds(50, others, ahead)
+    assert np.array_equal(odds, -filled.unlikeness(50, others, ahead))
+    assert odds[8:12].min() > 0 > np.median(odds)
     one = filled.unlikeness(50, np.array([10, 30]), np.zeros(2, bool))
     np.testing.assert_allclose(
         one, [here[10], filled.unlikeness(np.array([50]), np.array([30]), ahead[:1])[0]]

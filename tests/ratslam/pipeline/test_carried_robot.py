@@ -11,6 +11,7 @@ from tests.ratslam.pipeline.touch_walks import (
     Walk,
     dead_reckoning,
     empty_carried_session,
+    empty_merging_session,
     empty_session,
     follow,
     kidnap,
@@ -51,7 +52,7 @@ def kidnapped_session() -> tuple[Walk, Session]:
     return walk, empty_carried_session()
 
 
-@pytest.mark.parametrize("every", [7, pytest.param(100, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("every", [41, pytest.param(7, marks=pytest.mark.soak)])
 def test_reading_the_map_does_not_change_it(every: int) -> None:
     walk, session = kidnapped_session()
     expected = follow(session, walk.readings)
@@ -69,6 +70,23 @@ def test_reading_the_map_does_not_change_it(every: int) -> None:
     again = session.arrays()
     assert again.keys() == saved.keys()
     assert all(np.array_equal(again[name], saved[name], equal_nan=True) for name in saved)
+
+
+def test_a_map_with_merged_keyframes_is_the_same_whichever_part_is_read_first() -> None:
+    walk, _ = kidnapped_session()
+    session = empty_merging_session(1, may_be_carried=True)
+    found = follow(session, walk.readings)
+    made = session.map
+    taken, whole, kept = made.kept_keyframes().taken.rows, made.solution(), made.kept_solution()
+    assert len(taken) < made.keyframes().count
+    assert found.cuts
+    assert np.array_equal(kept.fit.poses, whole.fit.poses[taken])
+    assert np.array_equal(kept.cut.rows, whole.cut.rows[taken])
+    session.restore(session.arrays())
+    again = made.kept_solution(), made.solution()
+    for one, other in zip((kept, whole), again, strict=True):
+        assert np.array_equal(one.fit.poses, other.fit.poses)
+        assert np.array_equal(one.cut.rows, other.cut.rows)
 
 
 @pytest.mark.parametrize(

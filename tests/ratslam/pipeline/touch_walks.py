@@ -77,9 +77,9 @@ def empty_carried_session() -> Session:
     return session
 
 
-def empty_merging_session(merge_stood: int) -> Session:
+def empty_merging_session(merge_stood: int, **keyframes: Any) -> Session:
     """The shared compiled session that merges keyframes soon, empty; 0: none."""
-    session, empty = _compiled(512, select_every=30, merge_stood=merge_stood, merge_newest=60)
+    session, empty = _compiled(512, select_every=30, merge_stood=merge_stood, merge_newest=60, **keyframes)
     session.restore(empty)
     return session
 

@@ -1,0 +1,154 @@
+"""The final map of a robot that may be carried: the odometry cut where all views together show it.
+
+While a session goes on, a cut is found from one closure sequence at a time: it lies up to a lap off, or is
+missing where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are
+selected anew with the odometry cut there, and so on in turn, because each makes the other better. Each time
+it is retraced once on all keyframes and once on the earlier ones alone: two stretches at one wrong place bear
+each other out, but the first of them has to fit what was there before. Of all these maps and the one before,
+the one that the views and the measurements together find most likely is given. The method is ours."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.alignment.gain_odds import GainOdds
+from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.closure_selection import (
+    Selection,
+    SelectionProblem,
+    cut_odometry,
+    optimise_with_cuts,
+)
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.map_hypotheses import MapHypotheses
+from ratslam.keyframes.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
+from ratslam.keyframes.optimizer import MapFit
+from ratslam.keyframes.pose_tracks import TrackGround
+from ratslam.keyframes.retracing import JUMP, retrace
+from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
+
+ROUNDS = 3
+"""Number of times that the robot is retraced."""
+MOST_RETRACED = 2000
+"""Largest number of keyframes of a map that is retraced: each is compared with every other."""
+FEWEST_RETRACED = 100
+"""Least number of them: fewer teach nothing about how views fit."""
+
+
+class Case(NamedTuple):
+    """What is selected from once the odometry is cut.
+
+    Attributes:
+        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem: among
+            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one if
+            there is none.
+    """
+
+    log: ClosureLog
+    sequences: np.ndarray
+    problem: SelectionProblem
+    breaks: tuple[tuple[int, int], ...]
+
+    def starts(self, fit: MapFit) -> list[MapFit]:
+        """Maps to start from: a fit, and those that follow the sequences in order of time."""
+        cut = self.problem._replace(measurements=cut_odometry(self.problem.measurements, self.breaks))
+        return [fit, *MapHypotheses().follow(cut, self.sequences)]
+
+
+class Judged(NamedTuple):
+    """A selection, and its log-likelihood with what all views say, nat."""
+
+    case: Case
+    selection: Selection
+    likelihood: float
+
+
+def is_retraced(graph: KeyframeGraph) -> bool:
+    """Whether the final map of these keyframes, none of them merged, is retraced; one that is told where it
+    begins a piece is not."""
+    config = graph.config
+    known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
+    return bool(config.may_be_carried and config.select_every and known)
+
+
+def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolution:
+    """The map of `solution` after the robot has been retraced; the same if it has no sequences.
+
+    Args:
+        graph: keyframes, none of them merged.
+    """
+    fits, fit, log = view_fits(graph), solution.fit, solution.log
+    odds = learn_odds(TrackGround.of_map(graph, fit, fits))
+    first = _case(graph, log, np.flatnonzero(solution.cut.rows >= 0))
+    if not len(first.sequences):
+        return solution
+    newest = best = _judge(graph, fits, odds, first, [fit])
+    past = earlier_fits(fits)
+    for _ in range(ROUNDS):
+        found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
+        newest = max(found, key=lambda judged: judged.likelihood)
+        best = max(best, newest, key=lambda judged: judged.likelihood)
+    case, cut = best.case, _uncut(graph)
+    return selected_map(graph, case.log, cut, case.sequences, best.selection)
+
+
+def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:
+    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`."""
+    log, cut = kept.log.copy(), GrowableArray((), np.int64)
+    log.follow(solution.log)
+    cut.replace(solution.cut.rows[rows])
+    log.strike_across(np.flatnonzero(cut.rows >= 0))
+    return MapSolution(solution.fit._replace(poses=solution.fit.poses[rows]), log, cut)
+
+
+def _case(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+    """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
+    log = log.copy()
+    log.strike_across(cuts)
+    sequences = np.flatnonzero(sequences_to_select(graph, log))
+    problem = selection_case(graph, log, _uncut(graph), sequences, np.copy)
+    shows = np.array([np.append(np.flatnonzero(problem.first >= frame), -1)[0] for frame in cuts], int)
+    return Case(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
+
+
+def _retrace(
+    graph: KeyframeGraph,
+    fits: np.ndarray,
+    compared: np.ndarray,
+    odds: GainOdds,
+    before: Judged,
+    log: ClosureLog,
+) -> Judged:
+    """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
+    fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
+    ground = TrackGround.of_map(graph, fit, fits)
+    found = retrace(ground._replace(fits=compared), learn_odds(ground), cuts, log, graph.sector_angle)
+    case = _case(graph, log, found.cuts)
+    return _judge(graph, fits, odds, case, case.starts(fit._replace(poses=found.poses)))
+
+
+def _judge(
+    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, starts: list[MapFit]
+) -> Judged:
+    """The most likely of the selections from these starts.
+
+    Args:
+        fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
+    """
+    found = []
+    for start in starts:
+        selection = optimise_with_cuts(case.problem, start, case.breaks)
+        seen = TrackGround.of_map(graph, selection.fit, fits).own_odds(odds).sum()
+        likelihood = float(seen) - JUMP * len(case.breaks) - selection.cost / 2
+        found.append(Judged(case, selection, likelihood))
+    return max(found, key=lambda judged: judged.likelihood)
+
+
+def _uncut(graph: KeyframeGraph) -> GrowableArray:
+    """[N] no keyframe cut, see `KeyframeGraph.cut`."""
+    cut = GrowableArray((), np.int64)
+    cut.replace(np.full(graph.count, -1))
+    return cut

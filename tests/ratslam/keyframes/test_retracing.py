@@ -1,0 +1,60 @@
+"""Laws of retracing: a robot that was carried is found again, one that was not stays where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.retracing import JUMP, retrace
+from tests.ratslam.keyframes.selection_cases import LAP, lap_poses
+from tests.ratslam.keyframes.track_cases import COUNT, ODDS, laps, places
+
+law = settings(derandomize=True, deadline=None, max_examples=15)
+jumps = st.integers(2 * LAP + 5, 2 * LAP + 35), st.integers(LAP // 4, 3 * LAP // 4)
+NONE = np.zeros(0, int)
+
+
+def retraced(ground, cuts=NONE):
+    return retrace(ground, ODDS, cuts, ClosureLog(), np.pi)
+
+
+@law
+@given(*jumps)
+def test_a_carried_robot_is_found_again(jump, ahead):
+    place = places(jump, ahead)
+    found = retraced(laps(place))
+    assert len(found.cuts) == 1
+    assert abs(found.cuts[0] - jump) <= 2
+    off = np.hypot(*(found.poses - lap_poses(place))[:, :2].T)
+    assert off[np.abs(np.arange(COUNT) - jump) > 2].max() < 0.06
+
+
+@law
+@given(st.integers(LAP, COUNT - 10), st.integers(1, 5), st.integers(LAP // 4, 3 * LAP // 4))
+def test_a_robot_that_was_not_carried_stays_where_it_is(first, length, off):
+    """A few views of another place do not pay for two jumps."""
+    place = places(None, 0)
+    shown = place.copy()
+    shown[first : first + length] += off
+    ground = laps(place, shown)
+    found = retraced(ground)
+    assert not len(found.cuts)
+    assert np.hypot(*(found.poses - ground.poses)[:, :2].T).max() < ground.reach
+
+
+def test_a_wrong_cut_is_taken_back():
+    ground = laps(places(None, 0))
+    found = retraced(ground, np.array([LAP + 20]))
+    assert not len(found.cuts)
+    assert found.odds == ODDS.odds[1] * COUNT
+    ground = laps(places(2 * LAP + 20, LAP // 2))
+    assert retraced(ground).odds > ODDS.odds[1] * COUNT - JUMP - 6 * np.ptp(ODDS.odds)
+
+
+def test_retracing_again_gives_the_same_bits():
+    ground = laps(places(2 * LAP + 20, LAP // 2))
+    one, other = retraced(ground), retraced(ground)
+    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+    assert len(one.cuts) == 1
