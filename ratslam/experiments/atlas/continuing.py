@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.map_pieces import unjoined_share
-from ratslam.experiments.atlas.joins import Join, judge_join
+from ratslam.experiments.atlas.joins import Join, judge_join, shown_paths
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.scenarios import REENTERED, carried_sessions, kidnapped, open_world
@@ -121,12 +121,12 @@ def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[Line]:
 
 
 def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
-    """Draws one session that was carried and tied on, and the errors of all."""
-    one = found[0]
+    """Draws one session that was carried and, if there is one, tied on, and the errors of all."""
+    one = next((each for each in found if each.known.joined), found[0])
     paths = PathPanel(
-        "a robot that was carried, and its second session in the map of the first",
+        "a second session in the map of the first",
         open_world(one.seed).maze,
-        {"first session": one.paths[0], "second, true": one.paths[1], "second, in the map": one.known.path},
+        shown_paths(*one.paths, one.known),
     )
     dots = {
         name: [getattr(each, name).error[0] for each in found if getattr(each, name).joined]

@@ -48,6 +48,13 @@ class Join(NamedTuple):
         return self.joined and bool(exceeds(self.error[None], WRONG)[0])
 
 
+def shown_paths(first: np.ndarray, second: np.ndarray, join: Join) -> dict[str, np.ndarray]:
+    """Paths [.., 2] of two sessions by label: the true ones (m), and the second one in the map of the first, if
+    they are joined."""
+    paths = {"first session": first, "second, true": second}
+    return paths | {"second, in the map": join.path} if join.joined else paths
+
+
 def judge_join(arrays: MapArrays, earlier: int, entry: int = 0, revisits: bool = False) -> Join:
     """Compares the steps after the first `earlier` ones with these.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.experiments.atlas.joins import Join, judge_join
+from ratslam.experiments.atlas.joins import Join, judge_join, shown_paths
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.scenarios import open_world, overlapping_sessions, same_maze, ten_circuits
@@ -154,12 +154,12 @@ def ten_lines(found: Sequence[TenFigures]) -> Iterator[Line]:
 
 
 def draw_overlap(found: Sequence[OverlapFigures], png: Path) -> None:
-    """Draws one pair of sessions, and the Energy Metric of all."""
-    one = found[0]
+    """Draws one pair of sessions, joined if there is one, and the Energy Metric of all."""
+    one = next((each for each in found if each.join.joined), found[0])
     paths = PathPanel(
         "two sessions that share half their cells",
         open_world(one.seed).maze,
-        {"first session": one.paths[0], "second, true": one.paths[1], "second, in the map": one.join.path},
+        shown_paths(*one.paths, one.join),
     )
     dots = {
         "merged": [each.union for each in found if each.join.joined],
