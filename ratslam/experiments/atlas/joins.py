@@ -49,8 +49,8 @@ class Join(NamedTuple):
 
 
 def shown_paths(first: np.ndarray, second: np.ndarray, join: Join) -> dict[str, np.ndarray]:
-    """Paths [.., 2] of two sessions by label: the true ones (m), and the second one in the map of the first, if
-    they are joined."""
+    """Paths [.., 2] (m) of two sessions by label: the true ones, and that of the second one in the map of the
+    first if they are joined."""
     paths = {"first session": first, "second, true": second}
     return paths | {"second, in the map": join.path} if join.joined else paths
 
