@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.calibration import starting_noise
 from ratslam.keyframes.claimed_revisits import claims_cost
 from ratslam.keyframes.closure_selection import (
     ACCEPTED_WEIGHT,
@@ -20,6 +21,7 @@ from ratslam.keyframes.closure_selection import (
     select_closures,
     select_closures_and_cuts,
 )
+from ratslam.keyframes.fresh_selection import reconsidered, seems_noisy
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
@@ -139,8 +141,18 @@ def _select(
     present = graph.fit()._replace(poses=graph.pose.rows.copy())
     starts = [present, *hypotheses.follow(case, sequences)]
     if not graph.config.may_be_carried:
-        return select_closures(case, starts)
+        return _reconsider(graph, case, select_closures(case, starts))
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
+
+
+def _reconsider(graph: KeyframeGraph, case: SelectionProblem, found: Selection) -> Selection:
+    """A selection, or the one from dead reckoning where that is more probable with less noise."""
+    noise, start = graph.heading_noise, starting_noise(graph.config)
+    if not seems_noisy(noise, start):
+        return found
+    reckoned = _dead_reckoned(graph, case.measurements.prior)
+    reckoned = reckoned._replace(poses=case.place(reckoned.poses))
+    return reconsidered(case, found, reckoned, noise, start)
 
 
 def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior) -> MapFit:
