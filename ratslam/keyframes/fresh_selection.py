@@ -1,10 +1,10 @@
 """A second selection of closures where the odometry seems noisier than it was taken to be.
 
 A false sequence that is accepted early bends the map, the bent map raises the noise that is learned, and with
-more noise further false sequences fit: two halves of a maze that look alike become one. Among maps of one noise the
-bent one is then the cheapest. So the sequences are selected once more from dead reckoning with the noise at
-the start, and the more probable map is kept, each with the noise learned from it. The rule is ours; the
-evidence is that of MacKay 1992, see `odometry_noise`."""
+more noise further false sequences fit: two halves of a maze that look alike become one. Among maps of one
+noise the bent one is then the cheapest. So the sequences are selected once more from dead reckoning with the
+noise at the start, and the more probable map is kept, each with the noise learned from it. The rule is ours;
+the evidence is that of MacKay 1992, see `odometry_noise`."""
 
 from __future__ import annotations
 
