@@ -3,8 +3,12 @@
 A false sequence that is accepted early bends the map, the bent map raises the noise that is learned, and with
 more noise further false sequences fit: two halves of a maze that look alike become one. Among maps of one
 noise the bent one is then the cheapest. So the sequences are selected once more from dead reckoning with the
-noise at the start, and the more probable map is kept, each with the noise learned from it. The rule is ours;
-the evidence is that of MacKay 1992, see `odometry_noise`."""
+noise at the start, and the more probable map is kept, each with the noise learned from it.
+
+Odometry that is honestly noisy is explained with little noise if only the closures are refused. So a refused
+sequence costs its whole evidence here, beside its bounded cost in the selection: in doubt the map stays that
+explains more of what was recognised. The rule is ours; the evidence is that of MacKay 1992, see
+`odometry_noise`."""
 
 from __future__ import annotations
 
@@ -12,16 +16,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.closure_selection import Selection, SelectionProblem, select_closures
-from ratslam.keyframes.odometry_noise import SPREAD, HeadingNoise, learn_heading_noise
+from ratslam.keyframes.closure_selection import (
+    ACCEPTED_WEIGHT,
+    Selection,
+    SelectionProblem,
+    select_closures,
+)
+from ratslam.keyframes.odometry_noise import HeadingNoise, learn_heading_noise, log_posterior
 from ratslam.keyframes.optimizer import MapFit, System
 
 NOISY = 2.0
-"""Standard deviations by which the learned noise exceeds that of the start where it is doubted."""
+"""Standard deviations by which the learned noise has to exceed that of the start to be doubted."""
 ROUNDS = 4
 """Largest number of times that a map and its noise are learned in turn."""
 SETTLED = 0.05
-"""Change of the log of the noise at which they are."""
+"""Change of the log of the noise below which both are known."""
 
 
 class Settled(NamedTuple):
@@ -32,7 +41,7 @@ class Settled(NamedTuple):
 
 
 def seems_noisy(noise: HeadingNoise, start: HeadingNoise) -> bool:
-    """Whether the learned noise of the odometry exceeds that of the start."""
+    """Whether the learned noise of the odometry is surely above that of the start."""
     return noise.log_factor - start.log_factor > NOISY * noise.sd
 
 
@@ -61,6 +70,6 @@ def _settle(case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: Hea
         case = case._replace(measurements=case.measurements.with_heading_noise(float(np.exp(step))))
         if abs(step) < SETTLED:
             break
-    prior = -0.5 * ((noise.log_factor - start.log_factor) / SPREAD) ** 2
-    evidence = System(case.measurements).log_evidence(fit)
-    return Settled(selection, evidence + prior - case.views_cost(fit.poses) / 2)
+    seen = log_posterior(noise.log_factor - start.log_factor, fit, System(case.measurements))
+    refused = case.evidence[fit.weights <= ACCEPTED_WEIGHT].sum()
+    return Settled(selection, seen - case.views_cost(fit.poses) / 2 - float(refused))

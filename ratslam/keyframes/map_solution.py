@@ -30,6 +30,9 @@ from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.keyframes.piece_joining import spans_pieces
 from ratslam.keyframes.pieces import number_pieces
 
+Place = Callable[[np.ndarray], np.ndarray]
+"""Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
+
 
 class MapSolution(NamedTuple):
     """Optimised poses and bias, the closure log with its verdicts, and the odometry breaks ([N]
@@ -65,8 +68,7 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
     place = graph.placement(log).place
-    reckoned = (_dead_reckoned(graph, prior) for prior in priors)
-    starts = [graph.fit(), *(fit._replace(poses=place(fit.poses)) for fit in reckoned)]
+    starts = [graph.fit(), *(_dead_reckoned(graph, prior, place) for prior in priors)]
     system = System(problem)
     fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
     log.weigh(fit.weights)
@@ -102,7 +104,7 @@ def selection_case(
     log: ClosureLog,
     cut: GrowableArray,
     sequences: np.ndarray,
-    place: Callable[[np.ndarray], np.ndarray],
+    place: Place,
 ) -> SelectionProblem:
     """The problem of a selection among sequences [R], which the log then holds for accepted, with the
     odometry broken at `cut`."""
@@ -150,12 +152,11 @@ def _reconsider(graph: KeyframeGraph, case: SelectionProblem, found: Selection) 
     noise, start = graph.heading_noise, starting_noise(graph.config)
     if not seems_noisy(noise, start):
         return found
-    reckoned = _dead_reckoned(graph, case.measurements.prior)
-    reckoned = reckoned._replace(poses=case.place(reckoned.poses))
+    reckoned = _dead_reckoned(graph, case.measurements.prior, case.place)
     return reconsidered(case, found, reckoned, noise, start)
 
 
-def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior) -> MapFit:
-    """Odometry corrected by the mean of a calibration, from the first keyframe."""
-    poses = graph.dead_reckoned(prior.bias, prior.turn_error)
+def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior, place: Place) -> MapFit:
+    """Odometry corrected by the mean of a calibration, from the first keyframe, its pieces placed."""
+    poses = place(graph.dead_reckoned(prior.bias, prior.turn_error))
     return MapFit(poses, prior.bias, np.zeros(0), prior.turn_error)

@@ -49,7 +49,10 @@ def learn_heading_noise(
     steps = np.array([-LARGEST_STEP, 0.0, LARGEST_STEP])
     off = noise.log_factor - start.log_factor
     system = System(problem)
-    logs = np.array([_log_posterior(off, step, fit, system, problem) for step in steps])
+    changed = [system.with_problem(problem.with_heading_noise(float(np.exp(step)))) for step in steps]
+    logs = np.array(
+        [log_posterior(off + step, at.solve(fit, STEPS), at) for step, at in zip(steps, changed, strict=True)]
+    )
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)
@@ -60,7 +63,10 @@ def learn_heading_noise(
     return HeadingNoise(max(moved, least), float(1 / np.sqrt(-bend)) if curved else SPREAD)
 
 
-def _log_posterior(off: float, step: float, fit: MapFit, system: System, problem: MapProblem) -> float:
-    changed = system.with_problem(problem.with_heading_noise(float(np.exp(step))))
-    prior = -0.5 * ((off + step) / SPREAD) ** 2
-    return float(prior + changed.log_evidence(changed.solve(fit, STEPS)))
+def log_posterior(off: float, fit: MapFit, system: System) -> float:
+    """Log probability of the noise of `system`, and of odometry and closures with it, up to a constant.
+
+    Args:
+        off: log of the noise less that of the first map. fit: that solves the system.
+    """
+    return -0.5 * (off / SPREAD) ** 2 + system.log_evidence(fit)
