@@ -95,7 +95,8 @@ def _state(trial: BackendTrial) -> str:
 
 def _precision(trial: BackendTrial) -> str:
     for dtype in (np.float64, np.float32):
-        backend, name = trial.build(dtype), np.dtype(dtype).name
+        backend = trial.backend if dtype == np.float64 else trial.build(dtype)
+        name = np.dtype(dtype).name
         state = jax.eval_shape(lambda key, backend=backend: backend.init(key, CAPACITY), jax.random.key(0))
         wrong = [
             f"state{jax.tree_util.keystr(path)} {leaf.dtype}"

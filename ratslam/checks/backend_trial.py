@@ -45,15 +45,20 @@ class BackendTrial:
         return self.entry.build(self.settings, self.sensors, np.dtype(dtype))
 
     @cached_property
-    def refusals(self) -> dict[str, str]:
-        """For sensors that the method refuses with an `InputError`: its text."""
-        found = {}
+    def _built(self) -> dict[str, Backend | str]:
+        """For each kind of sensors: the backend, or the text of the `InputError` that refuses them."""
+        found: dict[str, Backend | str] = {}
         for name, sensors in SENSORS.items():
             try:
-                self.entry.build(self.settings, sensors, np.dtype(np.float64))
+                found[name] = self.entry.build(self.settings, sensors, np.dtype(np.float64))
             except InputError as error:
                 found[name] = str(error)
         return found
+
+    @property
+    def refusals(self) -> dict[str, str]:
+        """For sensors that the method refuses with an `InputError`: its text."""
+        return {name: made for name, made in self._built.items() if isinstance(made, str)}
 
     @cached_property
     def sensors(self) -> Sensors:
@@ -64,9 +69,10 @@ class BackendTrial:
         """The first observations of a walk."""
         return list(walk(count, seed, 0 if self.sensors.feelers is None else WHISKERS))
 
-    @cached_property
+    @property
     def backend(self) -> Backend:
-        return self.build()
+        """The backend for these sensors; all checks share it."""
+        return next(made for made in self._built.values() if not isinstance(made, str))
 
     @cached_property
     def types(self) -> tuple[Any, Any, Any, Any]:

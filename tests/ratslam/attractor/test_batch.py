@@ -12,8 +12,10 @@ from ratslam.attractor.batch import Course, Network, networks, trials
 from ratslam.attractor.config import PoseCellConfig, units
 from ratslam.attractor.levels import window_levels
 from ratslam.attractor.window import ring_difference
+from ratslam.backends.grid import GridOutcome
 from tactile.base.types import Odometry, stack
-from tests.helpers.grid_world import drive, filter_of, initial, report, settings
+from tests.helpers.grid_world import drive, initial, report
+from tests.ratslam.backends.grid_filters import PRINTED
 
 CONFIG = PoseCellConfig(cells_xy=21)
 STEPS = 60
@@ -40,12 +42,14 @@ def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("block", [pytest.param(1, marks=pytest.mark.soak), 3])
-def test_parameter_sets_are_networks_of_those_parameters(block):
-    given, sets = course(1), [(1.0, 2.0, 2e-5, 1.0), (0.9, 2.3, 1e-5, 1.0), (1.2, 1.8, 3e-5, 2.0)]
+@pytest.mark.parametrize(
+    ("block", "compared"), [(3, 2), *(pytest.param(block, 3, marks=pytest.mark.soak) for block in (1, 3))]
+)
+def test_parameter_sets_are_networks_of_those_parameters(block, compared):
+    given, sets = course(1), [(0.9, 2.3, 1e-5, 1.0), (1.2, 1.8, 3e-5, 2.0), (1.0, 2.0, 2e-5, 1.0)]
     columns = Network(*(jnp.asarray(column) for column in zip(*sets, strict=True)))
     track = networks(CONFIG, columns, given, block)
-    for k, (excite, inhibit, threshold, factor) in enumerate(sets):
+    for k, (excite, inhibit, threshold, factor) in enumerate(sets[:compared]):
         # The dense engine gives the same steps (test_adaptive_window) and compiles sooner.
         config = CONFIG.model_copy(
             update={
@@ -62,9 +66,12 @@ def test_parameter_sets_are_networks_of_those_parameters(block):
 
 
 def test_trials_of_other_seeds_and_noise_equal_single_sessions():
-    backend = filter_of(settings())
+    backend = PRINTED  # resamples at every report with evidence
     stream = np.random.default_rng(0)
-    courses = [[report(float(dx)) for dx in stream.uniform(0, 0.03, 12)] for _ in range(3)]
+    courses = [
+        [report(float(dx), touching=[k] if k < 2 else ()) for k, dx in enumerate(stream.uniform(0, 0.03, 12))]
+        for _ in range(3)
+    ]
     states = [backend.init(jax.random.key(seed), 256) for seed in range(3)]
     together = trials(
         backend.kernel,
@@ -73,5 +80,6 @@ def test_trials_of_other_seeds_and_noise_equal_single_sessions():
         block=3,
     )
     for seed, rows in enumerate(courses):
-        _, estimate, _ = drive(backend, initial(backend, seed), rows)
+        _, estimate, evidence = drive(backend, initial(backend, seed), rows)
+        assert GridOutcome.RESAMPLED in evidence.outcome
         assert np.abs(np.asarray(together.pose[seed]) - estimate.pose).max() <= 1e-12

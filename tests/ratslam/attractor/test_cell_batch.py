@@ -18,7 +18,7 @@ from tactile.base.types import Odometry
 
 CONFIG = PoseCellConfig(cells_xy=21)
 STEPS = SEGMENT + 70
-SETS = [(1.0, 2.0, 2e-5, 1.0, 0.0, 0.0), (0.9, 2.3, 1e-5, 1.0, 0.2, 0.1), (1.1, 1.8, 3e-5, 2.0, 0.1, 0.0)]
+SETS = [(0.9, 2.3, 1e-5, 1.0, 0.2, 0.1), (1.1, 1.8, 3e-5, 2.0, 0.1, 0.0), (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
 CHOSEN = [18 * 441 + 10 * 21 + 10, 17 * 441 + 11 * 21 + 9, 0]
 
 
@@ -61,14 +61,18 @@ def alone(row: tuple[float, ...], given: CellCourse) -> tuple[np.ndarray, np.nda
     return np.array(poses), np.array(active)
 
 
-@pytest.mark.parametrize("views", [False, True])
-def test_networks_equal_those_simulated_one_by_one(views):
+@pytest.mark.parametrize(
+    ("views", "compared"),
+    [(True, 2), *(pytest.param(views, 3, marks=pytest.mark.soak) for views in (True, False))],
+)
+def test_networks_equal_those_simulated_one_by_one(views, compared):
+    """With three networks in blocks of two; those compared are the first."""
     given = course(views)
     segments = list(walk(CONFIG, sets(), given, CHOSEN, block=2))
     assert [segment.pose.shape[1] for segment in segments] == [SEGMENT, STEPS - SEGMENT]
     pose, activity, _, level = (np.concatenate(each, axis=1) for each in zip(*segments, strict=True))
     assert bool(level.max()) == views
-    for k, row in enumerate(SETS):
+    for k, row in enumerate(SETS[:compared]):
         expected, active = alone(row, given)
         gap = ring_difference(pose[k] - expected, np.array([[21, 21, 36]]))
         assert np.abs(gap).max() <= 1e-9
@@ -81,10 +85,10 @@ def test_networks_that_left_the_smallest_window_go_back_to_it():
     steps = len(motion)
     template, energy = np.zeros(steps, np.int32), np.zeros(steps)
     novel = np.arange(steps) == 0
+    template[-1] = 1  # as many as in `course`, so that nothing compiles again
     energy[200] = 0.05
     given = CellCourse(motion, np.zeros((steps, 2)), template, novel, np.zeros(steps), energy)
-    given = jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == float else a, given)
-    level = np.concatenate([track.level for track in walk(CONFIG, sets(), given, CHOSEN)], axis=1)
+    level = np.concatenate([track.level for track in walk(CONFIG, sets(), given, CHOSEN, block=2)], axis=1)
     assert (level[:, 200] > 0).all()
     assert not level[:, :200].any()
     assert not level[:, -SEGMENT:].any()

@@ -14,8 +14,8 @@ from ratslam.backends.grid import GridOutcome
 from ratslam.backends.localise_grid import GridLocaliseOutcome
 from ratslam.backends.registry import BACKENDS
 from ratslam.checks.backend import CHECKS
-from ratslam.checks.backend_trial import BackendTrial
-from ratslam.core.session import CHUNK, Session, capacity_at
+from ratslam.checks.backend_trial import CIRCUIT, BackendTrial
+from ratslam.core.session import CHUNK, capacity_at
 from ratslam.examples import dead_reckoning
 
 
@@ -35,7 +35,7 @@ SIGNED = TOUCH | {"recall": {"sector_fov": "whiskers", "images": "signed"}}
 # With large odometry noise, so that it resamples throughout the session.
 DOUBTFUL = {
     "particles": 20,
-    "side": 3.0,
+    "side": 1.5,
     "drift": {"step": 0.3, "heading": 0.05},
     "likelihood": {"free": 0.5, "contact": 4.0},
     "resampling": {"min_effective_share": 0.9},
@@ -75,15 +75,30 @@ def trial_of(name):
     return BackendTrial(entry, entry.config_class.model_validate(settings))
 
 
+@cache
 def map_of(name):
-    """The file of the map that a method makes of the walk of the checks."""
+    """The file of the map that a method makes of the first laps of the walk of the checks."""
     file = Path(os.environ["RATSLAM_TEST_FOLDER"]) / f"{name}_{os.getpid()}.npz"
-    np.savez(file, **trial_of(name).arrays)
+    session = trial_of(name).fresh()
+    list(session.replay(trial_of(name).walk(12 * CIRCUIT)))
+    np.savez(file, **session.arrays())
     return file
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
-@pytest.mark.parametrize("name", some([*METHODS, EXAMPLE]))
+BATCHED_BY_STUDIES = {"touch", "classic", EXAMPLE}
+"""Backends whose batches `make test` compares; those of the grid filter are those of `test_batch`."""
+
+
+def cases():
+    """Every backend with every check; those that compile only what no study does, for the soak."""
+    for name in [*METHODS, EXAMPLE]:
+        for check in CHECKS:
+            batch = check.name == "a batch equals its members" and name not in BATCHED_BY_STUDIES
+            seldom = pytest.mark.soak if batch or name in OFTEN else ()
+            yield pytest.param(name, check, id=f"{name}-{check.name}", marks=seldom)
+
+
+@pytest.mark.parametrize(("name", "check"), list(cases()))
 def test_our_backends_pass(name, check):
     check.run(trial_of(name))
 
@@ -132,7 +147,7 @@ FIXED = ["classic", "classic-labels", "grid", "localise", "localise_grid", EXAMP
 def test_memory_does_not_grow_on_known_ground(name):
     """Otherwise time and memory of long sessions on known ground would grow."""
     trial = trial_of(name)
-    session = Session(trial.build())
+    session = trial.fresh()
     list(session.replay(trial.walk(600)))
     assert session.compilations() == 1
 

@@ -60,7 +60,7 @@ def test_whiskers_without_contact_mark_free_cells():
     assert float(state.maps.max()) <= 0
 
 
-@pytest.mark.parametrize("cell", [0.05, 0.02])
+@pytest.mark.parametrize("cell", [0.05, pytest.param(0.02, marks=pytest.mark.soak)])
 def test_a_contact_leaves_evidence_at_its_point(cell):
     backend = FILTER if cell == 0.05 else filter_of(settings(particles=2, cell=cell))
     blob = FILTER.config.footprint.blob
@@ -325,6 +325,7 @@ def test_without_whiskers_and_body_it_is_dead_reckoning_compiled_once():
     assert wrap(path[:, 2] - found[:, 2]) == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.soak
 def test_a_batch_of_seeds_equals_each():
     backend = PRINTED
     reports = [*circuit(6), report(0.05, touching=[0, 2], wall=(0.25, 0.1)), report(-0.05), *circuit(6)]

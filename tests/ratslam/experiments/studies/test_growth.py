@@ -109,7 +109,7 @@ def test_a_measurement_on_the_way_changes_nothing(config):
 
 def test_an_interrupt_leaves_table_and_picture_of_the_rows_so_far(config, tmp_path):
     output = tmp_path / "out"
-    long = ["--set", "first=32", "--set", "known_ground=5000", "--set", "new_ground=0"]
+    long = ["--set", "first=32", "--set", "known_ground=600", "--set", "new_ground=0"]
     code = (
         "import signal, sys\n"
         "from ratslam.__main__ import main\n"

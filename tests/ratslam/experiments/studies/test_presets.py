@@ -92,7 +92,7 @@ def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
 
 
 def test_both_backends_see_the_same_session(tmp_path, capsys):
-    quick = ["create_simulation.reports=40", "backend=classic", "pose_cells.cells_xy=11"]
+    quick = ["create_simulation.reports=20", "backend=classic", "pose_cells.cells_xy=11"]
     quick += ["pose_cells.cells_heading=12"]
     config = str(ROOT / "configs" / "create_arena.yaml")
     command = ["study", "--preset", "backends", config, *(f"--set={one}" for one in quick)]
@@ -102,7 +102,7 @@ def test_both_backends_see_the_same_session(tmp_path, capsys):
     assert [row["row"] for row in content["rows"]] == ["classic", "grid", "dead reckoning"]
     assert len({each.source for each in RunLog(tmp_path / "out").records.values()}) == 1
     for row in (rat, grid, reckoned):
-        assert row["steps"] == 40
+        assert row["steps"] == 20
         assert 0 < row["spreads"]["error_final"]["median"] < 3
         assert 0 < row["spreads"]["ate_final"]["median"] < 3
     assert "step_time" not in reckoned["spreads"]
