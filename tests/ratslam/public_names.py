@@ -1,4 +1,4 @@
-"""Uses every public name of `ratslam`; `test_public_names.py` checks it with `mypy --strict`."""
+"""Uses every public name of `ratslam`; `make lint` checks it as users check their own code."""
 
 from __future__ import annotations
 
@@ -86,3 +86,9 @@ def use_registries(
     metric = ratslam.Metric("own", "own", "m", "low", "Own", lambda data: ratslam.Finding(1.0))
     ratslam.METRICS.register("own", ratslam.MetricEntry(OwnSettings, lambda settings: metric))
     return [*ratslam.BACKENDS.names(), str(ratslam.PathMap().trajectory())]
+
+
+def use_names_wrongly() -> None:
+    """The two errors are found: an ignored error that does not exist would be reported."""
+    ratslam.Pose  # type: ignore[attr-defined]  # noqa: B018
+    ratslam.run(3)  # type: ignore[arg-type]
