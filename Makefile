@@ -21,8 +21,9 @@ run: $(BASE)
 	@n=1; while [ -e runs/whisker_maze-$$n ]; do n=$$((n + 1)); done; \
 	set -x; $(BIN)/python -m ratslam run configs/whisker_maze.yaml -o runs/whisker_maze-$$n
 
+# Three workers on two cores, because live sessions wait most of their time. The longest modules begin first.
 test: $(DEV)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 soak: $(DEV)
 	$(BIN)/python -m pytest --soak -n 2 --dist loadfile -v --timeout 3600 $(if $(PART),--part $(PART)/$(SOAK_PARTS))

@@ -46,17 +46,27 @@ more than they compute. Soak and benchmarks compile as users do, and so do the p
 the environment of `tests.helpers.environment`."""
 LONGEST = (
     "tests/ratslam/live/test_complete_session.py",
-    "tests/ratslam/live/test_create_session.py",
-    "tests/ratslam/live/test_head_faults.py",
     "tests/ratslam/backends/test_conformance.py",
-    "tests/ratslam/live/test_installed_backend.py",
-    "tests/ratslam/examples/test_examples.py",
-    "tests/ratslam/experiments/studies/test_growth.py",
-    "tests/ratslam/experiments/studies/test_study_runner.py",
-    "tests/ratslam/pipeline/test_report_page.py",
     "tests/test_docs.py",
-    "tests/ratslam/live/test_kills.py",
+    "tests/ratslam/live/test_head_faults.py",
+    "tests/ratslam/examples/test_examples.py",
+    "tests/ratslam/experiments/cells/test_cell_study.py",
+    "tests/ratslam/live/test_create_session.py",
+    "tests/ratslam/cli/test_run.py",
+    "tests/ratslam/pipeline/test_recall_maps.py",
     "tests/ratslam/live/test_arm_faults.py",
+    "tests/ratslam/pipeline/test_begun_pieces.py",
+    "tests/ratslam/cli/test_localise_grid.py",
+    "tests/ratslam/live/test_kills.py",
+    "tests/ratslam/experiments/studies/test_study_runner.py",
+    "tests/ratslam/pipeline/test_carried_robot.py",
+    "tests/robot/drivers/ur10/test_arm.py",
+    "tests/ratslam/keyframes/test_closure_odds.py",
+    "tests/ratslam/live/test_localise.py",
+    "tests/ratslam/live/test_installed_backend.py",
+    "tests/robot/drivers/create/test_driver.py",
+    "tests/robot/emulators/ur10/test_clients.py",
+    "tests/ratslam/live/test_mapper_faults.py",
 )
 """Modules that begin first, so that no worker is left alone with one at the end."""
 
@@ -96,7 +106,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Takes what lives to the end, which is most, out of the garbage collector's rounds; these become rarer."""
+    """Takes what lives to the end, which is most, out of the garbage collector's rounds."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(5_000, 20, 50)

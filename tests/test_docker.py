@@ -52,6 +52,7 @@ def test_the_copied_files_are_not_ignored() -> None:
     assert instructions("COPY") == [". ."]
 
 
+@pytest.mark.soak
 def test_the_steps_install_the_program(image: Path) -> None:
     """Without dependencies, which other tests install: `make soak` runs the steps as they are."""
     pytest.importorskip("build", reason="of the extra [dev]")

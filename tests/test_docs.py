@@ -56,7 +56,20 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("readme", PYTHON, ids=name)
+LONG = {
+    "docs/cells.md", "ratslam/rats/README.md", "ratslam/viewer/README.md", "ratslam/export/README.md",
+    "ratslam/experiments/trials/README.md",
+}  # fmt: skip
+"""READMEs whose blocks take longest, on parts of the program that have tests of their own: for `make soak`."""
+
+
+@pytest.mark.parametrize(
+    "readme",
+    [
+        pytest.param(path, marks=pytest.mark.soak if name(path) in LONG else (), id=name(path))
+        for path in PYTHON
+    ],
+)
 @pytest.mark.usefixtures("checkout")
 def test_python_blocks_run(readme: Path) -> None:
     for block in blocks(readme.read_text(encoding="utf-8"), "python"):

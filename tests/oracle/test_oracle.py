@@ -155,7 +155,10 @@ def test_templates_given_as_labels(tmp_path: Path) -> None:
             {"template_x_size": 60, "template_y_size": 20, "vt_shift_match": 4, "vt_step_match": 1},
             marks=pytest.mark.soak,
         ),
-        {"template_x_size": 12, "template_y_size": 2, "vt_panoramic": 1, "vt_step_match": 1},
+        pytest.param(
+            {"template_x_size": 12, "template_y_size": 2, "vt_panoramic": 1, "vt_step_match": 1},
+            marks=pytest.mark.soak,
+        ),
         {"template_x_size": 6, "template_y_size": 3, "vt_shift_match": 0, "pc_dim_xy": 14, "pc_dim_th": 20},
     ],
     ids=["camera", "panoramic", "small grid"],

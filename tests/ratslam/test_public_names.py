@@ -27,5 +27,7 @@ def test_other_names_do_not_exist() -> None:
 
 
 def test_the_type_check_uses_every_name() -> None:
-    used = set(re.findall(r"ratslam\.(\w+)", USES.read_text(encoding="utf-8").split("def use_names_wrongly")[0]))
+    used = set(
+        re.findall(r"ratslam\.(\w+)", USES.read_text(encoding="utf-8").split("def use_names_wrongly")[0])
+    )
     assert used == set(ratslam.__all__)

@@ -85,16 +85,19 @@ def map_of(name):
     return file
 
 
-BATCHED_BY_STUDIES = {"touch", "classic", EXAMPLE}
-"""Backends whose batches `make test` compares; those of the grid filter are those of `test_batch`."""
+SELDOM = {
+    "a batch equals its members": {"touch", EXAMPLE},
+    "single precision stays single": {"touch", "grid", EXAMPLE},
+}
+"""Checks that compile most, and the backends of which `make test` makes them."""
 
 
 def cases():
     """Every backend with every check; those that compile only what no study does, for the soak."""
     for name in [*METHODS, EXAMPLE]:
         for check in CHECKS:
-            batch = check.name == "a batch equals its members" and name not in BATCHED_BY_STUDIES
-            seldom = pytest.mark.soak if batch or name in OFTEN else ()
+            rare = name not in SELDOM.get(check.name, {name})
+            seldom = pytest.mark.soak if rare or name in OFTEN else ()
             yield pytest.param(name, check, id=f"{name}-{check.name}", marks=seldom)
 
 
@@ -103,7 +106,14 @@ def test_our_backends_pass(name, check):
     check.run(trial_of(name))
 
 
-@pytest.mark.parametrize("name", some(METHODS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        "touch",
+        "grid",
+        *(pytest.param(one, marks=pytest.mark.soak) for one in METHODS if one not in ("touch", "grid")),
+    ],
+)
 def test_the_evidence_is_finite_in_single_precision(name):
     _, steps = trial_of(name).single
     for step in steps:

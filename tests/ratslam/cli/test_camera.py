@@ -84,7 +84,7 @@ def scale_free_error(path: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.abs(np.vdot(a, b) / np.vdot(a, a) * a - b) ** 2)))
 
 
-@pytest.mark.parametrize("fov_deg", [60, 360])
+@pytest.mark.parametrize("fov_deg", [60, pytest.param(360, marks=pytest.mark.soak)])
 def test_visual_odometry_goes_round_a_loop(fov_deg: int, tmp_path: Path) -> None:
     """Without a map, whose kernels take a minute to compile."""
     world = CorridorLoop(seed=2, length=9.0, depth=5.5, breadth=1.8, laps=1.0, rate=8.0)

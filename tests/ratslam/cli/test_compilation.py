@@ -17,6 +17,7 @@ from tests.helpers.square_run import copy_square_run
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.soak
 def test_the_program_as_users_compile_it_gives_the_same_map(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "ratslam", "run", "configs/square.yaml", "-o", str(tmp_path / "users")]
     done = subprocess.run(command, cwd=ROOT, env=as_users_do(), capture_output=True, text=True)

@@ -75,6 +75,7 @@ def test_the_validator_accepts_the_file_and_it_holds_all(run, recording, tmp_pat
         assert len(file.acquisition["injected_energy"].data) == len(recording.time)
 
 
+@pytest.mark.soak
 def test_equal_runs_give_equal_bytes_in_every_process(run, recording, tmp_path):
     for name in ("a.nwb", "a.npz"):
         export_run(run, tmp_path / name)

@@ -29,7 +29,9 @@ def rescaled(case: SelectionProblem, by: float) -> SelectionProblem:
 # Selection
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(3, 6))]
+)
 def test_true_sequences_are_all_accepted(seed):
     made = world(seed)
     case, starts = made.case, made.starts()

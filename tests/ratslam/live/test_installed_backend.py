@@ -19,9 +19,9 @@ def test_it_maps_live_and_its_replay_gives_the_same_bits(
     point = {"ratslam.backends:reckoning": "own_reckoning:ENTRY"}
     install(tmp_path / "site", "own_reckoning", module, point)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
-    settings = [*PATIENT, "live.whisks=20", "live.plan.whisking.rate=2", "live.budget=3"]
+    settings = [*PATIENT, "live.whisks=6", "live.plan.whisking.rate=2", "live.budget=3"]
     settings += ["live.plan.calibration.min_duration=2", "backend=reckoning", "backend_settings.scale=0.5"]
     directory = complete_session(loopback, tmp_path, *settings, longest=280)
-    check_session(directory, 20, [name for name in SAME if not name.startswith("map.") or name == "map.tum"])
+    check_session(directory, 6, [name for name in SAME if not name.startswith("map.") or name == "map.tum"])
     assert "distance" in (directory / "steps.csv").read_text().splitlines()[0].split(",")
     assert json.loads((directory / "manifest.json").read_text())["status"] == "complete"

@@ -160,6 +160,7 @@ def test_no_link_leads_from_one_piece_to_the_next() -> None:
     assert not ((edges.i < first) != (edges.j < first)).any()
 
 
+@pytest.mark.soak
 def test_a_piece_of_a_map_that_merges_keyframes_is_joined_and_merged() -> None:
     walk, session = carried(), empty_merging_session(2)
     replay(session, walk.readings)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
-from ratslam.core.session import Session
 from tests.ratslam.pipeline.touch_walks import (
     WIDE,
+    MappedWalk,
     Walk,
     dead_reckoning,
     empty_carried_session,
@@ -47,16 +49,22 @@ def test_the_odometry_of_a_robot_that_is_never_carried_is_not_cut(seed: int) -> 
         assert not session.map.pieces().any()
 
 
-def kidnapped_session() -> tuple[Walk, Session]:
-    walk = kidnap(simulate_walk(4, maze=WIDE), 240, 45)
-    return walk, empty_carried_session()
+@cache
+def kidnapped() -> Walk:
+    return kidnap(simulate_walk(4, maze=WIDE), 240, 45)
+
+
+@cache
+def uninterrupted() -> tuple[MappedWalk, dict[str, np.ndarray]]:
+    """The map of the whole walk, and the arrays of its session."""
+    session = empty_carried_session()
+    return follow(session, kidnapped().readings), session.arrays()
 
 
 @pytest.mark.parametrize("every", [41, pytest.param(7, marks=pytest.mark.soak)])
 def test_reading_the_map_does_not_change_it(every: int) -> None:
-    walk, session = kidnapped_session()
-    expected = follow(session, walk.readings)
-    saved = session.arrays()
+    walk = kidnapped()
+    expected, saved = uninterrupted()
     session = empty_carried_session()
     for start in range(0, len(walk.readings), every):
         list(session.replay(walk.readings[start : start + every]))
@@ -73,7 +81,7 @@ def test_reading_the_map_does_not_change_it(every: int) -> None:
 
 
 def test_a_map_with_merged_keyframes_is_the_same_whichever_part_is_read_first() -> None:
-    walk, _ = kidnapped_session()
+    walk = kidnapped()
     session = empty_merging_session(1, may_be_carried=True)
     found = follow(session, walk.readings)
     made = session.map
@@ -90,13 +98,12 @@ def test_a_map_with_merged_keyframes_is_the_same_whichever_part_is_read_first() 
 
 
 @pytest.mark.parametrize(
-    "stop", [pytest.param(250, marks=pytest.mark.soak), 300, pytest.param(320, marks=pytest.mark.soak), 330]
+    "stop", [*(pytest.param(stop, marks=pytest.mark.soak) for stop in (250, 300, 320)), 330]
 )
 def test_a_restored_map_with_cuts_continues_as_the_uninterrupted_one(stop: int) -> None:
-    walk, session = kidnapped_session()
-    expected = follow(session, walk.readings)
+    walk = kidnapped()
+    expected, whole = uninterrupted()
     assert expected.cuts
-    whole = session.arrays()
     session = empty_carried_session()
     follow(session, walk.readings[:stop])
     saved = session.arrays()

@@ -75,7 +75,9 @@ def check_kill(moment: int, output: Path, maps: list[Path]) -> bool:
     return killed
 
 
-@pytest.mark.parametrize(("name", "moment"), [("both.npz", 1), ("both", 5)])
+@pytest.mark.parametrize(
+    ("name", "moment"), [("both.npz", 1), pytest.param("both", 5, marks=pytest.mark.soak)]
+)
 def test_a_killed_merge_leaves_the_maps_and_no_half_map(
     name: str, moment: int, maps: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

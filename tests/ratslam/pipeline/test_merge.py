@@ -82,6 +82,7 @@ def test_two_sessions_of_a_maze_become_one_map(maps: dict[str, Path], joined: Pa
     assert made.kept_keyframes().count < 0.7 * sum(kept)
 
 
+@pytest.mark.soak
 def test_the_order_of_arguments_does_not_matter(maps: dict[str, Path], joined: Path, tmp_path: Path) -> None:
     merge_maps([maps["again"], maps["one"]], tmp_path / "both.npz")
     assert read_map(tmp_path / "both.npz").digest == read_map(joined).digest

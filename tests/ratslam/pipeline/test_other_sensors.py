@@ -83,7 +83,13 @@ def improvement(found: dict[str, Quantity]) -> float:
     return metric.value / metric.odometry
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        "wrench of 1 x 6",
+        *(pytest.param(sensor, marks=pytest.mark.soak) for sensor in SENSORS if "1 x" not in sensor),
+    ],
+)
 def test_it_maps_three_circuits(sensor: str, tmp_path: Path) -> None:
     found = scores(tmp_path, SENSORS[sensor] + SESSION + SHORT)
     print(sensor, found["energy_all"], found["ate_final"], found["map_doubt"])

@@ -99,11 +99,11 @@ def golden(name: str) -> InMemorySource:
     ("trace", "limit", "broken"),
     [
         ("a_square3", 0.02, []),
-        ("b_figure8_alias", 0.03, []),
+        pytest.param("b_figure8_alias", 0.03, [], marks=pytest.mark.soak),
         ("e_kidnap", 0.08, [127]),
-        ("c_corridor_wrap", None, []),
+        pytest.param("c_corridor_wrap", None, [], marks=pytest.mark.soak),
         ("d1_rotation_generic", None, []),
-        ("j_reverse_stop", None, []),
+        pytest.param("j_reverse_stop", None, [], marks=pytest.mark.soak),
     ],
 )
 def test_one_setting_maps_every_trace(trace, limit, broken):
@@ -113,7 +113,7 @@ def test_one_setting_maps_every_trace(trace, limit, broken):
     assert cuts(found) == broken
 
 
-@pytest.mark.parametrize("trace", ["a_square3", "e_kidnap"])
+@pytest.mark.parametrize("trace", [pytest.param("a_square3", marks=pytest.mark.soak), "e_kidnap"])
 def test_a_map_is_cut_only_if_the_robot_may_be_carried(trace):
     """A map that would not be cut is the same with either setting."""
     plain, carried = golden_map(trace), carried_steps(trace)[0]

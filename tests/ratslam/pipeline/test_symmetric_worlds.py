@@ -44,7 +44,9 @@ def replayed(session, log):
     return session.map, strength
 
 
-@pytest.mark.parametrize("moves", [CORRIDOR, ROUND], ids=["corridor", "round"])
+@pytest.mark.parametrize(
+    "moves", [CORRIDOR, pytest.param(ROUND, marks=pytest.mark.soak)], ids=["corridor", "round"]
+)
 def test_a_symmetric_loop_is_closed_with_high_odds(session, moves):
     """The control is as sure as recall. The first members of the revisit are accepted all the same, because
     the map foretells their place; what the control finds there then no longer counts against them."""

@@ -184,6 +184,7 @@ def wait_for(port):
     raise AssertionError("the server has not started")
 
 
+@pytest.mark.soak
 def test_a_viewer_that_accepts_and_never_reads_changes_no_result(plain, tmp_path, capfd):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

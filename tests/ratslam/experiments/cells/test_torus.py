@@ -48,7 +48,7 @@ def test_a_box_smaller_than_the_torus_holds_no_lattice():
 
 
 def test_a_short_session_gives_table_and_picture(tmp_path):
-    result = measure_torus(CellTask(41009, 1), seconds=(30.0, 20.0), columns=6, shuffles=19)
+    result = measure_torus(CellTask(41009, 1), seconds=(60.0, 45.0), columns=6, shuffles=19)
     text = "\n".join(FIGURE.table(result))
     assert "3.33 x 2.38" in text
     assert "0.67 x 0.67" in text

@@ -32,7 +32,7 @@ from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.errors import InputError
 from tests.helpers.grid_world import TIPS, create, report
 
-TINY = ("create_simulation.reports=24", "grid.particles=20")
+TINY = ("create_simulation.reports=40", "grid.particles=20")
 ROOMY = Arena("roomy", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (), np.zeros(3))
 BRIER = next(measure for measure in MEASURES if measure.key == "map_brier_skill")
 EVERYWHERE = MEASURES[0]
@@ -106,12 +106,12 @@ def test_an_intermediate_stop_does_not_change_the_result(tiny: object) -> None:
     assert config.create_simulation is not None
     out = simulate_session(config.create_simulation)
     reports = observe_session(config, out, 0)
-    early, late = run_filter(config, out, reports, (13, len(reports)))
+    early, late = run_filter(config, out, reports, (23, len(reports)))
     (whole,) = run_filter(config, out, reports, (len(reports),))
     assert np.array_equal(late.online, whole.online)
     assert np.array_equal(late.grid.probability, whole.grid.probability)
-    assert np.array_equal(early.online, whole.online[:13])
-    assert len(early.path) == 13
+    assert np.array_equal(early.online, whole.online[:23])
+    assert len(early.path) == 23
 
 
 # Orders

@@ -44,6 +44,7 @@ def tiny():
 # Sessions
 
 
+@pytest.mark.soak
 def test_sessions_that_share_a_compiled_kernel_are_independent(tiny):
     config, log = tiny
     once = run_session(config, log)

@@ -107,6 +107,7 @@ def test_a_measurement_on_the_way_changes_nothing(config):
     assert errors(alone) == errors(rows[-1])
 
 
+@pytest.mark.soak
 def test_an_interrupt_leaves_table_and_picture_of_the_rows_so_far(config, tmp_path):
     output = tmp_path / "out"
     long = ["--set", "first=32", "--set", "known_ground=600", "--set", "new_ground=0"]

@@ -108,6 +108,7 @@ def test_both_backends_see_the_same_session(tmp_path, capsys):
     assert "step_time" not in reckoned["spreads"]
 
 
+@pytest.mark.soak
 def test_tiers_are_compared_by_cost_and_images(tmp_path, capsys, monkeypatch):
     monkeypatch.delitem(METHODS, "recall")  # one kernel less to compile
     (tmp_path / "tiny.yaml").write_text(TINY)

@@ -181,6 +181,7 @@ def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
     assert room > 0.17 - 0.05 * 0.01 - 1e-6  # motion between two checks
 
 
+@pytest.mark.soak
 def test_six_minutes_have_the_statistics_of_the_paper() -> None:
     """30 contacts or more, some without a second contact, in 3 to 4 anticlockwise circuits."""
     counts = []

@@ -137,6 +137,7 @@ def score_estimators(templates: StrainTemplates, side: float) -> dict[str, Score
 
 
 @pytest.mark.parametrize("side", [1.25, pytest.param(2.5, marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_walls_are_estimated_in_unseen_arenas(side: float, templates: StrainTemplates) -> None:
     scores = score_estimators(templates, side)
     print(f"\n{side:g} m     accepted  mean error  over 15 degrees")

@@ -175,7 +175,9 @@ def test_readings_do_not_depend_on_the_batch_size(tier: MechanicsModel) -> None:
         np.testing.assert_allclose(a.deflection, b.deflection, atol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["open", "rcp", "spread"])
+@pytest.mark.parametrize(
+    "mode", ["open", *(pytest.param(mode, marks=pytest.mark.soak) for mode in ("rcp", "spread"))]
+)
 def test_both_raw_tiers_agree_on_contacts(mode: str) -> None:
     slow, quick = (
         detected_contacts(tier, 40, WhiskingConfig(mode=mode))
