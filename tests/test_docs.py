@@ -60,7 +60,7 @@ LONG = {
     "docs/cells.md", "ratslam/rats/README.md", "ratslam/viewer/README.md", "ratslam/export/README.md",
     "ratslam/experiments/trials/README.md",
 }  # fmt: skip
-"""READMEs whose blocks take longest, on parts of the program that have tests of their own: for `make soak`."""
+"""READMEs whose blocks take longest, on parts that have tests of their own: for `make soak`."""
 
 
 @pytest.mark.parametrize(
