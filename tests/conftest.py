@@ -70,9 +70,14 @@ LONGEST = (
 )
 """Modules that begin first, so that no worker is left alone with one at the end."""
 
-settings.register_profile(
-    "ratslam", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+for profile, examples in (("ratslam", 40), ("soak", 100)):
+    settings.register_profile(
+        profile,
+        max_examples=examples,
+        derandomize=True,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
 settings.load_profile("ratslam")
 
 ROOT = Path(__file__).parents[1]
@@ -86,6 +91,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     # JAX reads the flags when it first computes; workers and programs that tests start inherit them.
     flags = os.environ.get("XLA_FLAGS", "")
+    if config.getoption("--soak"):
+        settings.load_profile("soak")
     as_users_do = config.getoption("--soak") or config.getoption("--benchmark-only")
     if not as_users_do and FEWER_PASSES not in flags:
         flags = f"{flags} {FEWER_PASSES}"

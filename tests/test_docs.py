@@ -56,17 +56,14 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-LONG = {
-    "docs/cells.md", "ratslam/rats/README.md", "ratslam/viewer/README.md", "ratslam/export/README.md",
-    "ratslam/experiments/trials/README.md",
-}  # fmt: skip
-"""READMEs whose blocks take longest, on parts that have tests of their own: for `make soak`."""
+OFTEN = {"README.md", "ratslam/README.md"}
+"""READMEs whose blocks `make test` runs; those of the others, of parts with own tests, are for `make soak`."""
 
 
 @pytest.mark.parametrize(
     "readme",
     [
-        pytest.param(path, marks=pytest.mark.soak if name(path) in LONG else (), id=name(path))
+        pytest.param(path, marks=() if name(path) in OFTEN else pytest.mark.soak, id=name(path))
         for path in PYTHON
     ],
 )

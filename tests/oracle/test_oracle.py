@@ -69,7 +69,7 @@ def test_stock_lecture_hall_whole() -> None:
     assert report.steps == 13838
 
 
-LONG = {"c_corridor_wrap"}
+LONG = {"b_figure8_alias", "c_corridor_wrap", "d1_rotation_generic"}
 
 
 @pytest.mark.parametrize(

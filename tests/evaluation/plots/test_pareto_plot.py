@@ -19,7 +19,7 @@ from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto, place_labels
         max_size=15,
     )
 )
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_labels_neither_overlap_nor_cover_blocked_boxes(rows):
     rows = np.array(rows, float)
     area, blocked = np.array([0.0, 0.0, 600.0, 400.0]), np.array([[100.0, 100.0, 140.0, 400.0]])

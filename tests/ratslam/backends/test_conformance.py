@@ -52,8 +52,9 @@ METHODS = {
     "localise_grid": ("localise_grid", {"grid": DOUBTFUL}),
 }
 EXAMPLE = "dead-reckoning"
-OFTEN = {"recall", "recall-labels", "classic-labels", "signed-touch"}
-"""Backends that differ from another one by the kind of views, or do less: for `make soak`."""
+OFTEN = {"recall", "recall-labels", "classic-labels", "signed-touch", "localise", "localise_grid"}
+"""Backends that differ from another one by the kind of views, do less, or have tests of whole sessions: for
+`make soak`."""
 
 
 def some(names):

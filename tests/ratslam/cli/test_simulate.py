@@ -172,6 +172,7 @@ def test_an_interrupted_session_is_a_complete_file(tmp_path):
     assert source.info.simulation.seed == 0
 
 
+@pytest.mark.soak
 def test_a_killed_session_is_readable(tmp_path):
     process, path = started(tmp_path)
     process.kill()

@@ -129,7 +129,7 @@ def moments():
     """Cases and keyframes at which a map is restored; most for the soak."""
     for case in CASES:
         for at in (60, 136, 155, LAP - 18, LAP + 7):
-            often = at == 136 or (at == LAP + 7 and case != "selected")
+            often = case != "selected" and at in (136, LAP + 7)
             yield pytest.param(case, at, marks=() if often else pytest.mark.soak)
 
 
@@ -147,7 +147,9 @@ def test_a_restored_map_continues_bit_for_bit(case, at):
     assert np.array_equal(whole.candidates(), again.candidates(), equal_nan=True)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(one, marks=pytest.mark.soak) if one == "selected" else one for one in CASES]
+)
 def test_asking_for_the_final_map_changes_nothing(case):
     recalled, settings = CASES[case]
     asked, silent = new_map(**settings), new_map(**settings)

@@ -32,7 +32,7 @@ OFTEN = pytest.mark.soak
         ({"do": "protective"}, "protective_stop"),
         pytest.param({"do": "safeguard"}, "safeguard_stop", marks=OFTEN),
         pytest.param({"do": "emergency"}, "emergency_stop", marks=OFTEN),
-        ({"do": "ik_fails"}, "unreachable"),
+        pytest.param({"do": "ik_fails"}, "unreachable", marks=OFTEN),
         ({"do": "die"}, "arm_gone"),
     ],
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",

@@ -12,7 +12,7 @@ from tests.ratslam.live.bench import Bench
 
 TOUCH = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
 """A map by the whiskers of the emulated head."""
-WHISKS = 12
+WHISKS = 6
 
 
 def test_a_map_of_another_sensor_is_refused_before_the_arm_moves(bench: Bench, tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_live_gives_the_bits_of_a_replay() -> None:
     "stop",
     [
         pytest.param(CARRIED, marks=pytest.mark.soak),
-        CARRIED + 5,
+        pytest.param(CARRIED + 5, marks=pytest.mark.soak),
         LEARNED,
         pytest.param(CARRIED + 60, marks=pytest.mark.soak),
     ],

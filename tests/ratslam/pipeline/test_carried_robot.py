@@ -80,6 +80,7 @@ def test_reading_the_map_does_not_change_it(every: int) -> None:
     assert all(np.array_equal(again[name], saved[name], equal_nan=True) for name in saved)
 
 
+@pytest.mark.soak
 def test_a_map_with_merged_keyframes_is_the_same_whichever_part_is_read_first() -> None:
     walk = kidnapped()
     session = empty_merging_session(1, may_be_carried=True)

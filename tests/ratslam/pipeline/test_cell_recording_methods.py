@@ -37,7 +37,7 @@ def circles() -> InMemorySource:
     )  # fmt: skip
 
 
-@pytest.fixture(params=METHODS)
+@pytest.fixture(params=["recall float64", pytest.param("classic float32", marks=pytest.mark.soak)])
 def live(request: pytest.FixtureRequest) -> tuple[Session, InMemorySource, list[Step], np.ndarray]:
     """A session that records, its source, its steps one at a time, and the torus after each."""
     source = circles()

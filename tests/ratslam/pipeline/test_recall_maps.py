@@ -155,6 +155,7 @@ def test_an_unknown_corridor_stays_odometry(seed):
     assert error(found, log) == pytest.approx(odometry_error(log), abs=1e-9)
 
 
+@pytest.mark.soak
 def test_a_lap_in_the_opposite_direction_is_closed_where_it_turns():
     # The return path has other views (another heading), so only equal headings may close.
     there = [(0.05, 0.0)] * 30 + [(0.0, np.pi / 18)] * 18

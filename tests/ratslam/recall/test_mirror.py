@@ -211,7 +211,10 @@ def second_pass(kind, seed, mirrored):
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.soak)])
-@pytest.mark.parametrize("kind", ["ordered sectors", "columns", "whiskers"])
+@pytest.mark.parametrize(
+    "kind",
+    ["whiskers", *(pytest.param(kind, marks=pytest.mark.soak) for kind in ("ordered sectors", "columns"))],
+)
 def test_a_path_in_the_mirror_swaps_recall_and_its_control(kind, seed):
     recalled, control = second_pass(kind, seed, False)
     in_mirror, control_in_mirror = second_pass(kind, seed, True)

@@ -62,6 +62,7 @@ def test_capacities_are_sufficient_powers_of_two(steps):
     assert capacity < 2 * steps + 512
 
 
+@pytest.mark.soak
 def test_a_threshold_sweep_equals_single_sessions(tiny):
     """In the current experiences, and in the map that the steps of a threshold are folded into."""
     config, log = tiny

@@ -91,6 +91,7 @@ def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
     assert copies == [0, 1, 2]
 
 
+@pytest.mark.soak
 def test_both_backends_see_the_same_session(tmp_path, capsys):
     quick = ["create_simulation.reports=20", "backend=classic", "pose_cells.cells_xy=11"]
     quick += ["pose_cells.cells_heading=12"]

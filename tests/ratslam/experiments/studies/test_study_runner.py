@@ -78,6 +78,7 @@ def outcomes(records):
     return [(each.key, each.row, each.varied, each.steps, each.source, each.quantities) for each in records]
 
 
+@pytest.mark.soak
 def test_two_workers_give_what_one_process_gives(tiny, tmp_path):
     jobs = read_study(tiny(seeds=2)).jobs
     alone = run(jobs, tmp_path / "alone")
@@ -176,6 +177,7 @@ def test_records_of_other_code_are_remarked_on(tiny, tmp_path, capsys, stubbed):
     assert "2 builds of ratslam" in capsys.readouterr().out
 
 
+@pytest.mark.soak
 def test_speed_is_measured_in_fresh_processes_and_is_not_measured_again(tiny, tmp_path, capsys):
     study, output = tiny(seeds=2, report="pareto", pace="live"), tmp_path / "out"
     assert main(["study", str(study), "-o", str(output)]) == 0

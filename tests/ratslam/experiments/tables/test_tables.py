@@ -171,6 +171,7 @@ def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
     assert lines[-1] == "Create, 9 settings: final median 0.500 m; above odometry: final 0, live 9."
 
 
+@pytest.mark.soak
 def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
     """Four rounds on a circle in a room, by a laser of 180 beams."""
     write_building(tmp_path / "buildings", "room")

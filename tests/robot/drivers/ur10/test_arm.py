@@ -104,7 +104,7 @@ def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
     [
         ("protective", SessionOutcome.PROTECTIVE_STOP),
         ("safeguard", SessionOutcome.SAFEGUARD_STOP),
-        ("emergency", SessionOutcome.EMERGENCY_STOP),
+        pytest.param("emergency", SessionOutcome.EMERGENCY_STOP, marks=pytest.mark.soak),
     ],
 )
 def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionOutcome) -> None:
