@@ -57,7 +57,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 OFTEN = {"README.md", "ratslam/README.md"}
-"""READMEs whose blocks `make test` runs; those of the others, of parts with own tests, are for `make soak`."""
+"""READMEs whose blocks `make test` runs. The others show parts with tests of their own: for `make soak`."""
 
 
 @pytest.mark.parametrize(
