@@ -47,5 +47,5 @@ def test_views_alike_everywhere_have_no_odds_and_others_do() -> None:
     """The map's own odds are those of the weighed gains."""
     ground = laps(4)
     alike = compare_with_itself(ground, GUARD, gains_on(ground, 0.0), weighing=DISTINCT)
-    told = compare_with_itself(ground, GUARD, gains_on(ground, 6.0), weighing=DISTINCT)
+    told = compare_with_itself(ground, GUARD, gains_on(ground, 6.0, reaches=1.0), weighing=DISTINCT)
     assert alike.expected < 0.5 * told.expected
