@@ -13,8 +13,6 @@ import numpy as np
 
 BINS = 24
 """Number of bins of the gain."""
-PRIOR_TRUE, PRIOR_FALSE = (1.9, 0.8), (0.5, 1.6)
-"""Mean and standard deviation of the gains at true and at false poses, before any were counted, nat."""
 PRIOR_COUNT = 40.0
 """Number of gains that the prior counts as."""
 FARTHEST = 20.0
@@ -24,6 +22,13 @@ OUTLIERS = 0.04
 """Share of either distribution that is drawn from the other: something has changed, or was misread."""
 LEAVING = -2.0
 """Log-odds of leaving mapped ground: false supposed poses do so more often than true ones."""
+
+
+class GainPrior(NamedTuple):
+    """Gains before any were counted: mean and standard deviation at `true` and at `false` poses, nat."""
+
+    true: tuple[float, float]
+    false: tuple[float, float]
 
 
 class GainOdds(NamedTuple):
@@ -41,11 +46,14 @@ class GainOdds(NamedTuple):
         return float(self.odds[np.searchsorted(self.edges, gain)])
 
 
-def learn_gain_odds(true: np.ndarray, false: np.ndarray) -> GainOdds:
+PRIOR = GainPrior(true=(1.9, 0.8), false=(0.5, 1.6))
+
+
+def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIOR) -> GainOdds:
     """Log-odds of gains from those counted at true poses [n] and at false ones [m]."""
     from scipy.optimize import isotonic_regression  # slow to import
 
-    prior_true, prior_false = (_quantiles(*prior) for prior in (PRIOR_TRUE, PRIOR_FALSE))
+    prior_true, prior_false = (_quantiles(*each) for each in prior)
     pooled = np.concatenate([true, false, prior_true, prior_false])
     low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
     edges = np.linspace(low, high, BINS - 1)

@@ -13,6 +13,7 @@ import numpy as np
 from ratslam.alignment.following import STILL, Motion, Supposed, advance_all
 from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
 from ratslam.alignment.ground import Ground
+from ratslam.alignment.weighing import PLAIN, Weighing
 from tactile.base.se2 import between, wrap
 
 STRETCHES = 24
@@ -23,8 +24,6 @@ ALIKE = 6
 """Number of other places from which each stretch is followed."""
 ELSEWHERE = 2.0
 """Least distance of another place, as a multiple of the ground's reach."""
-MATCHING = 1.0
-"""Mean gain of the keyframes before one above which a false pose still looks right, nat."""
 
 Gains = Callable[[int, int], np.ndarray]
 """Gains [n, S, M] of the n keyframes that follow a keyframe, against those of the ground before it.
@@ -48,12 +47,14 @@ class Stretch(NamedTuple):
         return found
 
 
-def compare_with_itself(ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None) -> GainOdds:
+def compare_with_itself(
+    ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None, weighing: Weighing = PLAIN
+) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
         guard: number of keyframes before a stretch that do not count as ground. held: [N] bool, the keyframes
-            that are ground for a session; None: all.
+            that are ground for a session; None: all. weighing: of the gains.
     """
     count = len(ground.poses)
     held = np.ones(count, bool) if held is None else held
@@ -62,10 +63,11 @@ def compare_with_itself(ground: Ground, guard: int, gains: Gains, held: np.ndarr
     if count > first + LENGTH + guard:
         for begin in np.linspace(first, count - LENGTH - 1, STRETCHES).astype(int).tolist():
             stretch = _stretch(ground, begin, guard, gains, held)
+            stretch = stretch._replace(gains=weighing.weigh(stretch.gains))
             here, *elsewhere = stretch.follow(np.stack([stretch.start, *_alike(stretch)]), LENGTH)
-            true.append(_continued(here))
-            false += map(_continued, elsewhere)
-    return learn_gain_odds(np.concatenate(true), np.concatenate(false))
+            true.append(_continued(here, weighing.matching))
+            false += [_continued(gain, weighing.matching) for gain in elsewhere]
+    return learn_gain_odds(np.concatenate(true), np.concatenate(false), weighing.prior)
 
 
 def _stretch(ground: Ground, begin: int, guard: int, gains: Gains, held: np.ndarray) -> Stretch:
@@ -104,9 +106,9 @@ def _facing(poses: np.ndarray, pose: np.ndarray, ground: Ground) -> np.ndarray:
     return np.abs(wrap(poses[:, 2] - pose[2])) < 2 * ground.reach_heading
 
 
-def _continued(gain: np.ndarray) -> np.ndarray:
+def _continued(gain: np.ndarray, matching: float) -> np.ndarray:
     """The gains of a stretch that follow `FIRST` matching ones."""
     rows = np.lib.stride_tricks.sliding_window_view(gain, FIRST)[:-1]
-    before = np.isfinite(rows).all(axis=1) & (np.nan_to_num(rows).mean(axis=1) > MATCHING)
+    before = np.isfinite(rows).all(axis=1) & (np.nan_to_num(rows).mean(axis=1) > matching)
     found = gain[FIRST:][before]
     return found[np.isfinite(found)]

@@ -13,6 +13,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
 from ratslam.alignment.interruptions import LONGEST
+from ratslam.alignment.weighing import less_where_common
 from ratslam.atlas.placement import NOTHING_RECALLED
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
@@ -187,10 +188,12 @@ class Localiser(Checkpointed, Map):
     def _add_keyframe(self, evidence: Evidence) -> None:
         ground, odds = self.place.ground, self.place.odds
         moved = self._moved()
-        gain = np.asarray(evidence.gain)[:, : len(ground.poses)] if bool(evidence.shows) else None
+        gain = None
+        if bool(evidence.shows):
+            gain = less_where_common(np.asarray(evidence.gain)[:, : len(ground.poses)])
         self._views.append(moved, gain)
         self._frame.append(len(self._pose.rows))
-        recalled = self._recall(evidence, moved)
+        recalled = self._recall(evidence, moved, gain)
         self._hypotheses.advance(ground, odds, moved, gain, recalled)
         if recalled is not None:
             self._hypotheses.propose(ground, odds, self._views, recalled.pose)
@@ -209,14 +212,14 @@ class Localiser(Checkpointed, Map):
         variance[2] /= min(graph.heading_noise.factor, 1.0)
         return Motion(graph.correct(motion, length), variance)
 
-    def _recall(self, evidence: Evidence, moved: Motion) -> Recalled | None:
+    def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:
         """The recalled pose once some in a row agree with odometry."""
         shift, match = int(evidence.shift_row), int(evidence.match)
         ground, posterior = self.place.ground, float(evidence.posterior)
         self._recalled = self._recalled.onwards(ground, moved, shift, match, posterior)
-        if not self._recalled.is_confirmed:
+        if gain is None or not self._recalled.is_confirmed:
             return None
-        return Recalled(self._recalled.pose, float(np.asarray(evidence.gain)[shift, match]))
+        return Recalled(self._recalled.pose, float(gain[shift, match]))
 
     def _judge(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.alignment.weighing import DISTINCT
 from ratslam.atlas.localiser import Localiser, Place
 from ratslam.backends.config import LocaliseBackendConfig
 from ratslam.backends.finished_map import map_file, restore_map
@@ -25,7 +26,7 @@ from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
-LOG_ODDS = 11.0
+LOG_ODDS = 8.0
 """Log-odds at which a pose is found, beyond the logarithm of the number of places, by default."""
 
 
@@ -84,7 +85,7 @@ class LocaliseBackend(Backend):
         frames = map.kept_keyframes().taken.rows
         self._memory = views.freeze(frames, poses[frames])
         every = np.arange(len(poses))
-        odds = views.odds(every, poses, np.isin(every, frames))
+        odds = views.odds(every, poses, np.isin(every, frames), DISTINCT)
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
         self._start = map.map_trajectory()[-1] if here else None
 

@@ -13,6 +13,7 @@ from ratslam.alignment.comparison import Comparison
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground, ground_of
 from ratslam.alignment.self_comparison import compare_with_itself
+from ratslam.alignment.weighing import PLAIN, Weighing
 from ratslam.core.session import capacity_at
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.recall import filter
@@ -87,13 +88,19 @@ class MapViews:
         graph = self.graph
         return ground_of(poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance())
 
-    def odds(self, frames: np.ndarray, poses: np.ndarray, held: np.ndarray | None = None) -> GainOdds:
+    def odds(
+        self,
+        frames: np.ndarray,
+        poses: np.ndarray,
+        held: np.ndarray | None = None,
+        weighing: Weighing = PLAIN,
+    ) -> GainOdds:
         """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
         with each other.
 
         Args:
             held: [N] bool, those that a session is compared with, the others being merged with them; None:
-                all.
+                all. weighing: of the gains.
         """
         held = np.ones(len(frames), bool) if held is None else held
         whole, guard = self.freeze(frames[held], poses[held]), self.recall.recall.guard
@@ -105,7 +112,7 @@ class MapViews:
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
 
-        return compare_with_itself(self.ground(poses), guard, gains, held)
+        return compare_with_itself(self.ground(poses), guard, gains, held, weighing)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.

@@ -19,13 +19,13 @@ def laps(count: int) -> Ground:
     return ground_at(np.concatenate([LOOP.drive(0, len(LOOP.poses), seed) for seed in range(count)]))
 
 
-def gains_on(ground: Ground, apart: float, seed: int = 0) -> Gains:
-    """Views whose gains at their place are higher by so much."""
+def gains_on(ground: Ground, apart: float, seed: int = 0, reaches: float = 2.0) -> Gains:
+    """Views whose gains within so many reaches of their place are higher by so much."""
     count = len(ground.poses)
     stream, gain = np.random.default_rng(seed), np.zeros((count, 1, count))
     for k, pose in enumerate(ground.poses):
         gain[k, 0] = stream.normal(0, 1, count)
-        gain[k][ground.near(pose, 2 * ground.reach, 0.6)] += apart
+        gain[k][ground.near(pose, reaches * ground.reach, 0.6)] += apart
     return lambda begin, n: gain[begin : begin + n]
 
 
