@@ -47,6 +47,7 @@ class GainOdds(NamedTuple):
 
 
 PRIOR = GainPrior(true=(1.9, 0.8), false=(0.5, 1.6))
+"""Of plain gains."""
 
 
 def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIOR) -> GainOdds:

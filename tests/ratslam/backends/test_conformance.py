@@ -94,7 +94,7 @@ SELDOM = {
 
 
 def cases():
-    """Every backend with every check; those that compile only what no study does, for the soak."""
+    """Every backend with every check; the rare ones, and those of the backends in `OFTEN`, for the soak."""
     for name in [*METHODS, EXAMPLE]:
         for check in CHECKS:
             rare = name not in SELDOM.get(check.name, {name})
