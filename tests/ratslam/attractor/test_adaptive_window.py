@@ -75,6 +75,7 @@ def random_motion(n, seed, often, speed, steps):
         assert not np.any(level)
 
 
+@pytest.mark.soak
 @settings(max_examples=2)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.01, 0.1]), st.sampled_from([0.05, 0.4, 2.0]))
 def test_some_hundred_steps_equal_those_of_the_torus(seed, often, speed):

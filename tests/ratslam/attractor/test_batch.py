@@ -65,6 +65,7 @@ def test_parameter_sets_are_networks_of_those_parameters(block, compared):
     assert not np.any(track.level[:, :30])
 
 
+@pytest.mark.soak
 def test_trials_of_other_seeds_and_noise_equal_single_sessions():
     backend = PRINTED  # resamples at every report with evidence
     stream = np.random.default_rng(0)

@@ -225,6 +225,7 @@ def corridor(backend, reports, spread):
     return np.array(moments)
 
 
+@pytest.mark.soak
 def test_position_in_a_corridor_is_that_of_an_exact_filter():
     """Mean and variance of the position at four reports named beforehand, over 20 runs of 1 000 particles:
     |t| < 5 in each of eight tests with 19 degrees of freedom. Size: 7e-4."""

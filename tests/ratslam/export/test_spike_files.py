@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 
 import numpy as np
-import pynwb
 import pytest
 
 from evaluation.cells.analysis import AnalysisSettings, analyse_cells
@@ -24,6 +24,12 @@ from tests.ratslam.rats.recordings import drawn_recording
 
 CELLS = [5, 1, 300]
 CONFIG = "recording: {file: none.bag}\npose_cells: {cells_xy: 7, cells_heading: 8}\n"
+
+
+@pytest.fixture(scope="module")
+def pynwb():
+    """The package, which takes seconds to import."""
+    return importlib.import_module("pynwb")
 
 
 @pytest.fixture
@@ -45,7 +51,7 @@ def run(recording, tmp_path):
     return directory
 
 
-def test_the_validator_accepts_the_file_and_it_holds_all(run, recording, tmp_path):
+def test_the_validator_accepts_the_file_and_it_holds_all(run, recording, tmp_path, pynwb):
     assert main(["export", str(run), "-o", str(tmp_path / "run.nwb"), "--peak-rate", "30"]) == 0
     assert pynwb.validate(path=str(tmp_path / "run.nwb")) == []
     network = PoseCellConfig(cells_xy=7, cells_heading=8)
@@ -102,7 +108,7 @@ def test_numpy_spikes_are_those_of_the_settings(run, recording, tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
-def test_cells_without_any_spike_are_valid(recording, tmp_path):
+def test_cells_without_any_spike_are_valid(recording, tmp_path, pynwb):
     recording.activity[:] = 0.0
     write_nwb(tmp_path / "silent.nwb", recording, draw_spikes(recording, 1.0), "digest")
     assert pynwb.validate(path=str(tmp_path / "silent.nwb")) == []

@@ -23,7 +23,7 @@ def gaps(recorded: RecordedData) -> int:
     [
         ({"do": "unplug"}, "head_gone"),
         ({"do": "silence", "seconds": 60}, "head_silent"),
-        ({"do": "corrupt", "frames": 10**6}, "head_garbled"),
+        pytest.param({"do": "corrupt", "frames": 10**6}, "head_garbled", marks=pytest.mark.soak),
     ],
     ids=lambda value: value["do"] if isinstance(value, dict) else "",
 )

@@ -12,6 +12,7 @@ from tests.helpers.distributions import install
 from tests.ratslam.live.test_complete_session import PATIENT, SAME, check_session, complete_session
 
 
+@pytest.mark.soak
 def test_it_maps_live_and_its_replay_gives_the_same_bits(
     loopback: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

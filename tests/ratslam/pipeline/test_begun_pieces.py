@@ -130,7 +130,8 @@ def test_a_checkpoint_continues_as_the_uninterrupted_session(stop: int) -> None:
     assert same(session.arrays(), whole)
 
 
-@pytest.mark.parametrize("stop", [LEARNED + 1, pytest.param(CARRIED + 60, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("stop", [LEARNED + 1, CARRIED + 60])
 def test_a_piece_that_stays_untied_continues_from_a_checkpoint(stop: int) -> None:
     first, other = carried(), simulate_walk(5, maze=WIDE | {"seed": 31002})
     readings = [*first.readings[:CARRIED], *other.readings[:100]]

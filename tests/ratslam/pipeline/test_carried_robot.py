@@ -61,7 +61,8 @@ def uninterrupted() -> tuple[MappedWalk, dict[str, np.ndarray]]:
     return follow(session, kidnapped().readings), session.arrays()
 
 
-@pytest.mark.parametrize("every", [41, pytest.param(7, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("every", [41, 7])
 def test_reading_the_map_does_not_change_it(every: int) -> None:
     walk = kidnapped()
     expected, saved = uninterrupted()

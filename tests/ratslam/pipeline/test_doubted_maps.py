@@ -42,6 +42,7 @@ def test_odometry_is_the_best_estimate_of_a_doubted_map(monkeypatch):
     assert ate(map.map_trajectory(), log.truth) < ate(map.trajectory(), log.truth)
 
 
+@pytest.mark.soak
 def test_the_doubt_is_the_same_live_and_in_replay():
     log = golden(NAME)
     readings = [sample.reading for sample in log]

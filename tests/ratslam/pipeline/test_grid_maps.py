@@ -9,7 +9,8 @@ import pytest
 
 from ratslam.experiments.tables.grid import GridFigures, GridTask, measure_session
 
-FEW, MANY = (9100, 9101), tuple(range(9100, 9108))
+ONE, FEW, MANY = (9100,), (9100, 9101), tuple(range(9100, 9108))
+ARENAS = pytest.mark.parametrize("arenas", [ONE, pytest.param(FEW, marks=pytest.mark.soak)])
 
 
 @cache
@@ -56,15 +57,17 @@ def test_scale_errors_need_their_noise_model_and_the_back_motions(row, times):
     assert ratio(row, MANY) > times * ratio("bias", MANY)
 
 
-def test_the_map_agrees_with_the_walls():
-    auc, skill, free, there, back = np.mean([one.map for one in sessions("bias")], axis=0)
+@ARENAS
+def test_the_map_agrees_with_the_walls(arenas):
+    auc, skill, free, there, back = np.mean([one.map for one in sessions("bias", arenas)], axis=0)
     assert auc > 0.85
     assert skill > max(0.25, free)
     assert max(there, back) < 0.08
 
 
-def test_wall_directions_are_estimated_from_contacts():
-    found = sessions("bias")
+@ARENAS
+def test_wall_directions_are_estimated_from_contacts(arenas):
+    found = sessions("bias", arenas)
     off = np.degrees(np.concatenate([one.wall_errors for one in found]))
     assert off.mean() < 6
     assert (off > 15).mean() < 0.04

@@ -147,6 +147,7 @@ def test_the_file_shows_closures_as_they_are_judged(shown):
     assert counts[-1] == verdicts.count("accepted")
 
 
+@pytest.mark.soak
 def test_a_viewer_killed_in_the_middle_changes_no_result(plain, tmp_path, capfd):
     port = free_port()
     command = [sys.executable, "-m", "rerun", "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)]

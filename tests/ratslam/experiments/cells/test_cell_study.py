@@ -139,18 +139,25 @@ def test_views_give_the_packets_of_the_classic_backend():
     assert np.abs(packets - expected).max() <= 1e-9
 
 
-def test_bytes_depend_neither_on_workers_nor_on_interrupts(box, tmp_path, monkeypatch):
+@pytest.mark.soak
+def test_bytes_do_not_depend_on_workers(box, tmp_path, monkeypatch):
     for name in ("compilation_cache_dir", "persistent_cache_min_compile_time_secs",
                  "persistent_cache_min_entry_size_bytes"):  # fmt: skip
         monkeypatch.setenv(f"JAX_{name.upper()}", str(getattr(jax.config, f"jax_{name}")))
     study = cell_study(box(), SMALL)
     with Executor(1) as executor:
+        run_cell_study(study, tmp_path / "one", executor)
+    with Executor(2) as executor:
+        run_cell_study(study, tmp_path / "two", executor)
+    assert chunks(tmp_path / "two") == chunks(tmp_path / "one")
+
+
+def test_bytes_do_not_depend_on_interrupts(box, tmp_path):
+    study = cell_study(box(), SMALL)
+    with Executor(1) as executor:
         scores = run_cell_study(study, tmp_path / "one", executor)
     alone = chunks(tmp_path / "one")
     assert len(alone) == 2
-    with Executor(2) as executor:
-        run_cell_study(study, tmp_path / "two", executor)
-    assert chunks(tmp_path / "two") == alone
     (tmp_path / "one" / FOLDER / sorted(alone)[0]).unlink()
     counted: list[int] = []
     with Executor(1) as executor:

@@ -200,7 +200,8 @@ def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch, tmp
     assert "buildings" in rows
 
 
-@pytest.mark.parametrize("turned_deg", [20, pytest.param(-20, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("turned_deg", [20, -20])
 def test_a_candidate_claims_the_heading_that_its_shifted_view_shows(turned_deg, tmp_path):
     """Later rounds are driven with the head turned by two sectors of ten degrees."""
     write_building(tmp_path / "buildings", "room", np.radians(turned_deg))
