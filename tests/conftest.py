@@ -42,8 +42,7 @@ FEWER_PASSES = (
     " --xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true,xla_cpu_optimize_for_size=true"
 )
 """Compiles a session's kernel in about 40 % of the time; its steps take a third longer. Most tests compile
-more than they compute. Soak and benchmarks compile as users do, and so do the programs that tests start with
-the environment of `tests.helpers.environment`."""
+more than they compute. Soak and benchmarks compile as users do."""
 LONGEST = (
     "tests/ratslam/live/test_complete_session.py",
     "tests/ratslam/backends/test_conformance.py",

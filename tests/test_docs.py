@@ -57,9 +57,10 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 LONG = {
-    "docs/cells.md", "ratslam/attractor/README.md", "ratslam/core/README.md", "ratslam/export/README.md",
-    "ratslam/experiments/studies/README.md", "ratslam/experiments/trials/README.md", "ratslam/grid/README.md",
-    "ratslam/pipeline/README.md", "ratslam/rats/README.md", "ratslam/viewer/README.md",
+    "docs/cells.md", "ratslam/README.md", "ratslam/attractor/README.md", "ratslam/core/README.md",
+    "ratslam/experiments/studies/README.md", "ratslam/experiments/trials/README.md",
+    "ratslam/export/README.md", "ratslam/grid/README.md", "ratslam/pipeline/README.md",
+    "ratslam/rats/README.md", "ratslam/viewer/README.md",
 }  # fmt: skip
 """READMEs whose blocks take longest, on parts that have tests of their own: for `make soak`."""
 

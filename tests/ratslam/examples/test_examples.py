@@ -79,6 +79,7 @@ def test_every_step_is_in_the_readme() -> None:
     assert named == [(name, name) for name in STEPS]
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("own_names")
 def test_a_loop_reads_through_an_own_front_end(tmp_path: Path) -> None:
     SOURCES.register("arrays", own_arrays.ENTRY)

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers.environment import as_users_do
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, Faults, until
 from tests.ratslam.live.bench import raise_priority, read_recorded
 
@@ -46,7 +45,7 @@ PATIENT = (
 def emulated(what: str, port: int, host: str, *settings: str) -> Iterator[Faults]:
     """`emulate` in a process that ends with the block."""
     command = [sys.executable, "-m", "ratslam", "emulate", what, CONFIG, "--host", host, "--ur-host", host]
-    process = subprocess.Popen([*command, *settings], cwd=ROOT, env=as_users_do(), stdout=subprocess.PIPE)
+    process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE)
     faults = Faults(process, host, port)
     try:
         assert process.stdout is not None
@@ -99,7 +98,7 @@ def complete_session(
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(
                 [*command, "-o", str(directory), *given, *options],
-                cwd=ROOT, env=as_users_do(), stdout=log, stderr=log,
+                cwd=ROOT, stdout=log, stderr=log,
             )  # fmt: skip
             raise_priority(process.pid)
             try:
@@ -146,7 +145,7 @@ def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> d
     again = directory.parent / "again"
     done = subprocess.run(
         [sys.executable, "-c", REPLAY, "run", str(directory / "config.yaml"), "-o", str(again)],
-        cwd=ROOT, env=as_users_do(), capture_output=True, text=True, timeout=1200,
+        cwd=ROOT, capture_output=True, text=True, timeout=1200,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]", "the replay loads what only live sessions need"

@@ -12,7 +12,6 @@ import pytest
 from ratslam.experiments.atlas.sessions import Recipe, touch_config
 from ratslam.experiments.atlas.stored_maps import store_map
 from ratslam.experiments.tables.touch import MAIN
-from tests.helpers.environment import as_users_do
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS
 from tests.ratslam.live.test_complete_session import CONFIG, PATIENT, emulated
 
@@ -38,7 +37,7 @@ def test_a_session_reaches_its_goals(loopback: str, tmp_path: Path) -> None:
         command = [sys.executable, "-m", "ratslam", "live", CONFIG, "--ur-host", loopback, "--head", loopback]
         done = subprocess.run(
             [*command, "-o", str(directory), *given],
-            cwd=ROOT, env=as_users_do(), capture_output=True, text=True, timeout=900,
+            cwd=ROOT, capture_output=True, text=True, timeout=900,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "reached: " in done.stderr

@@ -120,6 +120,7 @@ def test_a_larger_study_contains_a_smaller_one():
         assert (column <= high).all()
 
 
+@pytest.mark.soak
 def test_views_give_the_packets_of_the_classic_backend():
     config = load_config("square", ["session.precision=float64"])
     course = read_course(config, 240, True, 5, (), 0)

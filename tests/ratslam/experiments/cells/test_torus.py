@@ -47,6 +47,7 @@ def test_a_box_smaller_than_the_torus_holds_no_lattice():
     assert np.isnan(found.shape.spacing).all()
 
 
+@pytest.mark.soak
 def test_a_short_session_gives_table_and_picture(tmp_path):
     result = measure_torus(CellTask(41009, 1), seconds=(60.0, 45.0), columns=6, shuffles=19)
     text = "\n".join(FIGURE.table(result))

@@ -183,6 +183,7 @@ def test_all_conditions_are_valid_and_run_on_the_same_sets(name):
             assert job.config.templates.energy == 0.05
 
 
+@pytest.mark.soak
 def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path, capsys):
     sets = [part for assignment in TINY for part in ("--set", assignment)]
     arguments = ["reproduce", "fig6", "--sets", "1", "--workers", "1", "-o", str(tmp_path), *sets]

@@ -73,6 +73,7 @@ def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(confi
     assert len(np.unique(entered, axis=0)) > 0.9 * len(entered)
 
 
+@pytest.mark.soak
 def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
     output = tmp_path / "out"
     assert main(["study", "--preset", "growth", str(config), *SHORT, "-o", str(output)]) == 0

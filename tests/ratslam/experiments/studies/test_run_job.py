@@ -64,6 +64,7 @@ def test_pace_and_earlier_jobs_change_no_quantity(tiny):
     assert jax.config.jax_enable_x64 == before
 
 
+@pytest.mark.soak
 def test_the_grid_filter_is_judged_by_its_map(tmp_path):
     (tmp_path / "study.yaml").write_text(
         f"base: {ROOT}/configs/create_arena.yaml\nset: {{create_simulation.reports: 30}}\n"

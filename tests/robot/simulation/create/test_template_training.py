@@ -44,6 +44,7 @@ def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
     return np.array([one.error[:, ESTIMATORS.index(way)] for one in drives if one.known == known])
 
 
+@pytest.mark.soak
 def test_the_file_follows_from_the_seed(templates: StrainTemplates) -> None:
     again = train_strain_templates(CONFIG)
     assert len(templates.angle) == 15
