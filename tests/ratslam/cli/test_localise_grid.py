@@ -51,6 +51,7 @@ def found(arena: Path) -> Path:
     return arena / "found"
 
 
+@pytest.mark.soak
 def test_a_session_is_found_in_its_own_map(arena: Path, found: Path) -> None:
     with (found / "localisation.csv").open() as file:
         known = np.array([row["state"] == "found" for row in csv.DictReader(file)])
@@ -62,6 +63,7 @@ def test_a_session_is_found_in_its_own_map(arena: Path, found: Path) -> None:
     assert (found / "scorecard.json").is_file()
 
 
+@pytest.mark.soak
 def test_a_loop_localises_to_the_same_bits(arena: Path, found: Path) -> None:
     slam = ratslam.Slam.load(arena / "map", mode="localise")
     with (found / "steps.csv").open() as file:

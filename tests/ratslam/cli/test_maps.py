@@ -135,7 +135,7 @@ def test_what_cannot_be_cropped_is_refused(capsys, tmp_path: Path) -> None:
     assert not part.exists()
 
 
-@pytest.mark.parametrize("backend", ["classic", "grid"])
+@pytest.mark.parametrize("backend", ["classic", pytest.param("grid", marks=pytest.mark.soak)])
 def test_maps_without_keyframes(backend: str, capsys, tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
     settings = "pose_cells: {cells_xy: 11, cells_heading: 12, engine: dense}\ngrid: {particles: 20}\n"

@@ -26,8 +26,8 @@ STEPS = (
     "whisker_images", "grid_filter", "a_bag", "sensor_live", "come_back", "cells_of_a_rat",
 )  # fmt: skip
 LONG = {
-    "a_bag", "grid_filter", "one_packet", "own_arrays", "own_loop", "own_metric", "places_that_look_alike",
-    "sensor_live", "taxel_array", "two_packets",
+    "a_bag", "come_back", "grid_filter", "one_packet", "own_arrays", "own_loop", "own_metric",
+    "places_that_look_alike", "sensor_live", "taxel_array", "two_packets",
 }  # fmt: skip
 """Examples that take longest, on parts of the program that have tests of their own: for `make soak`."""
 FOLDER = Path(ratslam.examples.__file__).parent

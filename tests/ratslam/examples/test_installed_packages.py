@@ -86,6 +86,7 @@ def test_a_broken_package_is_named(
     assert cause in told
 
 
+@pytest.mark.soak
 def test_a_broken_package_harms_nothing_else(site: Path, tmp_path: Path) -> None:
     install(site, "harmless", "1 / 0", {POINT: "harmless:ENTRY"})
     assert main(["run", SQUARE, "-o", str(tmp_path / "run")]) == 0

@@ -100,6 +100,7 @@ def test_the_robot_is_unknown_where_a_piece_begins() -> None:
     assert int(first.estimate.previous) == -1
 
 
+@pytest.mark.soak
 def test_live_gives_the_bits_of_a_replay() -> None:
     expected, whole = replayed()
     walk, session = carried(), empty_session()

@@ -22,6 +22,7 @@ ratslam.run(config, "runs/<script>")
 """
 
 
+@pytest.mark.soak
 def test_a_cell_shows_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))

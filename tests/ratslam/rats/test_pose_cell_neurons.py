@@ -82,6 +82,7 @@ def test_rate_maps_come_from_the_history(walked):
         neurons.get_state(evaluate_at="all")
 
 
+@pytest.mark.soak
 def test_noise_drifts_and_the_true_pose_anchors():
     noise = {"pose_cells": CONFIG, "cell": [0], "heading_noise": 0.1, "speed_noise": 0.1}
     drifting = errors_of(PoseCellNeurons(new_agent(), noise), 600)

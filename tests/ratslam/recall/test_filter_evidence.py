@@ -278,6 +278,7 @@ def test_standing_still_makes_no_frames():
     assert int(session.state.memory.count) == 2
 
 
+@pytest.mark.soak
 def test_a_session_compiles_once_per_capacity():
     session = make_session()
     views = np.random.default_rng(0).random((30, 1, SIZE, 1))

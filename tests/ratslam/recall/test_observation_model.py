@@ -70,7 +70,10 @@ def test_mass_is_conserved(seed, config, kind):
     assert 0 <= found.entropy <= math.log(config.modes + 1) + 1e-12
 
 
-@pytest.mark.parametrize(("config", "dtype"), [(BOTH, float), (AHEAD, float), (BOTH, np.float32)])
+@pytest.mark.parametrize(
+    ("config", "dtype"),
+    [(BOTH, float), (AHEAD, float), pytest.param(BOTH, np.float32, marks=pytest.mark.soak)],
+)
 def test_mass_is_conserved_along_a_path(config, dtype):
     """A lap driven three times, every image remembered, from the first one on."""
     stream = np.random.default_rng(0)

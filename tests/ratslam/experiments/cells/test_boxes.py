@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -99,6 +100,7 @@ def test_columns_are_places_with_headings_all_the_way_round():
     assert single.shape == (2, 5)
 
 
+@pytest.mark.soak
 def test_a_short_session_gives_table_and_picture(tmp_path):
     result = measure_boxes(CellTask(41009, 1), seconds=12.0, columns=8)
     assert result.side < result.torus

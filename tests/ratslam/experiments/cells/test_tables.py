@@ -29,6 +29,7 @@ def test_scores_agree_with_other_packages(cells: int, seconds: float) -> None:
     assert len(list(agreement_table(found))) == 2 + len(found)
 
 
+@pytest.mark.soak
 def test_shuffles_of_every_score_are_compared() -> None:
     found = check_shuffles(CellTask(3, 12), shuffles=19, seconds=60.0)
     assert len({row.score for row in found.rows}) == 13
