@@ -4,8 +4,10 @@ While a session goes on, a cut is found from one closure sequence at a time: it 
 missing where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are
 selected anew with the odometry cut there, and so on in turn, because each makes the other better. Each time
 it is retraced once on all keyframes and once on the earlier ones alone: two stretches at one wrong place bear
-each other out, but the first of them has to fit what was there before. Of all these maps and the one before,
-the one that the views and the measurements together find most likely is given. The method is ours."""
+each other out, but the first of them has to fit what was there before. Each map is aligned by closures along
+its own poses (`track_closures`): bent, the right one would look less likely than a wrong one. Of all these
+maps and the one before, the one that the views and the measurements together find most likely is given. The
+method is ours."""
 
 from __future__ import annotations
 
@@ -25,13 +27,16 @@ from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
-from ratslam.keyframes.optimizer import MapFit
+from ratslam.keyframes.optimizer import MapFit, MapProblem, System
 from ratslam.keyframes.pose_tracks import TrackGround
 from ratslam.keyframes.retracing import JUMP, retrace
+from ratslam.keyframes.track_closures import add_closures_along
 from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
 
 ROUNDS = 3
 """Number of times that the robot is retraced."""
+ALIGNED = 3
+"""Number of times that a map is aligned by the views along its poses; more change it little."""
 MOST_RETRACED = 2000
 """Largest number of keyframes of a map that is retraced: each is compared with every other."""
 FEWEST_RETRACED = 100
@@ -54,14 +59,26 @@ class Case(NamedTuple):
 
     def starts(self, fit: MapFit) -> list[MapFit]:
         """Maps to start from: a fit, and those that follow the sequences in order of time."""
-        cut = self.problem._replace(measurements=cut_odometry(self.problem.measurements, self.breaks))
+        cut = self.problem._replace(measurements=self._measurements())
         return [fit, *MapHypotheses().follow(cut, self.sequences)]
+
+    def cost(self, fit: MapFit) -> float:
+        """Chi-square of a fit, its cuts left out."""
+        return System(self._measurements()).robust_cost(fit) + self.problem.views_cost(fit.poses)
+
+    def _measurements(self) -> MapProblem:
+        return cut_odometry(self.problem.measurements, self.breaks)
 
 
 class Judged(NamedTuple):
-    """A selection, and its log-likelihood with what all views say, nat."""
+    """A selection, and its log-likelihood with what all views say, nat.
+
+    Attributes:
+        case: with the sequences of recall alone. aligned: with those along the poses too. selection: of these.
+    """
 
     case: Case
+    aligned: Case
     selection: Selection
     likelihood: float
 
@@ -91,12 +108,15 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
         found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
         newest = max(found, key=lambda judged: judged.likelihood)
         best = max(best, newest, key=lambda judged: judged.likelihood)
-    case, cut = best.case, _uncut(graph)
+    case, cut = best.aligned, _uncut(graph)
     return selected_map(graph, case.log, cut, case.sequences, best.selection)
 
 
 def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:
-    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`."""
+    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`, and, if these
+    are fewer, to its sequences."""
+    if len(rows) == len(solution.fit.poses):
+        return solution
     log, cut = kept.log.copy(), GrowableArray((), np.int64)
     log.follow(solution.log)
     cut.replace(solution.cut.rows[rows])
@@ -108,10 +128,24 @@ def _case(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
     """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
     log = log.copy()
     log.strike_across(cuts)
+    return _case_of(graph, log, cuts)
+
+
+def _case_of(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+    """The selection among the sequences of a log, none of which lies across a cut; changes the log."""
     sequences = np.flatnonzero(sequences_to_select(graph, log))
     problem = selection_case(graph, log, _uncut(graph), sequences, np.copy)
     shows = np.array([np.append(np.flatnonzero(problem.first >= frame), -1)[0] for frame in cuts], int)
     return Case(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
+
+
+def _align(graph: KeyframeGraph, fits: np.ndarray, case: Case, fit: MapFit) -> tuple[Case, Selection]:
+    """The selection among the sequences of a case and those along the poses of a fit."""
+    log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
+    add_closures_along(log, TrackGround.of_map(graph, fit, fits), cuts, graph.config.max_gap)
+    aligned = _case_of(graph, log, cuts)
+    start = fit._replace(weights=np.ones(len(aligned.sequences)))
+    return aligned, optimise_with_cuts(aligned.problem, start, aligned.breaks)
 
 
 def _retrace(
@@ -133,18 +167,24 @@ def _retrace(
 def _judge(
     graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, starts: list[MapFit]
 ) -> Judged:
-    """The most likely of the selections from these starts.
+    """The most likely of the selections from these starts, aligned by the views.
 
     Args:
         fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
     """
-    found = []
-    for start in starts:
-        selection = optimise_with_cuts(case.problem, start, case.breaks)
-        seen = TrackGround.of_map(graph, selection.fit, fits).own_odds(odds).sum()
-        likelihood = float(seen) - JUMP * len(case.breaks) - selection.cost / 2
-        found.append(Judged(case, selection, likelihood))
-    return max(found, key=lambda judged: judged.likelihood)
+    selections = [optimise_with_cuts(case.problem, start, case.breaks) for start in starts]
+    likelihoods = [_likelihood(graph, fits, odds, case, one.fit) for one in selections]
+    selection, aligned = selections[int(np.argmax(likelihoods))], case
+    for _ in range(ALIGNED):
+        aligned, selection = _align(graph, fits, case, selection.fit)
+    return Judged(case, aligned, selection, _likelihood(graph, fits, odds, case, selection.fit))
+
+
+def _likelihood(graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, fit: MapFit) -> float:
+    """Of all views, the cuts, the odometry and the sequences of recall; those along the poses would count
+    the views twice."""
+    seen = TrackGround.of_map(graph, fit, fits).own_odds(odds).sum()
+    return float(seen) - JUMP * len(case.breaks) - case.cost(fit) / 2
 
 
 def _uncut(graph: KeyframeGraph) -> GrowableArray:

@@ -197,9 +197,10 @@ class ClosureLog(Checkpointed):
         self._lines = None
 
     def follow(self, other: ClosureLog) -> None:
-        """Takes over everything known of all sequences from a log of the same ones."""
+        """Takes over everything known of all sequences from a log whose first ones they are."""
+        count = self.sequences
         for name in ("_verdict", "_distance", "_weight", "_log_odds", "_stood"):
-            getattr(self, name).replace(getattr(other, name).rows.copy())
+            getattr(self, name).replace(getattr(other, name).rows[:count].copy())
         self._lines = None
 
     def spans(self) -> np.ndarray:

@@ -18,8 +18,9 @@ from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.pose_tracks import Track, TrackGround
 from ratslam.keyframes.verification import turn_on_spot
 
-JUMP = CUT / 2
-"""What being carried costs, nat."""
+JUMP = CUT
+"""What being carried costs, nat: twice what a cut costs a selection, because each view counts here, and
+successive ones are alike."""
 BEYOND, AROUND = 60, 180
 """Keyframes over which a stretch of the map is followed beyond its ends, and over which any other track is
 followed."""
