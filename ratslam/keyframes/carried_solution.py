@@ -24,7 +24,7 @@ from ratslam.keyframes.closure_selection import (
     optimise_with_cuts,
 )
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import ClosureLog
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
 from ratslam.keyframes.optimizer import MapFit, MapProblem, System
@@ -109,7 +109,11 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
         newest = max(found, key=lambda judged: judged.likelihood)
         best = max(best, newest, key=lambda judged: judged.likelihood)
     case, cut = best.aligned, _uncut(graph)
-    return selected_map(graph, case.log, cut, case.sequences, best.selection)
+    found = selected_map(graph, case.log, cut, case.sequences, best.selection)
+    refused = found.log.verdicts() != Verdict.ACCEPTED
+    refused[: log.sequences] = False  # what recall says against the map stays
+    found.log.strike_sequences(np.flatnonzero(refused))
+    return found
 
 
 def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:

@@ -243,6 +243,12 @@ class ClosureLog(Checkpointed):
         rows[(rows[:, 0] >= frame) & accepted & (rows[:, 3] != spare) & (rows[:, 3] >= 0), 3] = -1
         self._lines = None
 
+    def strike_sequences(self, sequences: np.ndarray) -> None:
+        """Strikes out the candidates of sequences [n]."""
+        rows = self._candidate.rows
+        rows[np.isin(rows[:, 3], sequences), 3] = -1
+        self._lines = None
+
     def strike_across(self, cuts: np.ndarray) -> None:
         """Strikes out candidates of sequences that lie across breaks of the odometry before keyframes `cuts`
         [n], ascending: of each sequence all but those of the part with the most."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.keyframes.carried_solution import is_retraced
+from ratslam.keyframes.loop_closures import Verdict
 from ratslam.keyframes.map import KeyframeMap
 from tactile.base.se2 import between
 from tactile.base.types import Odometry, observation
@@ -50,6 +51,18 @@ def test_the_odometry_is_cut_where_the_robot_was_carried():
     assert abs(cuts[0] - JUMP) <= 1
     assert off(map, JUMP).max() < 1.5
     assert not map.pieces().any()
+
+
+def test_the_carried_part_is_tied_to_the_map_all_along():
+    """Also where recall proposes nothing; the map that the session continues from is as recall left it."""
+    map = driven()
+    before = map.log.sequences
+    solution = map.solution()
+    tied = solution.log.accepted_pairs()
+    assert np.isin(np.arange(JUMP + 1, COUNT), tied[:, 0]).all()
+    assert not np.isin(np.arange(JUMP + 1, COUNT - 8), map.log.accepted_pairs()[:, 0]).any()
+    assert (solution.log.verdicts()[before:] == Verdict.ACCEPTED)[solution.log.left()[before:] > 0].all()
+    assert map.log.sequences == before
 
 
 def test_nothing_is_cut_without_a_jump():
