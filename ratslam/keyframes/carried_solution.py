@@ -74,7 +74,7 @@ class Judged(NamedTuple):
     """A selection, and its log-likelihood with what all views say, nat.
 
     Attributes:
-        case: with the sequences of recall alone. aligned: with those along the poses too. selection: of these.
+        case: with the sequences of recall. aligned: with those along the poses too. selection: of these.
     """
 
     case: Case
@@ -109,11 +109,11 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
         newest = max(found, key=lambda judged: judged.likelihood)
         best = max(best, newest, key=lambda judged: judged.likelihood)
     case, cut = best.aligned, _uncut(graph)
-    found = selected_map(graph, case.log, cut, case.sequences, best.selection)
-    refused = found.log.verdicts() != Verdict.ACCEPTED
+    given = selected_map(graph, case.log, cut, case.sequences, best.selection)
+    refused = given.log.verdicts() != Verdict.ACCEPTED
     refused[: log.sequences] = False  # what recall says against the map stays
-    found.log.strike_sequences(np.flatnonzero(refused))
-    return found
+    given.log.strike_sequences(np.flatnonzero(refused))
+    return given
 
 
 def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:

@@ -22,7 +22,6 @@ CSV_COLUMNS = (
     "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
 )
 
-
 CONFIRMED_WEIGHT = 0.5
 """Robust weight above which a sequence confirms what it joins."""
 
@@ -204,8 +203,7 @@ class ClosureLog(Checkpointed):
         self._lines = None
 
     def spans(self) -> np.ndarray:
-        """[R, 2] first and last keyframe of every sequence; first > last where all candidates are struck
-        out."""
+        """[R, 2] first and last keyframe of every sequence; first > last where all are struck out."""
         spans = np.tile(np.array([np.iinfo(np.int64).max, -1]), (self.sequences, 1))
         rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
         np.minimum.at(spans[:, 0], rows[:, 3], rows[:, 0])
@@ -245,8 +243,7 @@ class ClosureLog(Checkpointed):
 
     def strike_sequences(self, sequences: np.ndarray) -> None:
         """Strikes out the candidates of sequences [n]."""
-        rows = self._candidate.rows
-        rows[np.isin(rows[:, 3], sequences), 3] = -1
+        self._candidate.rows[np.isin(self._candidate.rows[:, 3], sequences), 3] = -1
         self._lines = None
 
     def strike_across(self, cuts: np.ndarray) -> None:
@@ -332,9 +329,8 @@ class ClosureLog(Checkpointed):
         columns = self._distance.rows, self._verdict.rows, self._weight.rows, self._log_odds.rows
         of_sequence = np.stack(columns, axis=1)[sequence]
         of_sequence[sequence < 0] = np.inf, Verdict.UNDONE, 0.0, np.nan
-        return np.concatenate(
-            [self._candidate.rows[:, :3], self._evidence.rows, sequence[:, None], of_sequence], axis=1
-        )
+        parts = self._candidate.rows[:, :3], self._evidence.rows, sequence[:, None], of_sequence
+        return np.concatenate(parts, axis=1)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""

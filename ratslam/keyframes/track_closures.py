@@ -1,8 +1,8 @@
 """Closure sequences along the poses of a map, where its views fit.
 
 Recall proposes few sequences on a stretch between two cuts of the odometry, so the stretch is bent and its
-views look as if it were elsewhere. Where the poses of keyframes are near each other and the view fits, each is
-a closure. The rule is ours."""
+views look as if it were elsewhere. Where the poses of two keyframes are near each other and the view fits,
+they are a closure. The rule is ours."""
 
 from __future__ import annotations
 
