@@ -148,8 +148,7 @@ def _align(graph: KeyframeGraph, fits: np.ndarray, case: Case, fit: MapFit) -> t
     log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
     add_closures_along(log, TrackGround.of_map(graph, fit, fits), cuts, graph.config.max_gap)
     aligned = _case_of(graph, log, cuts)
-    start = fit._replace(weights=np.ones(len(aligned.sequences)))
-    return aligned, optimise_with_cuts(aligned.problem, start, aligned.breaks)
+    return aligned, optimise_with_cuts(aligned.problem, fit, aligned.breaks)
 
 
 def _retrace(

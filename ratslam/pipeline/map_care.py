@@ -57,7 +57,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
 def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
     kept, solution = made.kept_keyframes(), made.solution()
     belief = made.keyframes().calibration(*solution)
-    verdicts = solution.log.verdicts()
+    verdicts = _verdicts(made)
     return {
         "keyframes": made.keyframes().count,
         "keyframes_not_merged": kept.count,
@@ -69,11 +69,16 @@ def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
     }
 
 
+def _verdicts(made: KeyframeMap) -> np.ndarray:
+    """[R] on the sequences of recall: those that may follow them in a final map follow from its poses."""
+    return made.solution().log.verdicts()[: made.log.sequences]
+
+
 def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
     """The accepted closure sequences: number, first and last step, the steps matched, evidence."""
     log, step = made.solution().log, made.keyframe_steps()
     found = []
-    for number in np.flatnonzero(log.verdicts() == Verdict.ACCEPTED).tolist():
+    for number in np.flatnonzero(_verdicts(made) == Verdict.ACCEPTED).tolist():
         members = log.members(number)
         found.append(
             {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from ratslam.keyframes.carried_solution import is_retraced
 from ratslam.keyframes.loop_closures import Verdict
@@ -63,6 +64,8 @@ def test_the_carried_part_is_tied_to_the_map_all_along():
     assert not np.isin(np.arange(JUMP + 1, COUNT - 8), map.log.accepted_pairs()[:, 0]).any()
     assert (solution.log.verdicts()[before:] == Verdict.ACCEPTED)[solution.log.left()[before:] > 0].all()
     assert map.log.sequences == before
+    with pytest.raises(ValueError, match="is not an accepted closure sequence"):
+        map.undo(before)  # would come again
 
 
 def test_nothing_is_cut_without_a_jump():
