@@ -67,6 +67,7 @@ def result() -> RotationResult:
     return measure_rotation(CellTask(41000, sessions=1), SHORT)
 
 
+@pytest.mark.soak
 def test_nothing_turns_where_no_cue_turns(result: RotationResult) -> None:
     heading = result.degrees("heading")
     for condition, turned in zip(CONDITIONS, heading, strict=True):
@@ -74,12 +75,14 @@ def test_nothing_turns_where_no_cue_turns(result: RotationResult) -> None:
             assert (np.abs(turned) < 40).all()
 
 
+@pytest.mark.soak
 def test_sessions_are_equal_until_the_turn(result: RotationResult) -> None:
     rows = round(SHORT.turn * 10)
     first = result.found[0][0].course[:rows]
     assert all(np.abs(wrap(seeds[0].course[:rows] - first)).max() < 1e-9 for seeds in result.found)
 
 
+@pytest.mark.soak
 def test_table_and_picture(result: RotationResult, tmp_path: Path) -> None:
     text = "\n".join(table_rotation(result))
     assert all(f"| {each.name} | {each.degrees} |" in text for each in CONDITIONS)
