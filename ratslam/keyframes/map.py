@@ -153,7 +153,7 @@ class KeyframeMap(Checkpointed, Map):
         return self.solution().pieces(self.keyframes(), doubted=self.final_doubt() > DOUBTED)
 
     def candidates(self) -> np.ndarray:
-        """[n, 10] all candidates of recall and their verdicts, see `ClosureLog.table`."""
+        """[n, 10] all candidates, of recall and then along a retraced map, see `ClosureLog.table`."""
         return self.solution().log.table()
 
     def covariance(self) -> np.ndarray:
