@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Literal
 
 import numpy as np
@@ -117,6 +118,8 @@ class HeadDriver:
     def __init__(self, reader: HeadReader, head: Head) -> None:
         self._reader, self._head = reader, head
         self._feedback: HostRcp | None = None
+        # Held while amplitudes are computed and queued: one queued after `rest` would keep the head awake.
+        self._lock = threading.Lock()
         reader.listeners.append(self._on_frames)
 
     def whisk(
@@ -137,23 +140,26 @@ class HeadDriver:
         check_amplitude(whisking, self._head, WHERE)
         rcp = self._reader.config.rcp
         commands = whisk_commands(whisking, threshold, centre, rcp)
-        self._feedback = None
+        feedback = None
         if rcp == "host" and whisking.mode != "open" and threshold is not None:
             middle = np.zeros(len(threshold)) if centre is None else centre
-            self._feedback = HostRcp(whisking, self._head.shape, threshold, middle)
-        for one in commands:
-            self._reader.send(one)
+            feedback = HostRcp(whisking, self._head.shape, threshold, middle)
+        with self._lock:
+            self._feedback = feedback
+            for one in commands:
+                self._reader.send(one)
 
     def rest(self) -> None:
         """Retracts the whiskers; samples continue."""
-        self._feedback = None
-        self._reader.rest()
+        with self._lock:
+            self._feedback = None
+            self._reader.rest()
 
     def _on_frames(self, frames: Frames, arrival: float) -> None:
-        feedback = self._feedback
-        amplitude = None if feedback is None else feedback.amplitudes(frames)
-        if amplitude is not None:
-            self._reader.send(Command(CommandKind.AMPLITUDES, FeedbackMode.OPEN, numbers=amplitude))
+        with self._lock:
+            amplitude = None if self._feedback is None else self._feedback.amplitudes(frames)
+            if amplitude is not None:
+                self._reader.send(Command(CommandKind.AMPLITUDES, FeedbackMode.OPEN, numbers=amplitude))
 
 
 def _thresholds(threshold: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -124,10 +126,31 @@ def test_the_driver_whisks_and_rests():
         memory.send(0, 40, frames.values, FrameFlag.CYCLE)
         until(lambda: memory.commands[-1].kind == CommandKind.AMPLITUDES)
         driver.rest()
-        count = len(memory.commands)
+        # A command on its way is written before the next samples are read.
         memory.send(40, 40, frames.values, FrameFlag.CYCLE)
         until(lambda: reader.decoder.counts.good == 80)
+        count = len(memory.commands)
+        memory.send(80, 40, frames.values, FrameFlag.CYCLE)
+        until(lambda: reader.decoder.counts.good == 120)
         assert len(memory.commands) == count
+
+
+def test_amplitudes_computed_during_rest_do_not_wake_the_head(monkeypatch):
+    reader = HeadReader(MemoryHead(18).connect, 18, HeadLinkConfig(rcp="host"))
+    driver = HeadDriver(reader, HEAD)
+    driver.whisk(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE)
+    resting = threading.Thread(target=driver.rest)
+
+    def rest_meanwhile(host: HostRcp, frames: Frames) -> np.ndarray:
+        resting.start()
+        resting.join(0.1)
+        return np.zeros(18, np.int16)
+
+    monkeypatch.setattr(HostRcp, "amplitudes", rest_meanwhile)
+    for listener in reader.listeners:
+        listener(whisks(1), 0.0)
+    resting.join()
+    assert reader._queue.next(np.inf) is None
 
 
 def test_amplitudes_beyond_the_drives_are_refused():
