@@ -20,6 +20,8 @@ BESIDE = -1.0
 a map's own revisits lie there, and three in ten of paths that only look alike."""
 AGAIN = 6
 """Keyframes after which a path that comes back to a place visits it again."""
+AGAIN_SHARE = 0.5
+"""Share of the evidence for a path that counts there."""
 
 
 class Path(NamedTuple):
@@ -78,14 +80,14 @@ def keyframe_odds(
     return 0.0, inside  # the pose is so uncertain that keyframes beyond the reach were compared
 
 
-def counted_once(ground: Ground, path: Path) -> np.ndarray:
-    """[n] the log-odds of each keyframe, evidence for the path only at the first visit of a place.
+def less_where_again(ground: Ground, path: Path) -> np.ndarray:
+    """[n] the log-odds of each keyframe, less for the path where it visits a place again.
 
-    A place elsewhere that is alike looks alike at each visit, and from every heading; one that is not,
+    A place elsewhere that is alike is alike at each visit, and often from every heading; one that is not,
     contradicts at each.
     """
     apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
     keyframe = np.arange(len(apart))
     earlier = keyframe[:, None] - keyframe >= AGAIN
     again = (earlier & (apart < NEAR * ground.reach)).any(axis=1)
-    return np.where(again, np.minimum(path.odds, 0.0), path.odds)
+    return np.where(again & (path.odds > 0), AGAIN_SHARE * path.odds, path.odds)

@@ -13,7 +13,7 @@ from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.learned_odds import LearnedOdds
-from ratslam.alignment.paths import counted_once
+from ratslam.alignment.paths import less_where_again
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
@@ -96,7 +96,7 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
     session = Traverse(compared, motions)
     return [
         Tie(
-            float(counted_once(on.ground, path).sum()) - places,
+            float(less_where_again(on.ground, path).sum()) - places,
             [
                 Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
                 for k, frame, shift, gain in closures_along(on.ground, compared, path)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.alignment.gain_odds import LEAVING
-from ratslam.alignment.paths import AGAIN, BESIDE, NEAR, Path, counted_once, keyframe_odds
+from ratslam.alignment.paths import AGAIN, AGAIN_SHARE, BESIDE, NEAR, Path, keyframe_odds, less_where_again
 from tactile.base.se2 import compose, wrap
 from tests.ratslam.alignment.alignment_cases import SEEDS, odds_of, square_loop
 
@@ -48,17 +48,18 @@ def test_a_view_of_nothing_and_one_of_keyframes_beyond_reach_decide_nothing() ->
 
 
 @given(SEEDS, st.integers(1, 3))
-def test_evidence_for_a_path_counts_once_a_place_and_evidence_against_it_always(seed: int, laps: int) -> None:
+def test_evidence_for_a_path_counts_half_where_it_comes_again_and_evidence_against_it_wholly(seed: int, laps: int) -> None:
     random = np.random.default_rng(seed)
     lap = LOOP.ground.poses
     back = lap[::-1] + np.array([0.0, 0.0, np.pi])
     poses = np.concatenate([lap, *[back, lap][: laps - 1]])
     odds = random.normal(0.5, 1.0, len(poses))
-    counted = counted_once(LOOP.ground, Path(poses, np.zeros((len(poses), 3, 3)), odds))
+    counted = less_where_again(LOOP.ground, Path(poses, np.zeros((len(poses), 3, 3)), odds))
     first = len(lap) - AGAIN
     np.testing.assert_array_equal(counted[:first], odds[:first])
     again = counted[len(lap) + AGAIN :]
-    np.testing.assert_array_equal(again, np.minimum(odds[len(lap) + AGAIN :], 0.0))
+    later = odds[len(lap) + AGAIN :]
+    np.testing.assert_array_equal(again, np.where(later > 0, AGAIN_SHARE * later, later))
 
 
 def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() -> None:
@@ -66,4 +67,4 @@ def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() 
     poses = np.tile(LOOP.ground.poses[3], (AGAIN, 1))
     poses[:, 2] += np.arange(AGAIN)
     path = Path(poses, np.zeros((AGAIN, 3, 3)), odds)
-    np.testing.assert_array_equal(counted_once(LOOP.ground, path), odds)
+    np.testing.assert_array_equal(less_where_again(LOOP.ground, path), odds)
