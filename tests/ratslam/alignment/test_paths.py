@@ -48,7 +48,7 @@ def test_a_view_of_nothing_and_one_of_keyframes_beyond_reach_decide_nothing() ->
 
 
 @given(SEEDS, st.integers(1, 3))
-def test_evidence_for_a_path_counts_half_where_it_comes_again_and_evidence_against_it_wholly(seed: int, laps: int) -> None:
+def test_evidence_for_a_path_counts_half_where_it_comes_again(seed: int, laps: int) -> None:
     random = np.random.default_rng(seed)
     lap = LOOP.ground.poses
     back = lap[::-1] + np.array([0.0, 0.0, np.pi])
