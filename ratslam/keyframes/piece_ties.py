@@ -59,7 +59,7 @@ def tie_newest_piece(
         if tie is None or tie.log_odds < graph.config.tie_log_odds:
             return False
         _accept(graph, log, archive, tie.closures)
-    elif tie is not None and tie.log_odds >= 0:
+    elif tie is not None and tie.log_odds >= graph.config.tie_log_odds / 2:
         return False
     for sequence in across.tolist():
         log.judge(sequence, Verdict.UNDONE)
