@@ -22,6 +22,8 @@ AGAIN = 6
 """Keyframes after which a path that comes back to a place visits it again."""
 AGAIN_SHARE = 0.5
 """Share of the evidence for a path that counts there."""
+BESIDE_SHARE = 0.3
+"""Share of the evidence against a path that counts beside the way after the first such keyframe of a run."""
 
 
 class Path(NamedTuple):
@@ -80,14 +82,17 @@ def keyframe_odds(
     return 0.0, inside  # the pose is so uncertain that keyframes beyond the reach were compared
 
 
-def less_where_again(ground: Ground, path: Path) -> np.ndarray:
-    """[n] the log-odds of each keyframe, less for the path where it visits a place again.
+def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
+    """[n] the log-odds of each keyframe, less where a keyframe before has said nearly the same.
 
     A place elsewhere that is alike is alike at each visit, and often from every heading; one that is not,
-    contradicts at each.
+    contradicts at each. A path beside the driven way stays there for some keyframes.
     """
     apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
     keyframe = np.arange(len(apart))
     earlier = keyframe[:, None] - keyframe >= AGAIN
     again = (earlier & (apart < NEAR * ground.reach)).any(axis=1)
-    return np.where(again & (path.odds > 0), AGAIN_SHARE * path.odds, path.odds)
+    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose, NEAR) for pose in path.poses])
+    still = beside & np.concatenate([[False], beside[:-1]])
+    share = np.where(path.odds > 0, np.where(again, AGAIN_SHARE, 1.0), np.where(still, BESIDE_SHARE, 1.0))
+    return share * path.odds

@@ -203,13 +203,10 @@ class Localiser(Checkpointed, Map):
         self._found.append(self._newest if known else np.full(3, np.nan))
 
     def _moved(self) -> Motion:
-        """The motion since the newest keyframe without the systematic errors that the map knows.
-
-        A map learns the noise of its own session, and little of it from few loop closures: the noise of
-        another session is not taken to be less than the settings say."""
+        """The motion since the newest keyframe without the systematic errors that the map knows."""
         graph, (motion, length, turn) = self.place.graph, self._travel
         variance = graph.odometry_variance(np.array([length]), np.array([turn]))[0]
-        variance[2] /= min(graph.heading_noise.factor, 1.0)
+        variance[2] *= graph.heading_noise.further_factor
         return Motion(graph.correct(motion, length), variance)
 
     def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:

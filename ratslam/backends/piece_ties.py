@@ -13,7 +13,8 @@ from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.learned_odds import LearnedOdds
-from ratslam.alignment.paths import less_where_again
+from ratslam.alignment.paths import less_where_dependent
+from ratslam.alignment.weighing import PIECE
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.placement import Traverse, find_placements
 from ratslam.backends.map_views import MapViews
@@ -81,7 +82,7 @@ def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.
 
     def learn() -> GainOdds:
         every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
-        return views.odds(every, archive.poses(graph.pose.rows)[every], np.isin(every, taken))
+        return views.odds(every, archive.poses(graph.pose.rows)[every], np.isin(every, taken), PIECE)
 
     key = (len(frames), int(taken[0]), int(taken[-1]))
     return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), odds.of(key, learn))
@@ -93,10 +94,10 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
     motions = _motions(graph, own)
     compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
     places = float(np.log(max(on.ground.places(), 1.0)))
-    session = Traverse(compared, motions)
+    session = Traverse(compared._replace(gain=PIECE.weigh(compared.gain)), motions)
     return [
         Tie(
-            float(less_where_again(on.ground, path).sum()) - places,
+            float(less_where_dependent(on.ground, path).sum()) - places,
             [
                 Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
                 for k, frame, shift, gain in closures_along(on.ground, compared, path)
@@ -110,4 +111,5 @@ def _motions(graph: KeyframeGraph, own: np.ndarray) -> list[Motion]:
     """Odometry into each keyframe of the piece without its systematic errors."""
     motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
     variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
+    variance[:, 2] *= graph.heading_noise.further_factor
     return [Motion(*one) for one in zip(motion, variance, strict=True)]

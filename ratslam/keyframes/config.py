@@ -87,7 +87,7 @@ class KeyframeMapConfig(Settings):
     """Largest robust scale."""
     may_be_carried: bool = False
     """Whether the robot may be carried during a session: only then the odometry is cut."""
-    tie_log_odds: PositiveFloat = 7.0
+    tie_log_odds: PositiveFloat = 6.5
     """Log-odds at which a piece of the map is tied to another one, beyond the logarithm of the number of its
     places; below half of them the tie is undone."""
     break_length: PositiveInt = 32

@@ -36,6 +36,13 @@ class HeadingNoise(NamedTuple):
         """On the variance."""
         return float(np.exp(self.log_factor))
 
+    @property
+    def further_factor(self) -> float:
+        """On the variance of a further session or piece, beside `factor`. A map learns the noise of its own
+        session, and little of it from few loop closures: that of others is not taken to be less than the
+        settings say."""
+        return 1 / min(self.factor, 1.0)
+
 
 def learn_heading_noise(
     noise: HeadingNoise, start: HeadingNoise, fit: MapFit, problem: MapProblem

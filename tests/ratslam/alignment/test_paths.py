@@ -7,7 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.alignment.gain_odds import LEAVING
-from ratslam.alignment.paths import AGAIN, AGAIN_SHARE, BESIDE, NEAR, Path, keyframe_odds, less_where_again
+from ratslam.alignment.paths import (
+    AGAIN,
+    AGAIN_SHARE,
+    BESIDE,
+    BESIDE_SHARE,
+    NEAR,
+    Path,
+    keyframe_odds,
+    less_where_dependent,
+)
 from tactile.base.se2 import compose, wrap
 from tests.ratslam.alignment.alignment_cases import SEEDS, odds_of, square_loop
 
@@ -51,15 +60,14 @@ def test_a_view_of_nothing_and_one_of_keyframes_beyond_reach_decide_nothing() ->
 def test_evidence_for_a_path_counts_half_where_it_comes_again(seed: int, laps: int) -> None:
     random = np.random.default_rng(seed)
     lap = LOOP.ground.poses
-    back = lap[::-1] + np.array([0.0, 0.0, np.pi])
-    poses = np.concatenate([lap, *[back, lap][: laps - 1]])
-    odds = random.normal(0.5, 1.0, len(poses))
-    counted = less_where_again(LOOP.ground, Path(poses, np.zeros((len(poses), 3, 3)), odds))
+    odds = random.normal(0.5, 1.0, laps * len(lap))
+    path = Path(np.tile(lap, (laps, 1)), np.zeros((len(odds), 3, 3)), odds)
+    counted = less_where_dependent(LOOP.ground, path)
     first = len(lap) - AGAIN
     np.testing.assert_array_equal(counted[:first], odds[:first])
-    again = counted[len(lap) + AGAIN :]
     later = odds[len(lap) + AGAIN :]
-    np.testing.assert_array_equal(again, np.where(later > 0, AGAIN_SHARE * later, later))
+    expected = np.where(later > 0, AGAIN_SHARE * later, later)
+    np.testing.assert_array_equal(counted[len(lap) + AGAIN :], expected)
 
 
 def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() -> None:
@@ -67,4 +75,12 @@ def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() 
     poses = np.tile(LOOP.ground.poses[3], (AGAIN, 1))
     poses[:, 2] += np.arange(AGAIN)
     path = Path(poses, np.zeros((AGAIN, 3, 3)), odds)
-    np.testing.assert_array_equal(less_where_again(LOOP.ground, path), odds)
+    np.testing.assert_array_equal(less_where_dependent(LOOP.ground, path), odds)
+
+
+def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyframe() -> None:
+    lap = LOOP.ground.poses
+    across = compose(lap[3:8], np.array([0.0, 0.0, np.pi / 2]))
+    poses = np.concatenate([lap[:3], across, lap[8:11]])
+    counted = less_where_dependent(LOOP.ground, Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)))
+    np.testing.assert_array_equal(counted, [-1.0] * 4 + [-BESIDE_SHARE] * 4 + [-1.0] * 3)

@@ -136,6 +136,9 @@ def test_the_driver_whisks_and_rests():
 
 
 def test_amplitudes_computed_during_rest_do_not_wake_the_head(monkeypatch):
+    calls: list[str] = []
+    monkeypatch.setattr(HeadReader, "send", lambda reader, command: calls.append(command.kind.name))
+    monkeypatch.setattr(HeadReader, "rest", lambda reader: calls.append("rest"))
     reader = HeadReader(MemoryHead(18).connect, 18, HeadLinkConfig(rcp="host"))
     driver = HeadDriver(reader, HEAD)
     driver.whisk(WhiskingConfig(mode="spread"), THRESHOLD, CENTRE)
@@ -150,7 +153,7 @@ def test_amplitudes_computed_during_rest_do_not_wake_the_head(monkeypatch):
     for listener in reader.listeners:
         listener(whisks(1), 0.0)
     resting.join()
-    assert reader._queue.next(np.inf) is None
+    assert calls == ["CENTRE", "DRIVE", "AMPLITUDES", "rest"]
 
 
 def test_amplitudes_beyond_the_drives_are_refused():
