@@ -33,6 +33,9 @@ UNEXPLAINED = 4.0
 needed to be found, and the best supposed pose has less than half of these."""
 LARGEST_EXPONENT = 700.0
 """Of a double, rounded down."""
+HEADING_NOISE = 2.0
+"""Variance of the heading by odometry as a multiple of what the settings say. Maps start from less noise than
+odometry has, so that a wrong map has to bend what is believed; in a turn the pose would be lost by that."""
 UNCERTAIN = 2 * LONGEST
 """Keyframes before a pose is lost at which it may have been wrong already."""
 
@@ -206,7 +209,7 @@ class Localiser(Checkpointed, Map):
         """The motion since the newest keyframe without the systematic errors that the map knows."""
         graph, (motion, length, turn) = self.place.graph, self._travel
         variance = graph.odometry_variance(np.array([length]), np.array([turn]))[0]
-        variance[2] *= graph.heading_noise.further_factor
+        variance[2] *= HEADING_NOISE * graph.heading_noise.further_factor
         return Motion(graph.correct(motion, length), variance)
 
     def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:

@@ -26,7 +26,7 @@ from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
-LOG_ODDS = 8.0
+LOG_ODDS = 7.5
 """Log-odds at which a pose is found, beyond the logarithm of the number of places, by default."""
 
 
