@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ratslam
+from ratslam.backends.localise import LOG_ODDS
 from ratslam.cli import main
 from tests.helpers.square_run import copy_square_run
 from tests.ratslam.pipeline.test_saved_map import rewritten
@@ -71,7 +72,7 @@ def test_a_bare_recording_is_read_as_that_of_the_map(found: Path, square: Path, 
     recording = ratslam.load_config(SQUARE).recording
     assert recording is not None
     arguments = ["localise", str(square / "map.npz"), str(recording.file), "-o", str(tmp_path / "again")]
-    assert main([*arguments, "--set", "localise.log_odds=8"]) == 0
+    assert main([*arguments, "--set", f"localise.log_odds={LOG_ODDS}"]) == 0
     for name in ("localisation.csv", "steps.csv", "trajectory.tum"):
         assert (tmp_path / "again" / name).read_bytes() == (found / name).read_bytes()
 
