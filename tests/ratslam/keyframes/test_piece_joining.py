@@ -7,6 +7,7 @@ import pytest
 
 from ratslam.keyframes.acceptance import AcceptByEvidence
 from ratslam.keyframes.closure_odds import AcceptByOdds
+from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.loop_closures import Candidate
 from ratslam.keyframes.map_health import DOUBTED
 from ratslam.keyframes.piece_placement import APART
@@ -46,14 +47,17 @@ def test_a_tie_joins_two_pieces(rule):
 
 
 @RULES
-def test_a_tie_that_later_views_contradict_is_undone(rule):
+@pytest.mark.parametrize("stands", [False, True])
+def test_a_tie_is_undone_below_half_the_log_odds_that_it_needs(rule, stands):
+    later = 0.5 * KeyframeMapConfig().tie_log_odds + (0.1 if stands else -0.1)
+
     def tie_once(graph, log, archive, odds):
-        return Tie(20.0 if graph.ever < LAP + 40 else -1.0, TIE) if graph.ever > LAP + 14 else None
+        return Tie(20.0 if graph.ever < LAP + 40 else later, TIE) if graph.ever > LAP + 14 else None
 
     assert not driven(rule, find_tie=tie_once, last=LAP + 38).pieces().any()
     map = driven(rule, find_tie=tie_once)
-    assert np.array_equal(map.pieces(), np.arange(LAP + 60) >= BEGIN)
-    assert len(map.closures()) == 0
+    assert np.array_equal(map.pieces(), (np.arange(LAP + 60) >= BEGIN) & (not stands))
+    assert (len(map.closures()) > 0) == stands
 
 
 @RULES
