@@ -13,7 +13,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
 from ratslam.alignment.interruptions import LONGEST
-from ratslam.alignment.weighing import less_where_common
+from ratslam.alignment.weighing import DISTINCT
 from ratslam.atlas.placement import NOTHING_RECALLED
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
@@ -193,7 +193,7 @@ class Localiser(Checkpointed, Map):
         moved = self._moved()
         gain = None
         if bool(evidence.shows):
-            gain = less_where_common(np.asarray(evidence.gain)[:, : len(ground.poses)])
+            gain = DISTINCT.weigh(np.asarray(evidence.gain)[:, : len(ground.poses)])
         self._views.append(moved, gain)
         self._frame.append(len(self._pose.rows))
         recalled = self._recall(evidence, moved, gain)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ratslam.alignment.self_comparison import compare_with_itself
-from ratslam.alignment.weighing import COMMON, DISTINCT, less_where_common
+from ratslam.alignment.weighing import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
 from tests.ratslam.alignment.test_self_comparison import GUARD, gains_on, laps
 
 GAINS = arrays(
@@ -32,6 +32,12 @@ def test_a_better_fit_everywhere_counts_in_part(gain: np.ndarray, more: float) -
     np.testing.assert_allclose(
         less_where_common(gain + more) - less_where_common(gain), (1 - COMMON) * more, atol=1e-9
     )
+
+
+@given(GAINS)
+def test_a_view_on_a_growing_map_loses_less_than_one_on_a_finished_map(gain: np.ndarray) -> None:
+    lost = COMMON_OF_PIECE / COMMON * (gain - DISTINCT.weigh(gain))
+    np.testing.assert_allclose(gain - PIECE.weigh(gain), lost, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
