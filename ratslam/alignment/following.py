@@ -61,7 +61,9 @@ class Motion(NamedTuple):
 STILL = Motion(np.zeros(3), np.zeros(3))
 
 
-def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None) -> tuple[Supposed, float]:
+def advance(
+    ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
+) -> tuple[Supposed, float | None]:
     """Moves a supposed pose, and corrects it by the keyframes near by, weighted by how well their views fit.
 
     Args:
@@ -69,11 +71,12 @@ def advance(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
             shows nothing.
 
     Returns:
-        the pose thereafter; the gain of the best keyframe near by, NaN where no keyframe is near.
+        the pose thereafter; the gain of the best keyframe near by, NaN where no keyframe is near, None of a
+        view that shows nothing.
     """
     at = move(at, moved)
     if gain is None:
-        return at, np.nan
+        return at, None
     shift, frame = ground.near(at.pose, *_reaches(ground, *at.deviations()))
     if not len(frame):
         return at, np.nan

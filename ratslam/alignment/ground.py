@@ -16,6 +16,14 @@ REACH_HEADING = 0.3
 between two sector shifts."""
 
 
+class Match(NamedTuple):
+    """The row of a sector shift, a keyframe of a ground, and the gain of a view there, nat."""
+
+    shift: int
+    frame: int
+    gain: float
+
+
 class Ground(NamedTuple):
     """N keyframes, each with S headings at which a robot there may be compared with it.
 
@@ -57,6 +65,16 @@ class Ground(NamedTuple):
         turned = np.abs(wrap(heading[frame, None] + self.turns - poses[one, 2:]))
         row, shift = np.nonzero(turned < reach_heading[one, None])
         return one[row], shift, frame[row]
+
+    def best_match(self, pose: np.ndarray, gain: np.ndarray) -> Match | None:
+        """Where a view with gains [S, N or more] fits best of what a robot at `pose` [3] is compared with;
+        None where it fits nothing better than a new place."""
+        shift, frame = self.near(pose, self.reach, self.reach_heading)
+        gains = gain[shift, frame]
+        if not (gains > 0).any():
+            return None
+        best = int(np.argmax(gains))
+        return Match(int(shift[best]), int(frame[best]), float(gains[best]))
 
     def is_near(self, pose: np.ndarray, share: float) -> bool:
         """Whether a robot at `pose` [3] is compared with a keyframe within this share of both reaches."""

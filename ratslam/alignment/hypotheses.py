@@ -121,9 +121,7 @@ class Hypotheses(Checkpointed):
         log_odds = np.zeros(self.count)
         for k in range(self.count):
             at, gained = advance(ground, self.at(k), moved, gain)
-            log_odds[k], inside = keyframe_odds(
-                ground, odds, at.pose, gained if gain is not None else None, bool(self.inside.rows[k])
-            )
+            log_odds[k], inside = keyframe_odds(ground, odds, at.pose, gained, bool(self.inside.rows[k]))
             self.pose.rows[k], self.covariance.rows[k] = at
             self.inside.rows[k] = inside
         self.log_odds.rows[:] += log_odds

@@ -52,7 +52,7 @@ def follow(
     total, inside = 0.0, True
     for moved, gains in onwards:
         at, gain = advance(ground, at, moved, gains)
-        log_odds, inside = keyframe_odds(ground, odds, at.pose, gain if gains is not None else None, inside)
+        log_odds, inside = keyframe_odds(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)
         covariances.append(at.covariance)
         gained.append(log_odds)
@@ -68,8 +68,8 @@ def keyframe_odds(
     """Log-odds of one keyframe, and whether it is on mapped ground.
 
     Args:
-        pose: [3] where it is supposed to be. gain: of the best keyframe near by, NaN without one, None if its
-            view shows nothing. inside: whether the keyframe before is on mapped ground.
+        pose: [3] where it is supposed to be. gain: see `advance`.
+        inside: whether the keyframe before is on mapped ground.
     """
     if gain is None:
         return 0.0, inside

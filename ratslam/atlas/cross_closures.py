@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ratslam.alignment.comparison import Comparison
-from ratslam.alignment.ground import Ground
+from ratslam.alignment.ground import Ground, Match
 from ratslam.alignment.paths import Path
 
 
-def closures_along(ground: Ground, views: Comparison, path: Path) -> list[tuple[int, int, int, float]]:
-    """The keyframe of the ground that fits best at each pose of a path, where any fits better than a new
-    place.
+def closures_along(ground: Ground, views: Comparison, path: Path) -> list[tuple[int, Match]]:
+    """Keyframes of a session, by number, and where on the ground each fits best at its pose of a path, if it
+    fits anything there better than a new place.
 
     Args:
         views: of the session's n keyframes. path: of the same.
-
-    Returns:
-        number among the session's keyframes, keyframe of the ground, row of the sector shift, and gain, nat.
     """
     found = []
     for k, pose in enumerate(path.poses):
         gain = views.gains(k)
-        shift, frame = ground.near(pose, ground.reach, ground.reach_heading)
-        if gain is None or not len(frame):
-            continue
-        best = int(np.argmax(gain[shift, frame]))
-        fit = float(gain[shift[best], frame[best]])
-        if fit > 0:
-            found.append((k, int(frame[best]), int(shift[best]), fit))
+        match = ground.best_match(pose, gain) if gain is not None else None
+        if match is not None:
+            found.append((k, match))
     return found

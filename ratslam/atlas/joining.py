@@ -227,13 +227,14 @@ def _closures(graph: KeyframeGraph, found: _Found) -> list[list[Candidate]]:
     """Closure sequences along a placement."""
     sequences: list[list[Candidate]] = []
     last = -graph.config.max_gap - 1
-    for k, row, shift, gain in closures_along(found.ground, found.views, found.path):
+    for k, match in closures_along(found.ground, found.views, found.path):
         if not found.on[k]:
             continue
         if k - last > graph.config.max_gap:
             sequences.append([])
-        frame, match = int(found.frames[k]), int(found.onto[row])
-        sequences[-1].append(_candidate(graph, frame, match, float(found.ground.turns[shift]), gain))
+        frame, other = int(found.frames[k]), int(found.onto[match.frame])
+        turn = float(found.ground.turns[match.shift])
+        sequences[-1].append(_candidate(graph, frame, other, turn, match.gain))
         last = k
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
 

@@ -56,12 +56,10 @@ class MapTraverse(NamedTuple):
         at, inside, unconfirmed = Supposed(rigid[0], loose), False, UNCONFIRMED
         poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
         for k, motion in enumerate(self.motions):
-            gains = self.views.gains(k)
             if unconfirmed >= UNCONFIRMED:
                 at, motion = Supposed(rigid[k], loose), STILL
-            at, gain = advance(ground, at, motion, gains)
-            seen = None if gains is None else gain
-            gained[k], inside = keyframe_odds(ground, odds, at.pose, seen, inside)
+            at, gain = advance(ground, at, motion, self.views.gains(k))
+            gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
             poses[k], covariances[k] = at
             unconfirmed = 0 if gained[k] > 0 else unconfirmed + 1
         return Path(poses, covariances, gained)

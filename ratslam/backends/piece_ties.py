@@ -99,8 +99,8 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
         Tie(
             float(less_where_dependent(on.ground, path).sum()) - places,
             [
-                Candidate(int(own[k]), int(on.frames[frame]), int(views.shifts[shift]), 1.0, gain)
-                for k, frame, shift, gain in closures_along(on.ground, compared, path)
+                Candidate(int(own[k]), int(on.frames[at.frame]), int(views.shifts[at.shift]), 1.0, at.gain)
+                for k, at in closures_along(on.ground, compared, path)
             ],
         )
         for path in find_placements(on.ground, on.odds, session)

@@ -28,7 +28,7 @@ from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
 from ratslam.keyframes.optimizer import MapFit, MapProblem, System
-from ratslam.keyframes.pose_tracks import TrackGround
+from ratslam.keyframes.pose_tracks import SelfTraverse
 from ratslam.keyframes.retracing import JUMP, retrace
 from ratslam.keyframes.track_closures import add_closures_along
 from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
@@ -98,7 +98,7 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
         graph: keyframes, none of them merged.
     """
     fits, fit, log = view_fits(graph), solution.fit, solution.log
-    odds = learn_odds(TrackGround.of_map(graph, fit, fits))
+    odds = learn_odds(SelfTraverse.of_map(graph, fit, fits))
     first = _case(graph, log, np.flatnonzero(solution.cut.rows >= 0))
     if not len(first.sequences):
         return solution
@@ -146,7 +146,7 @@ def _case_of(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
 def _align(graph: KeyframeGraph, fits: np.ndarray, case: Case, fit: MapFit) -> tuple[Case, Selection]:
     """The selection among the sequences of a case and those along the poses of a fit."""
     log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
-    add_closures_along(log, TrackGround.of_map(graph, fit, fits), cuts, graph.config.max_gap)
+    add_closures_along(log, SelfTraverse.of_map(graph, fit, fits), cuts, graph.config.max_gap)
     aligned = _case_of(graph, log, cuts)
     return aligned, optimise_with_cuts(aligned.problem, fit, aligned.breaks)
 
@@ -161,8 +161,8 @@ def _retrace(
 ) -> Judged:
     """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
     fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
-    ground = TrackGround.of_map(graph, fit, fits)
-    found = retrace(ground._replace(fits=compared), learn_odds(ground), cuts, log, graph.sector_angle)
+    session = SelfTraverse.of_map(graph, fit, fits)
+    found = retrace(session._replace(fits=compared), learn_odds(session), cuts, log, graph.sector_angle)
     case = _case(graph, log, found.cuts)
     return _judge(graph, fits, odds, case, case.starts(fit._replace(poses=found.poses)))
 
@@ -186,7 +186,7 @@ def _judge(
 def _likelihood(graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, fit: MapFit) -> float:
     """Of all views, the cuts, the odometry and the sequences of recall; those along the poses would count
     the views twice."""
-    seen = TrackGround.of_map(graph, fit, fits).own_odds(odds).sum()
+    seen = SelfTraverse.of_map(graph, fit, fits).own_odds(odds).sum()
     return float(seen) - JUMP * len(case.breaks) - case.cost(fit) / 2
 
 

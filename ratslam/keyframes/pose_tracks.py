@@ -13,7 +13,7 @@ import numpy as np
 
 from ratslam.alignment.following import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING
 from ratslam.alignment.gain_odds import LEAVING, GainOdds
-from ratslam.alignment.ground import REACH, REACH_HEADING
+from ratslam.alignment.ground import REACH, REACH_HEADING, Ground
 from ratslam.core.compiled import compiled
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.optimizer import MapFit
@@ -31,50 +31,52 @@ class Track(NamedTuple):
     poses: np.ndarray
     odds: np.ndarray
 
-    def leads_past(self, frame: int, pose: np.ndarray, ground: TrackGround) -> bool:
+    def leads_past(self, frame: int, pose: np.ndarray, ground: Ground) -> bool:
         """Whether the track has a keyframe near a pose [3]."""
         near = np.hypot(*(self.poses[frame] - pose)[:2]) < ground.reach
         return bool(near and np.cos(self.poses[frame, 2] - pose[2]) > np.cos(ground.reach_heading))
 
 
-class TrackGround(NamedTuple):
-    """N keyframes as ground and as session.
+class SelfTraverse(NamedTuple):
+    """A session of N keyframes over its own map: they are ground and session.
 
     Attributes:
-        poses: [N, 3] m, m, rad. turns: [S] rad, see `Ground`. fits: [N, S, N], see `view_fits`. motions,
-            variances: [N - 1, 3] of the odometry, without its systematic errors and without breaks.
-            spread: [3] variance of a closure. reach, reach_heading: m and rad.
+        ground: at their poses. fits: [N, S, N], see `view_fits`. motions, variances: [N - 1, 3] of the
+            odometry, without its systematic errors and without breaks.
     """
 
-    poses: np.ndarray
-    turns: np.ndarray
+    ground: Ground
     fits: np.ndarray
     motions: np.ndarray
     variances: np.ndarray
-    spread: np.ndarray
-    reach: float
-    reach_heading: float
 
     @classmethod
-    def of_map(cls, graph: KeyframeGraph, fit: MapFit, fits: np.ndarray) -> TrackGround:
+    def of_map(cls, graph: KeyframeGraph, fit: MapFit, fits: np.ndarray) -> SelfTraverse:
         """The keyframes of a map at the poses of a fit."""
         motions = fit.corrected(graph.odometry(graph.cut))
         variances = graph.odometry_variance(graph.length.rows, graph.turn.rows)[1:]
-        turns = np.arange(fits.shape[1]) * np.pi
-        spread, reach = graph.closure_variance(), REACH * graph.cell
-        return cls(fit.poses, turns, fits, motions, variances, spread, reach, REACH_HEADING)
+        turns, reach = np.arange(fits.shape[1]) * np.pi, REACH * graph.cell
+        ground = Ground(fit.poses, turns, reach, REACH_HEADING, graph.closure_variance())
+        return cls(ground, fits, motions, variances)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """[N, 3] m, m, rad."""
+        return self.ground.poses
 
     @property
     def size(self) -> int:
+        """N."""
         return len(self.poses)
 
     def own_fits(self) -> np.ndarray:
         """[N] how well each view fits at the keyframe's own pose, NaN where no keyframe is near."""
-        reach = self.reach, self.reach_heading
-        looked = (
-            _look(self.poses, self.turns, self.fits[k], self.poses[k], *reach)[0] for k in range(self.size)
-        )
-        return np.array(list(looked))
+        return np.array([self._fit(frame, pose) for frame, pose in enumerate(self.poses)])
+
+    def _fit(self, frame: int, pose: np.ndarray) -> float:
+        """How well the view of a keyframe fits at a pose [3], NaN where no keyframe is near."""
+        on = self.ground
+        return _look(on.poses, on.turns, self.fits[frame], pose, on.reach, on.reach_heading)[0]
 
     def own_odds(self, odds: GainOdds) -> np.ndarray:
         """[N] the log-odds of each view at the keyframe's own pose."""
@@ -95,17 +97,17 @@ class TrackGround(NamedTuple):
         frames = np.arange(frame + 1, stop + 1) if ahead else np.arange(frame - 1, stop - 1, -1)
         motions = self.motions[frames - 1] if ahead else inverse(self.motions[frames])
         variances = self.variances[frames - 1] if ahead else self.variances[frames]
-        reach = self.reach, self.reach_heading
-        session = frames, motions, variances, self.spread
-        found = _follow(self.poses, self.turns, self.fits, *session, *reach, odds.edges, odds.odds, pose)
+        on, session = self.ground, (frames, motions, variances)
+        reach = on.variance, on.reach, on.reach_heading
+        found = _follow(on.poses, on.turns, self.fits, *session, *reach, odds.edges, odds.odds, pose)
         return frames[: len(found[0])], *found
 
     def track(self, frame: int, pose: np.ndarray, extent: int, odds: GainOdds) -> Track:
         """The track through a keyframe at a pose [3], at most `extent` keyframes before and after it."""
         track = Track(np.full((self.size, 3), np.nan), np.full(self.size, -np.inf))
-        look = _look(self.poses, self.turns, self.fits[frame], pose, self.reach, self.reach_heading)
+        fit = self._fit(frame, pose)
         track.poses[frame] = pose
-        track.odds[frame] = LEAVING if np.isnan(look[0]) else odds.of(look[0])
+        track.odds[frame] = LEAVING if np.isnan(fit) else odds.of(fit)
         for stop in (frame + extent, frame - extent):
             frames, poses, _, gained = self.follow(frame, pose, stop, odds)
             track.poses[frames], track.odds[frames] = poses, gained
@@ -113,14 +115,15 @@ class TrackGround(NamedTuple):
 
     def places(self) -> np.ndarray:
         """[C, 3] poses that a robot may have on the ground, one of each that can be told apart."""
-        return _spread_out(self.poses, self.turns, self.reach, self.reach_heading)
+        on = self.ground
+        return _spread_out(on.poses, on.turns, on.reach, on.reach_heading)
 
     def scan(self, frame: int, places: np.ndarray, length: int) -> np.ndarray:
         """[C] how well the views of a keyframe and those after it, `length` together, fit if the keyframe is
         at each of the places [C, 3]."""
-        last = min(frame + length, self.size)
-        reach = self.reach, self.reach_heading
-        return _scan(self.poses, self.turns, self.fits, self.motions, places, frame, last, *reach)
+        on, last = self.ground, min(frame + length, self.size)
+        reach = on.reach, on.reach_heading
+        return _scan(on.poses, on.turns, self.fits, self.motions, places, frame, last, *reach)
 
 
 @compiled
@@ -160,7 +163,7 @@ def _follow(
     frames: np.ndarray, motions: np.ndarray, variances: np.ndarray, spread: np.ndarray,
     reach: float, reach_heading: float, edges: np.ndarray, odds: np.ndarray, start: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """See `TrackGround.follow`."""
+    """See `SelfTraverse.follow`."""
     count = len(frames)
     poses, found, gained = np.empty((count, 3)), np.empty(count), np.empty(count)
     pose, place, heading = start.copy(), spread[0], spread[2]  # with its variances
@@ -197,7 +200,7 @@ def _scan(
     ground: np.ndarray, turns: np.ndarray, fits: np.ndarray, motions: np.ndarray, places: np.ndarray,
     first: int, last: int, reach: float, reach_heading: float,
 ) -> np.ndarray:  # fmt: skip
-    """See `TrackGround.scan`."""
+    """See `SelfTraverse.scan`."""
     total = np.zeros(len(places))
     for k in range(len(places)):
         pose = places[k].copy()
@@ -214,7 +217,7 @@ def _scan(
 
 @compiled
 def _spread_out(poses: np.ndarray, turns: np.ndarray, reach: float, reach_heading: float) -> np.ndarray:
-    """See `TrackGround.places`."""
+    """See `SelfTraverse.places`."""
     kept = np.empty((len(turns) * len(poses), 3))
     count = 0
     for s in range(len(turns)):

@@ -15,7 +15,7 @@ from ratslam.alignment.gain_odds import GainOdds
 from ratslam.core.compiled import compiled
 from ratslam.keyframes.closure_selection import CUT
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
-from ratslam.keyframes.pose_tracks import Track, TrackGround
+from ratslam.keyframes.pose_tracks import SelfTraverse, Track
 from ratslam.keyframes.verification import turn_on_spot
 
 JUMP = CUT
@@ -42,60 +42,61 @@ class Retraced(NamedTuple):
 
 
 def retrace(
-    ground: TrackGround, odds: GainOdds, cuts: np.ndarray, log: ClosureLog, sector_angle: float
+    session: SelfTraverse, odds: GainOdds, cuts: np.ndarray, log: ClosureLog, sector_angle: float
 ) -> Retraced:
     """The most likely track through all keyframes.
 
     Args:
         cuts: keyframes [n] before which the odometry of the map is cut. log: whose sequences claim places.
     """
-    tracks = _own_tracks(ground, odds, cuts)
-    for frame, pose in _claims(ground, log, sector_angle):
-        _add(tracks, ground, odds, frame, pose)
-    _search(tracks, ground, odds)
+    tracks = _own_tracks(session, odds, cuts)
+    for frame, pose in _claims(session, log, sector_angle):
+        _add(tracks, session, odds, frame, pose)
+    _search(tracks, session, odds)
     poses, gained = (np.stack(part) for part in zip(*tracks, strict=True))
-    chosen, jumps, total = _best_sequence(poses, gained, ground.reach, ground.reach_heading, JUMP)
-    return Retraced(poses[chosen, np.arange(ground.size)], total, np.flatnonzero(jumps))
+    reach = session.ground.reach, session.ground.reach_heading
+    chosen, jumps, total = _best_sequence(poses, gained, *reach, JUMP)
+    return Retraced(poses[chosen, np.arange(session.size)], total, np.flatnonzero(jumps))
 
 
-def _own_tracks(ground: TrackGround, odds: GainOdds, cuts: np.ndarray) -> list[Track]:
+def _own_tracks(session: SelfTraverse, odds: GainOdds, cuts: np.ndarray) -> list[Track]:
     """The stretches of the map between its cuts, followed on beyond them."""
-    own, tracks = ground.own_odds(odds), []
-    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), ground.size], strict=True):
-        track = Track(np.full((ground.size, 3), np.nan), np.full(ground.size, -np.inf))
-        track.poses[first:last], track.odds[first:last] = ground.poses[first:last], own[first:last]
+    own, tracks = session.own_odds(odds), []
+    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), session.size], strict=True):
+        track = Track(np.full((session.size, 3), np.nan), np.full(session.size, -np.inf))
+        track.poses[first:last], track.odds[first:last] = session.poses[first:last], own[first:last]
         for end, stop in ((last - 1, last - 1 + BEYOND), (first, first - BEYOND)):
-            frames, poses, _, gained = ground.follow(end, ground.poses[end], stop, odds)
+            frames, poses, _, gained = session.follow(end, session.poses[end], stop, odds)
             track.poses[frames], track.odds[frames] = poses, gained
         tracks.append(track)
     return tracks
 
 
-def _claims(ground: TrackGround, log: ClosureLog, sector_angle: float) -> list[tuple[int, np.ndarray]]:
+def _claims(session: SelfTraverse, log: ClosureLog, sector_angle: float) -> list[tuple[int, np.ndarray]]:
     """The poses [3] that the sequences claim for the keyframe of their middle members."""
     claims = []
     for sequence in np.flatnonzero((log.left() > 1) & (log.verdicts() != Verdict.UNDONE)).tolist():
         members = log.members(sequence)
         frame, match, shift, _ = members[len(members) // 2].tolist()
-        claims.append((frame, turn_on_spot(ground.poses[match], -shift * sector_angle)))
+        claims.append((frame, turn_on_spot(session.poses[match], -shift * sector_angle)))
     return claims
 
 
-def _search(tracks: list[Track], ground: TrackGround, odds: GainOdds) -> None:
+def _search(tracks: list[Track], session: SelfTraverse, odds: GainOdds) -> None:
     """Adds tracks of places that look alike where the poses of the map do not fit."""
-    fits = np.convolve(ground.own_odds(odds), np.ones(LOOKED), "valid")
-    places = ground.places()
+    fits = np.convolve(session.own_odds(odds), np.ones(LOOKED), "valid")
+    places = session.places()
     for frame in range(0, len(fits), EVERY):
         if fits[frame] < DOUBTED * LOOKED:
-            likeness = ground.scan(frame, places, LOOKED)
+            likeness = session.scan(frame, places, LOOKED)
             for place in np.argsort(-likeness, kind="stable")[:TRIED].tolist():
-                _add(tracks, ground, odds, frame, places[place])
+                _add(tracks, session, odds, frame, places[place])
 
 
-def _add(tracks: list[Track], ground: TrackGround, odds: GainOdds, frame: int, pose: np.ndarray) -> None:
+def _add(tracks: list[Track], session: SelfTraverse, odds: GainOdds, frame: int, pose: np.ndarray) -> None:
     """Adds the track of a keyframe at a pose [3], unless one leads past it."""
-    if not any(track.leads_past(frame, pose, ground) for track in tracks):
-        tracks.append(ground.track(frame, pose, AROUND, odds))
+    if not any(track.leads_past(frame, pose, session.ground) for track in tracks):
+        tracks.append(session.track(frame, pose, AROUND, odds))
 
 
 @compiled

@@ -6,7 +6,7 @@ import numpy as np
 
 from ratslam.alignment.gain_odds import BINS, GainOdds, learn_gain_odds
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.pose_tracks import TrackGround
+from ratslam.keyframes.pose_tracks import SelfTraverse
 
 SAMPLES = 60
 """Number of stretches by which the odds of false poses are learned."""
@@ -38,19 +38,19 @@ def earlier_fits(fits: np.ndarray) -> np.ndarray:
     return np.where(later[:, None], np.float32(-np.inf), fits)
 
 
-def learn_odds(ground: TrackGround) -> GainOdds:
+def learn_odds(session: SelfTraverse) -> GainOdds:
     """The log-odds of a fit, from those at the map's own poses and on tracks from other places that look
     alike."""
-    true, false = ground.own_fits(), [np.zeros(0)]
-    places = ground.places()
-    frames = np.arange(FIRST, ground.size - FIRST - FURTHER, max(ground.size // SAMPLES, 1))
+    true, false = session.own_fits(), [np.zeros(0)]
+    places = session.places()
+    frames = np.arange(FIRST, session.size - FIRST - FURTHER, max(session.size // SAMPLES, 1))
     for frame in frames.tolist():
-        fits = ground.scan(frame, places, FIRST)
-        apart = np.hypot(*(places - ground.poses[frame])[:, :2].T)
-        facing = np.cos(places[:, 2] - ground.poses[frame, 2]) > np.cos(2 * ground.reach_heading)
-        fits[(apart < ELSEWHERE * ground.reach) & facing] = -np.inf
+        fits = session.scan(frame, places, FIRST)
+        apart = np.hypot(*(places - session.poses[frame])[:, :2].T)
+        facing = np.cos(places[:, 2] - session.poses[frame, 2]) > np.cos(2 * session.ground.reach_heading)
+        fits[(apart < ELSEWHERE * session.ground.reach) & facing] = -np.inf
         for place in np.argsort(-fits, kind="stable")[:ALIKE].tolist():
-            *_, found, _ = ground.follow(frame, places[place], frame + FIRST + FURTHER, EVEN)
+            *_, found, _ = session.follow(frame, places[place], frame + FIRST + FURTHER, EVEN)
             false.append(found[FIRST:])
     other = np.concatenate(false)
     return learn_gain_odds(true[np.isfinite(true)], other[np.isfinite(other)])

@@ -41,6 +41,19 @@ def test_near_keyframes_claim_poses_within_reach_and_no_others_do(seed: int) -> 
             assert ((shift, frame) in found) == expected
 
 
+@given(SEEDS)
+def test_the_best_match_is_the_largest_gain_near_by_that_is_better_than_a_new_place(seed: int) -> None:
+    ground, random = scattered(seed), np.random.default_rng(seed + 1)
+    gain = random.normal(0.0, 2.0, (2, len(ground.poses)))
+    near = gain[ground.near(np.zeros(3), REACH, REACH_HEADING)]
+    match = ground.best_match(np.zeros(3), gain)
+    if match is None:
+        assert not (near > 0).any()
+    else:
+        assert match.gain == gain[match.shift, match.frame] == near.max() > 0
+    assert ground.best_match(np.zeros(3), -np.abs(gain)) is None
+
+
 @given(SEEDS, POSES)
 def test_what_is_near_does_not_depend_on_the_frame_of_the_map(seed: int, change: np.ndarray) -> None:
     ground, moved = scattered(seed), moved_by(change, scattered(seed))

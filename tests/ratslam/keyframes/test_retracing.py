@@ -16,8 +16,8 @@ jumps = st.integers(2 * LAP + 5, 2 * LAP + 35), st.integers(LAP // 4, 3 * LAP //
 NONE = np.zeros(0, int)
 
 
-def retraced(ground, cuts=NONE):
-    return retrace(ground, ODDS, cuts, ClosureLog(), np.pi)
+def retraced(session, cuts=NONE):
+    return retrace(session, ODDS, cuts, ClosureLog(), np.pi)
 
 
 @law
@@ -38,23 +38,23 @@ def test_a_robot_that_was_not_carried_stays_where_it_is(first, length, off):
     place = places(None, 0)
     shown = place.copy()
     shown[first : first + length] += off
-    ground = laps(place, shown)
-    found = retraced(ground)
+    session = laps(place, shown)
+    found = retraced(session)
     assert not len(found.cuts)
-    assert np.hypot(*(found.poses - ground.poses)[:, :2].T).max() < ground.reach
+    assert np.hypot(*(found.poses - session.poses)[:, :2].T).max() < session.ground.reach
 
 
 def test_a_wrong_cut_is_taken_back():
-    ground = laps(places(None, 0))
-    found = retraced(ground, np.array([LAP + 20]))
+    session = laps(places(None, 0))
+    found = retraced(session, np.array([LAP + 20]))
     assert not len(found.cuts)
     assert found.odds == ODDS.odds[1] * COUNT
-    ground = laps(places(2 * LAP + 20, LAP // 2))
-    assert retraced(ground).odds > ODDS.odds[1] * COUNT - JUMP - 6 * np.ptp(ODDS.odds)
+    session = laps(places(2 * LAP + 20, LAP // 2))
+    assert retraced(session).odds > ODDS.odds[1] * COUNT - JUMP - 6 * np.ptp(ODDS.odds)
 
 
 def test_retracing_again_gives_the_same_bits():
-    ground = laps(places(2 * LAP + 20, LAP // 2))
-    one, other = retraced(ground), retraced(ground)
+    session = laps(places(2 * LAP + 20, LAP // 2))
+    one, other = retraced(session), retraced(session)
     assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
     assert len(one.cuts) == 1

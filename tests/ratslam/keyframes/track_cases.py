@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.alignment.gain_odds import GainOdds
-from ratslam.alignment.ground import REACH, REACH_HEADING
-from ratslam.keyframes.pose_tracks import TrackGround
+from ratslam.alignment.ground import REACH, REACH_HEADING, Ground
+from ratslam.keyframes.pose_tracks import SelfTraverse
 from tactile.base.se2 import between, integrate
 from tests.ratslam.keyframes.selection_cases import LAP, NOISE, SPREAD, STEP, lap_poses
 
@@ -24,7 +24,7 @@ def places(jump: int | None, ahead: int) -> np.ndarray:
     return place % LAP
 
 
-def laps(place: np.ndarray, shown: np.ndarray | None = None) -> TrackGround:
+def laps(place: np.ndarray, shown: np.ndarray | None = None) -> SelfTraverse:
     """A map by odometry alone, which does not measure that the robot is carried.
 
     Args:
@@ -40,4 +40,5 @@ def laps(place: np.ndarray, shown: np.ndarray | None = None) -> TrackGround:
     fits[np.abs(time[:, None] - time) <= LAP // 2] = -np.inf
     variances = np.tile((0.2 * NOISE) ** 2, (COUNT - 1, 1))
     reach = REACH * STEP / 0.6
-    return TrackGround(poses, np.zeros(1), fits[:, None], motions, variances, SPREAD**2, reach, REACH_HEADING)
+    ground = Ground(poses, np.zeros(1), reach, REACH_HEADING, SPREAD**2)
+    return SelfTraverse(ground, fits[:, None], motions, variances)
