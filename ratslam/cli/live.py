@@ -31,7 +31,8 @@ def add_commands(commands: Commands) -> None:
     live.add_argument("--ur-host", metavar="HOST", help="address of the arm's controller")
     live.add_argument(
         "--head", metavar="ADDRESS",
-        help="of the whiskers: usb, usb:VENDOR:PRODUCT[:SERIAL], or the HOST of an emulator",
+        help="address of the whisker head: usb, usb:VENDOR:PRODUCT[:SERIAL] (hexadecimal ids), or "
+        "HOST[:PORT] of an emulator",
     )  # fmt: skip
     live.add_argument(
         "--localise", type=Path, metavar="MAP", help="localise in this map instead of making one"

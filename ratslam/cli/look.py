@@ -55,7 +55,7 @@ def add_commands(commands: Commands) -> None:
     report.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="run directory")
     report.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), metavar="HTML",
-        help="the page, replaced if it exists (default report.html)",
+        help="the page, replaced if it exists (default ./report.html)",
     )  # fmt: skip
 
 

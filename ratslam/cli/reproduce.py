@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ratslam.cli.common import (
@@ -19,6 +19,9 @@ from ratslam.cli.common import (
 )
 from ratslam.cli.reproduce_tables import add_tables
 from ratslam.config.packaged import find_config
+from ratslam.experiments.atlas.registry import ROWS as MAP_ROWS
+from ratslam.experiments.cells.reproduction import NAMES as CELL_ROWS
+from ratslam.experiments.real.reproduction import NAMES as REAL_ROWS
 from tactile.base.errors import InputError
 
 SALMAN2016 = {
@@ -70,14 +73,14 @@ def add_commands(commands: Commands) -> None:
         "real", _real, "figures on recordings of real whiskers and wheels",
         "reproduce real --rows contact -o runs/real",
     )  # fmt: skip
-    real.add_argument("--rows", nargs="+", metavar="ROW", help="only these figures")
+    add_row_names(real, REAL_ROWS)
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
-    add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", "start", 32000)
+    add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", MAP_ROWS, 32000)
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
-    add_rows(names, "cells", _cells, title, "drift", 40000)
+    add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -87,15 +90,17 @@ def add_commands(commands: Commands) -> None:
 
 
 def add_rows(
-    names: Commands, name: str, command: Callable[..., int], title: str, row: str, first: int
+    names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
 ) -> None:
     """Registers a set of tables and figures, of which each is a row.
 
     Args:
-        title: line of the help. row: for the example. first: default seed of the first session.
+        title: line of the help. rows: names of the rows; the first is in the example. first: default seed of
+            the first session.
     """
-    parser = names.add(name, command, title, f"reproduce {name} --rows {row} --sessions 1 -o runs/{name}")
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+    example = f"reproduce {name} --rows {next(iter(rows))} --sessions 1 -o runs/{name}"
+    parser = names.add(name, command, title, example)
+    add_row_names(parser, rows)
     parser.add_argument(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
@@ -106,6 +111,12 @@ def add_rows(
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
     add_workers(parser, 1)
+
+
+def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
+    """Registers `--rows`, whose help lists the names of all rows."""
+    listed = ", ".join(f"'{name}'" if " " in name else name for name in rows)
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed} (default: all)")
 
 
 def add_figure(names: Commands, name: str, title: str) -> None:
@@ -175,7 +186,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _real(arguments: argparse.Namespace) -> int:
-    from ratslam.experiments.real.reproduction import NAMES, reproduce_real
+    from ratslam.experiments.real.reproduction import reproduce_real
     from ratslam.experiments.tables.markdown import select_rows
     from ratslam.experiments.tables.recordings import DATA, real_recordings
 
@@ -183,7 +194,7 @@ def _real(arguments: argparse.Namespace) -> int:
     if data is None:
         raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
     prepare_jax(keep_compiled=False)
-    names = select_rows(arguments.rows, dict.fromkeys(NAMES), NAMES)
+    names = select_rows(arguments.rows, dict.fromkeys(REAL_ROWS), REAL_ROWS)
     for line in reproduce_real(names, data, arguments.output):
         print(line, flush=True)
     print(f"wrote {arguments.output / 'real.md'}")
@@ -193,10 +204,10 @@ def _real(arguments: argparse.Namespace) -> int:
 def _maps(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     from ratslam.experiments.atlas.product import PRODUCT
-    from ratslam.experiments.atlas.reproduction import ROWS, reproduce_maps
+    from ratslam.experiments.atlas.reproduction import reproduce_maps
     from ratslam.experiments.tables.markdown import select_rows
 
-    names = select_rows(arguments.rows, ROWS, tuple(ROWS))
+    names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
     lines = reproduce_maps(
         names, PRODUCT, arguments.output, arguments.first, arguments.sessions, arguments.workers
     )
@@ -209,10 +220,10 @@ def _maps(arguments: argparse.Namespace) -> int:
 def _cells(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     from ratslam.experiments.cells.figure import CellTask
-    from ratslam.experiments.cells.reproduction import NAMES, reproduce_cells
+    from ratslam.experiments.cells.reproduction import reproduce_cells
     from ratslam.experiments.tables.markdown import select_rows
 
-    names = select_rows(arguments.rows, dict.fromkeys(NAMES), NAMES)
+    names = select_rows(arguments.rows, dict.fromkeys(CELL_ROWS), CELL_ROWS)
     task = CellTask(arguments.first, arguments.sessions, arguments.workers)
     for line in reproduce_cells(names, task, arguments.output):
         print(line, flush=True)

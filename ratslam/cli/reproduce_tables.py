@@ -38,7 +38,7 @@ def add_tables(tables: Commands) -> None:
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
-    health = add("health", _health_lines, "whether a map knows that it is wrong", "--sessions 1")
+    health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
     for parser in (touch, grid, laser, buildings):

@@ -18,8 +18,8 @@ def add_commands(commands: Commands) -> None:
     add_run_directory(run)
     run.add_argument(
         "--continue", dest="resume", type=Path, metavar="MAP",
-        help="map to continue from, a run directory or its map.npz: after its last sample if the recording "
-        "is the same, else as a new piece, tied on once its views show where it lies",
+        help="map to continue: a run directory, or a map file (.npz). The same recording goes on after the "
+        "last sample mapped; another begins a separate piece, joined once its views place it in the map",
     )  # fmt: skip
     run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)

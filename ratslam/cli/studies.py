@@ -58,7 +58,8 @@ def add_commands(commands: Commands) -> None:
     )
     study.add_argument(
         "--workers", type=positive_integer, metavar="N",
-        help="Dask processes (default: one per core; 1 without Dask and for report: pareto, a measurement)",
+        help="Dask processes (default: one per core; 1 without Dask, and 1 with `report: pareto`, so that no "
+        "run disturbs the timing of another)",
     )  # fmt: skip
     study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
     study.add_argument(

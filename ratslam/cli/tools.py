@@ -32,15 +32,17 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     convert.add_argument("parameters", type=Path, metavar="INI", help="the parameter file")
     convert.add_argument(
-        "--recording", type=Path, metavar="FILE", help="the bag or video to map (default ROOT.bag)"
-    )
-    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help="write to a file instead")
+        "--recording", type=Path, metavar="FILE",
+        help="the bag or video to map (default ROOT.bag, where ROOT is `topic_root` of the parameter file)",
+    )  # fmt: skip
+    to_file = "write to this file instead of standard output"
+    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help=to_file)
 
     schema = tools.add(
         "schema", _schema, "print the JSON schema of configurations, for editors",
         "tools schema -o runs/schema.json",
     )  # fmt: skip
-    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help="write to a file instead")
+    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help=to_file)
 
     tools.add("version", _version, "print the versions of ratslam, Python and JAX", "tools version")
 

@@ -5,29 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ratslam.experiments.atlas import arenas, changing, continuing, goals, halves, localising, merging
 from ratslam.experiments.atlas.methods import Methods
-from ratslam.experiments.atlas.row import MapRow, MapTask
+from ratslam.experiments.atlas.registry import ROWS
+from ratslam.experiments.atlas.row import MapTask
 from ratslam.experiments.studies.executor import run_tasks
 from tactile.base.atomic_write import write_text_atomically
 
 FIRST = 32000
 """Seed of the first maze; mazes below were used to choose settings."""
-ROWS: dict[str, MapRow] = {
-    "start": localising.START,
-    "other maze": localising.FOREIGN_ROW,
-    "carried": continuing.CARRIED,
-    "kidnaps": continuing.KIDNAPS_ROW,
-    "merge": merging.OVERLAP,
-    "merge mazes": merging.DIFFERENT,
-    "ten sessions": merging.TEN,
-    "goals": goals.GOALS,
-    "wall moved": changing.WALL,
-    "door closed": changing.DOOR,
-    "buildings": halves.HALVES,
-    "grid": arenas.GRID,
-    "grid large": arenas.GRID_LARGE,
-}
 
 
 def reproduce_maps(
