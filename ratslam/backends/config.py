@@ -57,7 +57,7 @@ class LocaliseConfig(Settings):
     """The map: a file map.npz; `python -m ratslam localise` sets it."""
     log_odds: PositiveFloat | None = None
     """Log-odds at which a pose is found, beyond the logarithm of the number of places in the map. By default
-    11 in a map of views, and 15 in one of `backend: grid`."""
+    7.5 in a map of `backend: recall`, and 15 in one of `backend: grid`."""
     particles: Annotated[int, Field(ge=100, le=1_000_000)] = 20_000
     """Number of supposed poses in a map of `backend: grid`."""
     start: Start = "unknown"

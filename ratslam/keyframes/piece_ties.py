@@ -22,8 +22,13 @@ YOUNG = 400
 
 
 class Tie(NamedTuple):
-    """A placement of the newest piece: its log-odds beyond the number of places, less those of the best other
-    one where that is closer than half of what is needed; and the closures that it implies."""
+    """A placement of the newest piece.
+
+    Attributes:
+        log_odds: of the placement less the logarithm of the number of places; where those of another
+            placement are within half of `tie_log_odds`, the difference to the largest of these. closures:
+            implied by the placement.
+    """
 
     log_odds: float
     closures: Sequence[Candidate]
