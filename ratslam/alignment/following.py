@@ -67,12 +67,12 @@ def advance(
     """Moves a supposed pose, and corrects it by the keyframes near by, weighted by how well their views fit.
 
     Args:
-        gain: [S, N] log-likelihood of the newest view at each keyframe less that at a new place; None if it
-            shows nothing.
+        gain: [S, N] log-likelihood of the newest view at each keyframe less that at a new place, nat; None
+            if it shows nothing.
 
     Returns:
-        the pose thereafter; the gain of the best keyframe near by, NaN where no keyframe is near, None of a
-        view that shows nothing.
+        the pose thereafter; the gain of the best keyframe near by, nat, NaN where no keyframe is near, None
+        of a view that shows nothing.
     """
     at = move(at, moved)
     if gain is None:
@@ -91,8 +91,8 @@ def advance(
 
 
 def advance_all(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray) -> tuple[Supposed, np.ndarray]:
-    """`advance` for P supposed poses that move alike, and the gains [P]. Most of many poses fit nowhere: only
-    the others are corrected, one by one."""
+    """`advance` for P supposed poses that move alike, and the gains [P], nat. Most of many poses fit
+    nowhere: only the others are corrected, one by one."""
     pose, covariance = (each.copy() for each in move(at, moved))
     (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(covariance, 0, -1)
     position = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))

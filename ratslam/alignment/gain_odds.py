@@ -33,8 +33,8 @@ class GainPrior(NamedTuple):
 
 class GainOdds(NamedTuple):
     """Attributes:
-    edges: [BINS - 1] limits between the bins of the gain, nat. odds: [BINS] log-odds of each, ascending.
-    expected: mean log-odds at a true pose.
+    edges: [BINS - 1] limits between the bins of the gain, nat. odds: [BINS] log-odds of each, ascending,
+        nat. expected: mean log-odds at a true pose, nat.
     """
 
     edges: np.ndarray
@@ -42,7 +42,7 @@ class GainOdds(NamedTuple):
     expected: float
 
     def of(self, gain: float) -> float:
-        """Log-odds of one gain."""
+        """Log-odds of one gain, both in nat."""
         return float(self.odds[np.searchsorted(self.edges, gain)])
 
 

@@ -27,8 +27,8 @@ BESIDE_SHARE = 0.3
 
 
 class Path(NamedTuple):
-    """A supposed pose followed through n keyframes: poses [n, 3], covariances [n, 3, 3], and log-odds [n] of
-    each keyframe."""
+    """A supposed pose followed through n keyframes: poses [n, 3], m, m, rad; covariances [n, 3, 3]; and
+    log-odds [n] of each keyframe, nat."""
 
     poses: np.ndarray
     covariances: np.ndarray
@@ -65,7 +65,7 @@ def follow(
 def keyframe_odds(
     ground: Ground, odds: GainOdds, pose: np.ndarray, gain: float | None, inside: bool
 ) -> tuple[float, bool]:
-    """Log-odds of one keyframe, and whether it is on mapped ground.
+    """Log-odds of one keyframe, nat, and whether it is on mapped ground.
 
     Args:
         pose: [3] where it is supposed to be. gain: see `advance`.

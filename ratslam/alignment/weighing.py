@@ -11,9 +11,9 @@ import numpy as np
 from ratslam.alignment.gain_odds import PRIOR, GainPrior
 
 COMMON = 0.5
-"""Share of a view's mean likelihood on the whole ground that is taken off its gains, as a logarithm."""
+"""Factor on the logarithm of a view's mean likelihood over the whole ground, subtracted from its gains."""
 COMMON_OF_PIECE = 0.25
-"""The same for a piece of a growing map."""
+"""The same factor for a piece of a growing map."""
 
 
 class Weighing(NamedTuple):

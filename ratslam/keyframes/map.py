@@ -3,9 +3,9 @@ optimised.
 
 Recall proposes candidates. Consecutive candidates that agree with the odometry form a closure sequence; it is
 accepted if it has enough evidence and lies where the map's covariance allows. Accepted sequences keep a
-robust weight, so that other closures can still outvote them. A long sequence that contradicts the map shows a
-break of the odometry: the odometry is cut where the views indicate it, and the sequence joins the parts. The
-rules are ours."""
+robust weight, so that other closures can still outvote them. Only for a robot that may be carried
+(`may_be_carried`), a long sequence that contradicts the map shows a break of the odometry: the odometry is
+cut where the views indicate it, and the sequence joins the parts. The rules are ours."""
 
 from __future__ import annotations
 
