@@ -1,4 +1,4 @@
-"""The grid-filter table: a simulated Create in arenas never used for tuning, one setting for all rows.
+"""The grid-filter table: a simulated Create in arenas never used for tuning; the rows name changed settings.
 
 Errors are means over all reports of the distance between the online pose and the true pose, with the start
 known and without alignment, beside those of dead reckoning.

@@ -1,7 +1,8 @@
-"""The touch table: whisker sessions in mazes never used for tuning, with one setting for all conditions.
+"""The touch table: whisker sessions in mazes never used for tuning.
 
-Each row is a condition; each session of it has its own maze, so that an unlucky maze counts once. Values are
-medians over the sessions; a failure is an Energy Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
+Each row is a condition, with the preset of the sensor and what the row changes; each session of it has its
+own maze, so that an unlucky maze counts once. Values are medians over the sessions; a failure is an Energy
+Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
 """
 
 from __future__ import annotations
