@@ -82,17 +82,23 @@ def keyframe_odds(
     return 0.0, inside  # the pose is so uncertain that keyframes beyond the reach were compared
 
 
+def counted_beside(ground: Ground, path: Path) -> np.ndarray:
+    """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the first:
+    a path beside the way stays there for some keyframes, and the map may be bent there."""
+    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose, NEAR) for pose in path.poses])
+    still = beside & np.concatenate([[False], beside[:-1]])
+    return np.where(still & (path.odds < 0), BESIDE_SHARE * path.odds, path.odds)
+
+
 def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
-    """[n] the log-odds of each keyframe, less where a keyframe before has said nearly the same.
+    """[n] the log-odds of each keyframe, nat, less where a keyframe before has said nearly the same.
 
     A place elsewhere that is alike is alike at each visit, and often from every heading; one that is not,
-    contradicts at each. A path beside the driven way stays there for some keyframes.
+    contradicts at each.
     """
     apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
     keyframe = np.arange(len(apart))
     earlier = keyframe[:, None] - keyframe >= AGAIN
     again = (earlier & (apart < NEAR * ground.reach)).any(axis=1)
-    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose, NEAR) for pose in path.poses])
-    still = beside & np.concatenate([[False], beside[:-1]])
-    share = np.where(path.odds > 0, np.where(again, AGAIN_SHARE, 1.0), np.where(still, BESIDE_SHARE, 1.0))
-    return share * path.odds
+    odds = counted_beside(ground, path)
+    return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)

@@ -1,4 +1,5 @@
-"""Joins the pieces of a map that views of one on the ground of the other place beyond doubt.
+"""Joins two pieces of a map if the views of one, compared with the keyframes of the other, place it there
+beyond doubt.
 
 A placement of one piece in the other has to explain all its views, be more likely than any other by far, and
 be found from either side. Its keyframes on common ground then give closure sequences, which are selected
@@ -18,7 +19,7 @@ from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import same_pose
-from ratslam.alignment.paths import NEAR, Path
+from ratslam.alignment.paths import NEAR, Path, counted_beside
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.map_traverse import MapTraverse
 from ratslam.atlas.placement import find_placements
@@ -196,7 +197,10 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
     odds = views.odds(every, archive.poses(pose)[every], np.isin(every, taken[onto]))
     session = MapTraverse(compared, own, motions, HOPELESS)
-    paths = find_placements(ground, odds, session)
+    paths = [
+        path._replace(odds=counted_beside(ground, path)) for path in find_placements(ground, odds, session)
+    ]
+    paths.sort(key=lambda path: -path.odds.sum())
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
     if not paths or paths[0].odds.sum() < needed:
         return None
