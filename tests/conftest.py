@@ -51,6 +51,7 @@ LONGEST = (
     "tests/ratslam/examples/test_examples.py",
     "tests/ratslam/experiments/cells/test_cell_study.py",
     "tests/ratslam/live/test_create_session.py",
+    "tests/ratslam/cli/test_stopped_runs.py",
     "tests/ratslam/cli/test_run.py",
     "tests/ratslam/pipeline/test_recall_maps.py",
     "tests/ratslam/live/test_arm_faults.py",

@@ -13,19 +13,12 @@ import pytest
 import ratslam
 from ratslam.backends.localise import LOG_ODDS
 from ratslam.cli import main
-from tests.helpers.square_run import copy_square_run
 from tests.ratslam.pipeline.test_saved_map import rewritten
 
 ROOT = Path(__file__).parents[3]
 SQUARE = ROOT / "configs" / "square.yaml"
 TOUCH = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
 """A map by whiskers."""
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run directory, whose map stays as it is."""
-    return copy_square_run(tmp_path_factory.mktemp("square") / "run")
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from ratslam.pipeline.source import open_source
 from robot.recordings.mcap_reader import Recording
 from robot.simulation.head.session import HeadSimulation
 from robot.touch_source import open_touch_source
+from tests.ratslam.cli.run_cases import refuses
 
 ROOT = Path(__file__).parents[3]
 CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
@@ -37,16 +38,6 @@ def folder(tmp_path_factory):
     assert main(["run", str(path / "config.yaml"), "-o", str(path / "direct")]) == 0
     assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
     return path
-
-
-def refuses(capsys, arguments, *messages):
-    """The command ends with code 2 and an error that contains all of `messages`, without a traceback."""
-    capsys.readouterr()
-    assert main([str(argument) for argument in arguments]) == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    for words in ("ratslam: error: ", *messages):
-        assert words in error
 
 
 def test_a_run_on_the_recording_equals_a_run_on_the_simulation(folder):

@@ -1,14 +1,16 @@
-"""Settings of an example, and a file that sets every part of them."""
+"""Settings of an example, a file that sets every part of them, and what is said of other files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
+import pytest
 from pydantic import Field, model_validator
 
 from ratslam.config.strict_yaml import override, parse, validate
 from tactile.base.config import Settings
+from tactile.base.errors import InputError
 
 
 class PoseCells(Settings):
@@ -85,3 +87,10 @@ name: off
 
 def overridden(*assignments: str, text: str = VALID) -> Config:
     return validate(override(parse(text, "config.yaml"), assignments), Config)
+
+
+def refusal(text: str) -> str:
+    """The message for a text that cannot be read or is not a `Config`."""
+    with pytest.raises(InputError) as caught:
+        validate(parse(text, "config.yaml"), Config)
+    return str(caught.value)

@@ -1,45 +1,16 @@
-"""Configuration files: accepted and refused content, and the places in messages."""
+"""Configuration files as text: scalars, refused YAML, variables of the environment, files, dumps."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ratslam.config.strict_yaml import dump, load, override, parse, schema, validate
+from ratslam.config.strict_yaml import dump, load, parse
 from tactile.base.errors import InputError
-from tests.ratslam.config.example_schema import (
-    VALID,
-    Config,
-    PoseCells,
-    Recording,
-    Simulation,
-    overridden,
-)
-
-
-def _message(text: str) -> str:
-    """The message for a text that cannot be read or is not a `Config`."""
-    with pytest.raises(InputError) as caught:
-        validate(parse(text, "config.yaml"), Config)
-    return str(caught.value)
-
-
-def test_reads_every_part() -> None:
-    config = validate(parse(VALID, "config.yaml"), Config)
-    assert config == Config(
-        pose_cells=PoseCells(excite_sigma=1e-3),
-        metric="cosine",
-        source=Recording(path=Path("data/a.mcap")),
-        others=(Simulation(simulation=3), Recording(kind="bag", path=Path("b.bag"))),
-        width=(1.5, 0.5),
-        gains={"left": 1.0, "right": -250.0},
-        learn=False,
-        name="off",
-    )
+from tests.ratslam.config.example_schema import Config, Recording, refusal
 
 
 @pytest.mark.parametrize(
@@ -151,109 +122,16 @@ def test_not_a_number() -> None:
     ],
 )
 def test_invalid_yaml_is_refused(text: str, message: str) -> None:
-    assert _message(text).startswith(message)
+    assert refusal(text).startswith(message)
 
 
 def test_all_refused_values_are_reported_at_once() -> None:
-    lines = _message("a: 010\nb: 1\nb: 2\n3: 4").splitlines()
+    lines = refusal("a: 010\nb: 1\nb: 2\n3: 4").splitlines()
     assert [line.split(": ")[0] for line in lines] == [
         "config.yaml:1:4",
         "config.yaml:3:1",
         "config.yaml:4:1",
     ]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            "steps: 1\npose_cells:\n  exite_sigma: 2",
-            "config.yaml:3:3: pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
-        ),
-        (
-            "source: {sped: 3}",
-            "config.yaml:1:1: source.kind: missing; expected 'recording', 'bag' or 'simulation'",
-        ),
-        (
-            "source: {kind: simulation, sped: 3}",
-            "config.yaml:1:28: source.sped: unknown key; the keys here are kind, simulation",
-        ),
-        (
-            "source:\n  kind: simulation\n  simulation: x",
-            "config.yaml:3:15: source.simulation: 'x'; expected a whole number",
-        ),
-        (
-            "others:\n- kind: simulatoin",
-            "config.yaml:2:9: others.0.kind: 'simulatoin'; expected 'recording', 'bag' or 'simulation'; "
-            "did you mean 'simulation'?",
-        ),
-        (
-            "others:\n- kind: simulation\n- kind: bag",
-            "config.yaml:3:3: others.1.path: missing; The file of the recording.",
-        ),
-        ("source:\n  kind: bag", "config.yaml:1:1: source.path: missing; The file of the recording."),
-        (
-            "pose_cells:\n  excite_sigma: -1",
-            "config.yaml:2:17: pose_cells.excite_sigma: -1; expected a number greater than 0",
-        ),
-        ("steps: -1", "config.yaml:1:8: steps: -1; expected a number greater than or equal to 0"),
-        ("steps: 1.5", "config.yaml:1:8: steps: 1.5; expected a whole number"),
-        ("steps: '5'", "config.yaml:1:8: steps: '5'; expected a whole number"),
-        ("steps: true", "config.yaml:1:8: steps: true; expected a whole number"),
-        ("steps:", "config.yaml:1:7: steps: nothing; expected a whole number"),
-        ("learn: yes", "config.yaml:1:8: learn: 'yes'; expected true or false"),
-        ("learn: 1", "config.yaml:1:8: learn: 1; expected true or false"),
-        ("name: 3", "config.yaml:1:7: name: 3; expected text"),
-        ("gains: 3", "config.yaml:1:8: gains: 3; expected a section of keys and values"),
-        ("gains:\n  left: 12:30", "config.yaml:2:9: gains.left: '12:30'; expected a number"),
-        ("gains: {left: .inf}", "config.yaml:1:15: gains.left: inf; expected a finite number"),
-        (
-            "pose_cells: [1]",
-            "config.yaml:1:13: pose_cells: a list of 1; expected a section of keys and values",
-        ),
-        ("optional: {shape: 3}", "config.yaml:1:19: optional.shape: 3; expected a list"),
-        ("metric: L1", "config.yaml:1:9: metric: 'L1'; expected 'l1' or 'cosine'; did you mean 'l1'?"),
-        (
-            "motion: Turns",
-            "config.yaml:1:9: motion: 'Turns'; expected 'forward' or 'turn'; did you mean 'turn'?",
-        ),
-        ("motion: back", "config.yaml:1:9: motion: 'back'; expected 'forward' or 'turn'"),
-        ("width: wide", "config.yaml:1:8: width: 'wide'; expected a number or a list"),
-        ("pose_cells: {shape: [1]}", "config.yaml:1:21: pose_cells.shape: a list of 1; expected 3 values"),
-        (
-            "pose_cells: {shape: [1, 2, 3, 4]}",
-            "config.yaml:1:21: pose_cells.shape: a list of 4; expected 3 values",
-        ),
-        (
-            "pose_cells: {shape: [1, 2, x]}",
-            "config.yaml:1:28: pose_cells.shape.2: 'x'; expected a whole number",
-        ),
-        ("pose_cells: {shape: [2, 2, 2]}", "config.yaml:1:13: pose_cells: one of x and y must be odd"),
-        (
-            f"weights: {[0] * 51}",
-            "config.yaml:1:10: weights: a list of 51; expected at most 50 values",
-        ),
-    ],
-)
-def test_invalid_configurations_are_refused(text: str, message: str) -> None:
-    assert _message(text) == message
-
-
-def test_all_errors_are_reported_at_once_in_the_order_of_the_file() -> None:
-    lines = _message("zzz: 1\nsteps: x\nmetric: l3\npose_cells:\n  excite_sigma: 0\n  shape: []").splitlines()
-    assert [line.split(": ")[1] for line in lines] == [
-        "zzz",
-        "steps",
-        "metric",
-        "pose_cells.excite_sigma",
-        "pose_cells.shape",
-    ]
-
-
-def test_many_errors_are_cut_short() -> None:
-    lines = _message("gains:\n" + "".join(f"  k{i}: x\n" for i in range(99))).splitlines()
-    assert len(lines) == 51
-    assert lines[-1] == "and 49 more errors"
 
 
 def test_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,7 +143,7 @@ def test_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unset_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RATSLAM_DATA", raising=False)
     monkeypatch.setenv("RATSLAM_TEST", "")
-    first, second = _message("a: ${RATSLAM_DATA}/x\nb:\n- ${RATSLAM_TEST}").splitlines()
+    first, second = refusal("a: ${RATSLAM_DATA}/x\nb:\n- ${RATSLAM_TEST}").splitlines()
     assert first == (
         "config.yaml:1:4: a: the environment variable RATSLAM_DATA is not set; "
         "the recordings are not part of the project: set RATSLAM_DATA to the folder that holds them"
@@ -295,66 +173,6 @@ def test_files(tmp_path: Path) -> None:
             load(path)
 
 
-def test_override() -> None:
-    document = parse(VALID, "config.yaml")
-    config = validate(
-        override(
-            document,
-            [
-                "pose_cells.excite_sigma=2e-3",
-                "pose_cells.shape.0=23",
-                "others.0.simulation=4",
-                "optional.excite_sigma=3",
-                "gains={up: 1}",
-                "gains.down=2",
-                "name=a=b",
-                "steps=1",
-                "steps=2",
-            ],
-        ),
-        Config,
-    )
-    assert config.pose_cells == PoseCells(excite_sigma=2e-3, shape=(23, 21, 36))
-    assert config.others[0] == Simulation(simulation=4)
-    assert config.optional == PoseCells(excite_sigma=3)
-    assert config.gains == {"up": 1, "down": 2}
-    assert config.name == "a=b"
-    assert config.steps == 2
-    assert document == parse(VALID, "config.yaml")
-
-
-@pytest.mark.parametrize(
-    ("assignment", "message"),
-    [
-        ("steps", "--set steps: not an assignment; expected key=value such as pose_cells.excite_sigma=1e-3"),
-        ("=1", "--set : not an assignment"),
-        ("a..b=1", "--set a..b: not an assignment"),
-        ("steps=", "--set steps: empty; expected a value"),
-        ("steps=yes", "--set steps: 'yes'; expected a whole number"),
-        ("steps=[1", "--set steps: a bracket that is not closed"),
-        ("steps=010", "--set steps: 010; expected a number without leading zeros"),
-        ("steps.x=1", "--set steps.x: steps is 5; expected a section to put a key in"),
-        ("weights.2=1", "--set weights.2: weights has 2 items; expected an index below 2"),
-        ("weights.x=1", "--set weights.x: weights has 2 items; expected an index below 2"),
-        ("stepz=1", "--set stepz: unknown key; did you mean 'steps'?"),
-        (
-            "pose_cells.exite_sigma=1",
-            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
-        ),
-        (
-            "pose_cells={exite_sigma: 1}",
-            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
-        ),
-        ("optional.shape.x=1", "--set optional.shape: a section of keys and values; expected a list"),
-        ("source.kind=bag", "--set source.path: missing; The file of the recording."),
-    ],
-)
-def test_override_errors(assignment: str, message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        overridden(assignment, text="steps: 5\nweights: [1, 2]")
-    assert str(caught.value).startswith(message)
-
-
 def test_dump_is_readable() -> None:
     assert dump(Config(name="no", source=Recording(path=Path("a")), gains={"1": 1e-300})) == (
         "pose_cells:\n  excite_sigma: 1.0\n  shape: [21, 21, 36]\n"
@@ -364,15 +182,3 @@ def test_dump_is_readable() -> None:
         "gains:\n  '1': 1.0e-300\n"
         "learn: true\nsteps: 10\nname: 'no'\nweights: []\n"
     )
-
-
-def test_the_schema_lists_the_keys_for_editors() -> None:
-    described = schema(Config)
-    json.dumps(described)
-    assert described["$schema"].startswith("https://json-schema.org/")
-    assert described["title"] == "Config"
-    assert described["description"] == "A whole configuration."
-    section = described["$defs"]["PoseCells"]
-    assert section["properties"]["excite_sigma"]["description"] == "Width of the excitation, cells."
-    assert section["properties"]["excite_sigma"]["exclusiveMinimum"] == 0
-    assert section["additionalProperties"] is False

@@ -1,248 +1,29 @@
-"""Emulated arm and head, and sessions on them, each in a process of its own."""
+"""Emulated arm and head, each in a process of its own, and quick sessions on them."""
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from robot.drivers.head.decoder import Frames
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.recordings.cdr_live import Event
-from robot.recordings.mcap_scanner import McapScanner
-from robot.sources.source import Sample
-from tests.helpers.live import HEAD_FAULTS, PATIENCE, ROOT, Faults, emulator, until, ur_emulator
+from tests.helpers.live import HEAD_FAULTS, PATIENCE, Faults, emulator, until, ur_emulator
+from tests.ratslam.live.forked_process import raise_priority
+from tests.ratslam.live.live_session import Session
+from tests.ratslam.live.recorded_data import Moment
+from tests.ratslam.live.server_process import SessionServer
 
-SAMPLES = 2000.0
-"""Frames of the head in a second."""
 LEGS = tuple((0.63 + 0.07 * x, 0.45 + 0.02 * (x % 2), 0.0) for x in (0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0))
 """Route of quick sessions: legs of 1.6 s."""
 START = tcp_from_pose(BaseTransformConfig(), np.array(LEGS[0]), 0.005)
 HIGH = BaseTransformConfig(z=BaseTransformConfig().z - 0.3)
 """Pose of the map for the emulated head in quick sessions, too low for its whiskers to touch walls."""
-
-
-class Moment(NamedTuple):
-    """A moment by the devices' clocks: s of the controller, number of the head's newest sample."""
-
-    robot: float
-    sample: int
-
-
-class RecordedData(NamedTuple):
-    """Content of a recording."""
-
-    sequence: np.ndarray
-    robot: np.ndarray
-    samples: list[Sample]
-    events: list[Event]
-    broken: str
-
-    def lost(self, until: Moment) -> float:
-        """Duration of the data missing at the end of the recording, of either device, s."""
-        return max(until.robot - float(self.robot[-1]), (until.sample - int(self.sequence[-1])) / SAMPLES)
-
-    def names(self) -> list[str]:
-        return [event.name for event in self.events]
-
-
-def raise_priority(pid: int) -> None:
-    """Raises the priority of a process and its children where allowed, because they work in real time."""
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, pid, -10)
-
-
-def read_recorded(path: Path) -> RecordedData:
-    """Reads a recording, complete or not."""
-    walk = McapScanner(path)
-    sequence, robot, samples, events = [], [], [], []
-    for entry in walk.entries():
-        if isinstance(entry.content, Frames):
-            sequence.append(entry.content.sequence)
-        elif isinstance(entry.content, np.ndarray):
-            robot.append(entry.content["robot"])
-        elif isinstance(entry.content, Event):
-            events.append(entry.content)
-        else:
-            samples.append(entry.content)
-    return RecordedData(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
-
-
-class Forked:
-    """A process started by a `SessionServer`, with the methods of `subprocess.Popen` that tests use."""
-
-    def __init__(self, pid: int, code: Path) -> None:
-        self.pid, self._code = pid, code
-
-    def poll(self) -> int | None:
-        return int(self._code.read_text()) if self._code.exists() else None
-
-    def wait(self, timeout: float) -> int:
-        end = time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if time.monotonic() > end:
-                raise subprocess.TimeoutExpired("session", timeout)
-            time.sleep(0.005)
-        return code
-
-    def send_signal(self, number: int) -> None:
-        os.kill(self.pid, number)
-
-    def kill(self) -> None:
-        self.send_signal(signal.SIGKILL)
-
-
-class SessionServer:
-    """A process that has loaded all modules and forks sessions."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._count = folder, 0
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.ratslam.live.session_server"],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            bufsize=1,
-        )
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline() == "ready\n"
-
-    def start(
-        self,
-        config: dict[str, Any],
-        mapper: float | None = 0.0,
-        without: Sequence[str] = (),
-        rate_check: bool = False,
-        options: Sequence[str] = (),
-    ) -> Session:
-        """Starts a session.
-
-        Args:
-            config: its configuration. mapper: s that the stub takes for each sample; None: no stub, the
-                mapper itself. without: libraries that it cannot import. rate_check: whether it checks the
-                head's rate. options: more of `live`.
-        """
-        self._count += 1
-        folder = self._folder / str(self._count)
-        folder.mkdir()
-        file, log, code = folder / "config.yaml", folder / "log", folder / "code"
-        file.write_text(json.dumps(config))
-        log.touch()
-        order = {
-            "arguments": ["live", str(file), "-o", str(folder / "run"), *options],
-            "log": str(log),
-            "code": str(code),
-            "mapper": mapper,
-            "rate_check": rate_check,
-            "without": list(without),
-        }
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(order) + "\n")
-        session = Session(folder, Forked(int(self._process.stdout.readline()), code))
-        raise_priority(session.process.pid)
-        return session
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.communicate()
-
-
-class Session:
-    """A session's process.
-
-    Attributes:
-        directory: of its run. log: its output.
-    """
-
-    def __init__(self, folder: Path, process: Forked) -> None:
-        self.directory, self.log, self.process = folder / "run", folder / "log", process
-
-    def output(self) -> str:
-        return self.log.read_text(errors="replace")
-
-    def until(self, condition: Callable[[], Any], what: str) -> Any:
-        """As `tests.helpers.live.until`; fails at once when the session has ended."""
-
-        def met() -> Any:
-            found = condition()
-            assert found or self.process.poll() is None, self.output()
-            return found
-
-        try:
-            return until(met, what)
-        except AssertionError:
-            print(self.output())
-            raise
-
-    def wait_for(self, text: str) -> None:
-        """Waits for a text in its output."""
-        self.until(lambda: text in self.output(), f"{text!r} is said")
-
-    def code(self, seconds: float = 2 * PATIENCE) -> int:
-        """Waits for its end; returns the exit code."""
-        try:
-            return self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            print(self.output())
-            raise
-
-    def report(self) -> dict[str, Any]:
-        """Content of `live.json`."""
-        report: dict[str, Any] = json.loads((self.directory / "live.json").read_text())
-        return report
-
-    def recorded(self) -> RecordedData:
-        """Content of its recording."""
-        return read_recorded(self.directory / "session.mcap")
-
-    def child(self) -> int:
-        """Process id of its RTDE process."""
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                words = (folder / "cmdline").read_bytes().split(b"\0")
-                if (
-                    b"robot.drivers.ur10.rtde_process" in words
-                    and os.getpgid(int(folder.name)) == self.process.pid
-                ):
-                    return int(folder.name)
-        raise AssertionError("no process of the arm")
-
-    def lives(self) -> bool:
-        """Whether any of its processes runs."""
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                if os.getpgid(int(folder.name)) == self.process.pid and _runs(folder):
-                    return True
-        return False
-
-    def mapper(self) -> int:
-        """Process id of its mapper."""
-        return int((self.directory / "mapper.pid").read_text())
-
-    def end(self) -> None:
-        """Kills its processes."""
-        with suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(PATIENCE)
-
-
-def _runs(folder: Path) -> bool:
-    """Whether a process runs; a zombie does not."""
-    return (folder / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
 class Bench:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.ratslam.live.bench import Bench, SessionServer
+from tests.ratslam.live.bench import Bench
+from tests.ratslam.live.server_process import SessionServer
 
 
 @pytest.fixture(scope="session")

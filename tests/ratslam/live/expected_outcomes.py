@@ -6,7 +6,9 @@ import time
 from typing import Any
 
 from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.bench import Bench, Moment, RecordedData, Session
+from tests.ratslam.live.bench import Bench
+from tests.ratslam.live.live_session import Session
+from tests.ratslam.live.recorded_data import Moment, RecordedData
 
 LOST = 1.5
 """s of a recording that may be lost on a busy machine."""

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, Faults, until
-from tests.ratslam.live.bench import raise_priority, read_recorded
+from tests.ratslam.live.forked_process import raise_priority
+from tests.ratslam.live.recorded_data import read_recorded
 
 CONFIG = str(ROOT / "configs" / "live_maze.yaml")
 REPLAY = """

@@ -23,8 +23,9 @@ from ratslam.pipeline.run import run
 from robot.recordings.mcap_reader import Recording
 from tactile.base.types import MotionKind, Report, StepEnd
 from tests.helpers.live import PATIENCE
-from tests.ratslam.live.bench import Session, SessionServer
 from tests.ratslam.live.create_bench import CreateBench, child_of, create_bench, ended, kill
+from tests.ratslam.live.live_session import Session
+from tests.ratslam.live.server_process import SessionServer
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
 pytest.importorskip("serial", reason="needs pyserial")

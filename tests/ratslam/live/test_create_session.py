@@ -19,8 +19,9 @@ from robot.recordings.mcap_reader import Recording
 from tactile.base.errors import InputError
 from tactile.base.types import MotionKind, StepEnd
 from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.bench import Session, SessionServer
 from tests.ratslam.live.create_bench import CreateBench, child_of, create_bench, kill
+from tests.ratslam.live.live_session import Session
+from tests.ratslam.live.server_process import SessionServer
 
 pytest.importorskip("serial", reason="needs pyserial")
 pytest.importorskip("termios", reason="needs pseudo-terminals")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tests.helpers.live import until
-from tests.ratslam.live.bench import LEGS, START, Bench, RecordedData
+from tests.ratslam.live.bench import LEGS, START, Bench
 from tests.ratslam.live.expected_outcomes import ended
+from tests.ratslam.live.recorded_data import RecordedData
 
 
 def gaps(recorded: RecordedData) -> int:

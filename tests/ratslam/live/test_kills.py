@@ -14,8 +14,9 @@ import pytest
 from robot.recordings.mcap_reader import Recording, recover
 from tactile.base.random_streams import stream
 from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.bench import Bench, read_recorded
+from tests.ratslam.live.bench import Bench
 from tests.ratslam.live.expected_outcomes import LOST, STRICT, ended, stands
+from tests.ratslam.live.recorded_data import read_recorded
 
 FEW, MANY = range(1), range(1, 52)
 NUMBERS = [*FEW, *(pytest.param(number, marks=pytest.mark.soak) for number in MANY)]

@@ -1,0 +1,13 @@
+"""A finished run, a copy for each module."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.helpers.square_run import copy_square_run
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory):
+    """A finished run."""
+    return copy_square_run(tmp_path_factory.mktemp("square") / "run")

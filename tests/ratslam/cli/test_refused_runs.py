@@ -1,0 +1,97 @@
+"""The command run refuses configurations, recordings, directories and checkpoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.ratslam.cli.run_cases import ROOT, SQUARE, refuses
+
+
+@pytest.mark.parametrize(
+    ("text", "messages"),
+    [
+        ("", ["config.yaml"]),
+        (
+            "recording: {file: a.npz}\npose_cells: {excite_sigm: 1}\n",
+            ["did you mean 'excite_sigma'", "config.yaml:2:"],
+        ),
+        ("recording: {file: a.npz}\npose_cells: {excite_sigma: -1}\n", ["pose_cells.excite_sigma"]),
+        ("recording: {file: a.npz}\npose_cells: {excite_width: 6}\n", ["odd"]),
+        ("recording: {file: a.npz}\ntemplates: {threshold: high}\n", ["templates.threshold"]),
+        ("recording: {file: a.npz}\nrecording: {file: b.npz}\n", ["recording"]),
+        ("recording: {file: missing.npz}\n", ["missing.npz"]),
+        ("recording: {file: '${RATSLAM_NOT_SET}/a.npz'}\n", ["RATSLAM_NOT_SET"]),
+        ("recording: {file: a.npz\n", [":"]),
+        ("pose_cells: {}\nplaces: {radius: 0}\n", ["recording", "places.radius"]),
+    ],
+)
+def test_a_faulty_config_is_refused(capsys, tmp_path, text, messages):
+    config = tmp_path / "config.yaml"
+    config.write_text(text)
+    refuses(capsys, ["run", config, "-o", tmp_path / "run"], *messages)
+    assert not (tmp_path / "run").exists()
+
+
+def changed(tmp_path, **changes):
+    """A golden stream with some arrays changed."""
+    with np.load(ROOT / "tests" / "golden" / "a_square3.npz") as archive:
+        arrays = dict(archive)
+    for name, change in changes.items():
+        arrays[name] = change(arrays[name].copy())
+    np.savez(tmp_path / "changed.npz", **arrays)
+    return tmp_path / "changed.npz"
+
+
+def put(row, value):
+    def change(array):
+        array[row] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "messages"),
+    [
+        ({"in_w": lambda w: w * 180 / np.pi}, "deg"),
+        ({"in_v": lambda v: v * 1000}, "m"),
+        ({"in_v": put(7, np.nan)}, "row 7"),
+        ({"in_t": put(9, 0.0)}, "row 9"),
+        ({"in_view": lambda view: view * 255}, "0..1"),
+        ({"in_view": lambda view: view[:, :5]}, "in_view"),
+    ],
+    ids=["degrees", "millimetres", "nan", "backwards", "bytes", "shape"],
+)
+def test_a_faulty_recording_is_refused(capsys, tmp_path, changes, messages):
+    file = changed(tmp_path, **changes)
+    refuses(capsys, ["run", SQUARE, "-o", tmp_path / "run", "--set", f"recording.file={file}"], messages)
+    assert not (tmp_path / "run").exists()
+
+
+def test_cut_and_empty_recordings_are_refused(capsys, tmp_path):
+    whole = (ROOT / "tests" / "golden" / "a_square3.npz").read_bytes()
+    for name, content in (("cut.npz", whole[:5000]), ("empty.npz", b""), ("noise.mcap", b"noise" * 99)):
+        (tmp_path / name).write_bytes(content)
+        file = f"recording.file={tmp_path / name}"
+        refuses(capsys, ["run", SQUARE, "-o", tmp_path / "run", "--set", file], name)
+
+
+def test_an_existing_directory_is_not_changed(capsys, square):
+    before = {path: path.read_bytes() for path in square.iterdir()}
+    refuses(capsys, ["run", SQUARE, "-o", square], "exists")
+    assert before == {path: path.read_bytes() for path in square.iterdir()}
+
+
+def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
+    again = ["run", SQUARE, "-o", tmp_path / "run", "--continue"]
+    refuses(capsys, [*again, square / "map.npz"], "already")
+    refuses(capsys, [*again, square / "steps.csv"], "not a map")
+    refuses(capsys, [*again, tmp_path / "none.npz"], "none.npz")
+    refuses(capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_xy=25"], "configuration")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused(capsys, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    refuses(capsys, ["run", SQUARE, "-o", tmp_path / "file" / "run"], "cannot be created")

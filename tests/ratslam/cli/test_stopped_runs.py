@@ -1,0 +1,131 @@
+"""Interrupted runs are scored and continue; killed ones are readable."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from ratslam.config.run_config import load_config
+from ratslam.pipeline.run import process_source
+from ratslam.pipeline.runner import open_runner
+from ratslam.pipeline.source import open_observations
+from tests.ratslam.cli.run_cases import FILES, ROOT
+
+
+@pytest.fixture(scope="module")
+def corridor_run(tmp_path_factory):
+    """A config that runs for some seconds, its uninterrupted run, and the session of this run."""
+    folder = tmp_path_factory.mktemp("corridor")
+    config = folder / "long.yaml"
+    golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
+    config.write_text(
+        f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 11, cell_size: 0.05, engine: dense}}\n"
+    )
+    with (
+        open_observations(load_config(config)) as (completed, source),
+        open_runner(completed, source, folder / "whole") as runner,
+    ):
+        assert not process_source(runner, source)
+        runner.finish(interrupted=False)
+        return config, folder / "whole", runner.session
+
+
+@pytest.fixture(scope="module")
+def corridor(corridor_run):
+    """The config and the run."""
+    return corridor_run[:2]
+
+
+def start(config, directory):
+    """The program in a process of its own."""
+    command = [sys.executable, "-m", "ratslam", "run", str(config), "-o", str(directory)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_steps(process, directory, size=400):
+    """Waits until the file of steps has so many bytes (by default some lines beside the first one, of names),
+    or the process has ended."""
+    steps = directory / "steps.csv"
+    while process.poll() is None and not (steps.exists() and steps.stat().st_size > size):
+        time.sleep(0.005)
+
+
+def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
+    config, whole = corridor
+    process = start(config, tmp_path / "first")
+    wait_for_steps(process, tmp_path / "first")
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate()
+    first = tmp_path / "first"
+    assert process.returncode == 130, messages
+    assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
+    # No closure yet, and so no views of one.
+    assert {path.name for path in first.iterdir()} == FILES - {"closure_views.npz"}
+    assert len((first / "closures.csv").read_text().splitlines()) == 1
+    second = tmp_path / "second"
+    assert main(["run", str(config), "--continue", str(first / "map.npz"), "-o", str(second)]) == 0
+    added = (second / "steps.csv").read_text().split("\n", 1)[1]
+    assert (first / "steps.csv").read_text() + added == (whole / "steps.csv").read_text()
+    assert (whole / "trajectory.tum").read_text().endswith((second / "trajectory.tum").read_text())
+
+
+def test_a_run_of_known_length_compiles_its_kernel_once(corridor_run):
+    _, _, session = corridor_run
+    assert session.backend.rows(session.state) > 256, "fits into the smallest capacity"
+    assert session.compilations() == 1
+
+
+def check_killed_run(corridor, directory):
+    """A killed run has a prefix of the lines, and can be scored from its first step on; how many."""
+    _, whole = corridor
+    for name in ("steps.csv", "online.tum", "odometry.tum", "truth.tum"):
+        if (directory / name).exists():
+            written = (directory / name).read_bytes()
+            assert (whole / name).read_bytes().startswith(written)
+            assert not written or written.endswith(b"\n")
+    code = main(["score", str(directory)])
+    rows = (directory / "steps.csv").read_text().count("\n") if (directory / "steps.csv").exists() else 0
+    assert code == (0 if rows > 1 else 2)
+    return rows
+
+
+def test_a_killed_run_is_readable(corridor, tmp_path):
+    """Also before its first step: a stopped process leaves the same files as a killed one."""
+    process = start(corridor[0], tmp_path / "run")
+    wait_for_steps(process, tmp_path / "run", -1)
+    process.send_signal(signal.SIGSTOP)
+    shutil.copytree(tmp_path / "run", tmp_path / "early")
+    process.send_signal(signal.SIGCONT)
+    wait_for_steps(process, tmp_path / "run", 40_000)
+    process.kill()
+    process.communicate()
+    assert check_killed_run(corridor, tmp_path / "run") > 1
+    check_killed_run(corridor, tmp_path / "early")
+
+
+@pytest.mark.soak
+def test_fifty_killed_runs_are_readable(corridor, tmp_path):
+    began = time.monotonic()
+    process = start(corridor[0], tmp_path / "timed")
+    process.communicate()
+    whole = time.monotonic() - began  # a busy machine takes longer
+    delays = whole * np.random.default_rng(0).uniform(0.1, 1.0, 50)
+    rows = []
+    for k, delay in enumerate(delays):
+        process = start(corridor[0], tmp_path / str(k))
+        try:
+            process.communicate(timeout=delay)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+        rows.append(check_killed_run(corridor, tmp_path / str(k)))
+    print("rows left by each kill:", rows)
+    assert sum(count > 1 for count in rows) > 10
