@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,6 +15,7 @@ from ratslam.alignment.paths import (
     BESIDE_SHARE,
     NEAR,
     Path,
+    counted_beside,
     keyframe_odds,
     less_where_dependent,
 )
@@ -78,9 +80,17 @@ def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() 
     np.testing.assert_array_equal(less_where_dependent(LOOP.ground, path), odds)
 
 
-def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyframe() -> None:
+@pytest.mark.parametrize("count", [counted_beside, less_where_dependent])
+def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyframe(count) -> None:
     lap = LOOP.ground.poses
     across = compose(lap[3:8], np.array([0.0, 0.0, np.pi / 2]))
     poses = np.concatenate([lap[:3], across, lap[8:11]])
-    counted = less_where_dependent(LOOP.ground, Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)))
+    counted = count(LOOP.ground, Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)))
     np.testing.assert_array_equal(counted, [-1.0] * 4 + [-BESIDE_SHARE] * 4 + [-1.0] * 3)
+
+
+def test_evidence_for_a_path_counts_beside_the_way_and_where_it_comes_again() -> None:
+    poses = np.tile(compose(LOOP.ground.poses[3], np.array([0.0, 0.0, np.pi / 2])), (2 * AGAIN, 1))
+    odds = np.full(len(poses), 0.5)
+    counted = counted_beside(LOOP.ground, Path(poses, np.zeros((len(poses), 3, 3)), odds))
+    np.testing.assert_array_equal(counted, odds)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from ratslam.cli import GROUPS, RETIRED, build_parser, main
+from ratslam.experiments.atlas.registry import ROWS
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = build_parser()
@@ -24,6 +25,13 @@ def test_the_help_fits_one_screen_and_lists_every_command() -> None:
     assert {parser.group for parser in COMMANDS.values()} == set(GROUPS)
     for name, parser in COMMANDS.items():
         assert any(f" {name} " in line and line.endswith(parser.help) for line in lines)
+
+
+def test_the_help_of_saved_maps_lists_every_row(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["reproduce", "maps", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert all(row in text for row in ROWS)
 
 
 def test_the_help_loads_no_numerics() -> None:
