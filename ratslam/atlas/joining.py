@@ -60,9 +60,8 @@ class Views(Protocol):
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
 
-    def odds(self, frames: np.ndarray, poses: np.ndarray, held: np.ndarray) -> GainOdds:
-        """The log-odds of gains on the ground of those of keyframes `frames` [N] at `poses` [N, 3] that are
-        not merged, `held` [N] bool."""
+    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
+        """The log-odds of gains on the ground of keyframes `frames` [N] at `poses` [N, 3]."""
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """The views of keyframes `frames` [n], moved by `motion` [n, 3] into each."""
@@ -87,13 +86,17 @@ class Join(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A placement beyond doubt: of keyframes `frames` [n] on `ground` of keyframes `onto` [N]. on: [n] bool,
-    those on it. motion: [3] brings them there."""
+    """A placement beyond doubt.
+
+    Attributes:
+        onto: [N] keyframes of the ground that are not merged. frames: [n] keyframes placed on it. ground: of
+            `onto` and all merged with these. on: [n] bool, those on the ground. motion: [3] brings them
+            there.
+    """
 
     onto: np.ndarray
     frames: np.ndarray
     ground: Ground
-    views: Comparison
     path: Path
     on: np.ndarray
     motion: np.ndarray
@@ -156,7 +159,7 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
         return None
     if max(found.on.mean(), back.on.mean()) < COMMON:
         return None
-    sequences = _closures(graph, found)
+    sequences = _closures(graph, views, found)
     start = compose(found.motion, graph.pose.rows[other[0]])
     trial, log = graph.copy(), map.log.copy()
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
@@ -186,17 +189,15 @@ def _covariance(graph: KeyframeGraph, log: ClosureLog) -> MapCovariance:
 
 
 def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
-    """The placement of keyframes `frames` [n] on those `onto` [N], if it is beyond doubt."""
+    """The placement of keyframes `frames` [n] on the ground of those `onto` [N] and of all merged with these,
+    if it is beyond doubt."""
     graph, archive = map.kept_keyframes(), map.archive
-    taken, pose = graph.taken.rows, graph.pose.rows
-    ground, own = views.ground(pose[onto]), pose[frames]
-    motion = between(own[np.maximum(np.arange(len(own)) - 1, 0)], own)
-    variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
-    motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
-    compared = views.compare(views.freeze(taken[onto], pose[onto]), taken[frames], motion)
-    every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else taken[onto]
-    odds = views.odds(every, archive.poses(pose)[every], np.isin(every, taken[onto]))
-    session = MapTraverse(compared, own, motions, HOPELESS)
+    own = graph.pose.rows[frames]
+    every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else graph.taken.rows[onto]
+    poses = archive.poses(graph.pose.rows)[every]
+    ground, odds = views.ground(poses), views.odds(every, poses)
+    motions = _motions(graph, own)
+    session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, HOPELESS)
     paths = [
         path._replace(odds=counted_beside(ground, path)) for path in find_placements(ground, odds, session)
     ]
@@ -210,7 +211,22 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
     moved = fit_rigid_motion(own[on], best.poses[on])
-    return _Found(onto, frames, ground, compared, best, on, moved, needed)
+    return _Found(onto, frames, ground, best, on, moved, needed)
+
+
+def _compare(
+    graph: KeyframeGraph, views: Views, ever: np.ndarray, poses: np.ndarray, frames: np.ndarray
+) -> Comparison:
+    """The views of keyframes `frames` [n] on those `ever` [M] taken, at `poses` [M, 3]."""
+    motion = np.array([moved.motion for moved in _motions(graph, graph.pose.rows[frames])])
+    return views.compare(views.freeze(ever, poses), graph.taken.rows[frames], motion)
+
+
+def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
+    """The motions into keyframes of a solved map at `poses` [n, 3]."""
+    motion = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
+    variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
+    return [Motion(*one) for one in zip(motion, variance, strict=True)]
 
 
 def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
@@ -227,17 +243,20 @@ def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
     return bool(far < 2 * found.ground.reach and turned < found.ground.reach_heading)
 
 
-def _closures(graph: KeyframeGraph, found: _Found) -> list[list[Candidate]]:
-    """Closure sequences along a placement."""
+def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Candidate]]:
+    """Closure sequences along a placement, with keyframes that are not merged."""
+    poses = graph.pose.rows[found.onto]
+    compared = _compare(graph, views, graph.taken.rows[found.onto], poses, found.frames)
+    ground = views.ground(poses)
     sequences: list[list[Candidate]] = []
     last = -graph.config.max_gap - 1
-    for k, match in closures_along(found.ground, found.views, found.path):
+    for k, match in closures_along(ground, compared, found.path):
         if not found.on[k]:
             continue
         if k - last > graph.config.max_gap:
             sequences.append([])
         frame, other = int(found.frames[k]), int(found.onto[match.frame])
-        turn = float(found.ground.turns[match.shift])
+        turn = float(ground.turns[match.shift])
         sequences[-1].append(_candidate(graph, frame, other, turn, match.gain))
         last = k
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]

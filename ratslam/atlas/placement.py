@@ -105,16 +105,6 @@ class Stretch(NamedTuple):
         return inside and bool(same_pose(ground, self.path.poses[row : row + 1], pose)[0])
 
 
-def motions_between(poses: np.ndarray, variance: np.ndarray) -> list[Motion]:
-    """[n] the motion into each keyframe of a solved map.
-
-    Args:
-        poses: [n, 3]. variance: [n, 3] of the motion into each.
-    """
-    steps = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
-    return [Motion(*one) for one in zip(steps, variance, strict=True)]
-
-
 def find_placements(ground: Ground, odds: GainOdds, session: Followed) -> list[Path]:
     """The different placements of a session that recall proposes and that are not hopeless, those with the
     largest log-odds first."""

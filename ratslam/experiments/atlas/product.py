@@ -58,16 +58,15 @@ def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
         InputError: the maps cannot be merged.
     """
     merged = merge_maps([made.path for made in maps], path)
-    own = {made.path: len(made.arrays.truth) for made in maps}
-    ends = np.cumsum(merged.steps).tolist()
-    end = {at.parent: last for at, last in zip(merged.maps, ends, strict=True)}
-    order = np.concatenate([np.arange(end[at] - count, end[at]) for at, count in own.items()])
+    begins = np.cumsum([0, *merged.steps[:-1]]).tolist()
+    begin = {at.parent: first for at, first in zip(merged.maps, begins, strict=True)}
+    order = np.concatenate([begin[made.path] + made.order for made in maps])
     session = read_map(path).open_session()
     truth = np.concatenate([made.arrays.truth for made in maps])
     whole = MapArrays.of_session(session, truth)
     arrays = whole._replace(trajectory=whole.trajectory[order], piece=whole.piece[order])
     np.savez(path / STEPS, **arrays._asdict())
-    return StoredMap(path, arrays)
+    return StoredMap(path, arrays, order)
 
 
 def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:

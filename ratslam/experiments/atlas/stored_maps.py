@@ -70,11 +70,13 @@ class StoredMap(NamedTuple):
     """A map on the disk.
 
     Attributes:
-        path: the folder of its map file. arrays: what is measured of it.
+        path: the folder of its map file. arrays: what is measured of it. order: [T] the step of the map that
+            each step of `arrays` is.
     """
 
     path: Path
     arrays: MapArrays
+    order: np.ndarray
 
 
 def store_map(recipe: Recipe, folder: Path) -> StoredMap:
@@ -88,7 +90,7 @@ def store_map(recipe: Recipe, folder: Path) -> StoredMap:
         _write_map(record(recipe), path)
     with np.load(path / STEPS) as saved:
         arrays = MapArrays(saved["trajectory"], saved["truth"], saved["piece"], int(saved["frames"]))
-    return StoredMap(path, arrays)
+    return StoredMap(path, arrays, np.arange(len(arrays.truth)))
 
 
 def _write_map(recorded: Recorded, path: Path) -> None:

@@ -53,13 +53,13 @@ def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
     """The second map at its true place in the first, without a common keyframe more."""
     one, other = maps
     arrays = _joined(one, other.arrays.truth, true_pose(one, other.arrays.truth), True)
-    return StoredMap(path, arrays)
+    return _stored(path, arrays)
 
 
 def keep_apart(maps: Sequence[StoredMap], path: Path) -> StoredMap:
     """Two pieces."""
     one, other = maps
-    return StoredMap(path, _joined(one, other.arrays.truth, other.arrays.trajectory, False))
+    return _stored(path, _joined(one, other.arrays.truth, other.arrays.trajectory, False))
 
 
 def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
@@ -67,6 +67,10 @@ def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
     simulation = recorded.config.simulation
     assert simulation is not None
     return true_pose(made, recorded.truth[[50]])[:, :2] if simulation.maze.added else np.zeros((0, 2))
+
+
+def _stored(path: Path, arrays: MapArrays) -> StoredMap:
+    return StoredMap(path, arrays, np.arange(len(arrays.truth)))
 
 
 def _joined(made: StoredMap, truth: np.ndarray, pose: np.ndarray, joined: bool) -> MapArrays:
