@@ -23,9 +23,8 @@ from ratslam.core.session import Session
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.estimate import START
 from ratslam.pipeline.map_results import write_merged_results
-from ratslam.pipeline.saved_map import NAME, SavedMap, digest_of, read_map, write_map
-from ratslam.pipeline.sensor import check_same_sensor
-from tactile.base.errors import InputError
+from ratslam.pipeline.merge_refusals import check_mergeable, keyframes_of
+from ratslam.pipeline.saved_map import NAME, SavedMap, read_map, write_map
 
 
 class MergeReport(NamedTuple):
@@ -100,7 +99,7 @@ def merge_maps(
         InputError: a map cannot be read or merged, or the output exists.
     """
     maps = sorted((read_map(path, report) for path in paths), key=lambda one: one.digest)
-    _check(maps)
+    check_mergeable(maps)
     session, made = _open(maps[0])
     backend = session.backend
     assert isinstance(backend, RecallBackend)
@@ -153,30 +152,7 @@ def _stretches(made: KeyframeMap) -> int:
 
 def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
     session = saved.open_session()
-    if not isinstance(session.map, KeyframeMap) or not session.map.kept_keyframes().count:
-        found = f"a map of `backend: {saved.config.backend}` without keyframes"
-        raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
-    return session, session.map
-
-
-def _check(maps: Sequence[SavedMap]) -> None:
-    """Raises `InputError` if maps cannot be merged."""
-    if len(maps) < 2:
-        raise InputError("merge", "one map", "two or more maps")
-    for saved in maps:
-        if saved.config.backend != "recall":
-            reason = "has no keyframes whose views could be compared"
-            found = f"a map of `backend: {saved.config.backend}`, which {reason}"
-            raise InputError(str(saved.path), found, "maps of `backend: recall`")
-        check_same_sensor(str(maps[0].path), maps[0].sensor, saved.sensor)
-    contents: dict[str, Path] = {}
-    for saved in maps:
-        content = digest_of(saved.arrays)
-        if content in contents:
-            raise InputError(
-                str(saved.path), f"the same map as {contents[content]}", "maps of other sessions"
-            )
-        contents[content] = saved.path
+    return session, keyframes_of(saved, session.map)
 
 
 def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
