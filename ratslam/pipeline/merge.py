@@ -24,6 +24,7 @@ from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.estimate import START
 from ratslam.pipeline.map_results import write_merged_results
 from ratslam.pipeline.merge_refusals import check_mergeable, keyframes_of
+from ratslam.pipeline.method_settings import differing_settings
 from ratslam.pipeline.saved_map import NAME, SavedMap, read_map, write_map
 
 
@@ -34,7 +35,8 @@ class MergeReport(NamedTuple):
         maps: the inputs in the order of their steps in the merged map. joins: what joined pieces, in order,
             with the numbers of the maps that had them. pieces: [n] for each piece of the merged map the
             numbers of the maps with steps in it. steps: [n] of each map. keyframes: not merged, of the merged
-            map. before: the same of all maps together.
+            map. before: the same of all maps together. settings: of the method, by name, that are not the
+            same in all maps, with the value in each; those of the first were taken.
     """
 
     maps: tuple[Path, ...]
@@ -43,6 +45,7 @@ class MergeReport(NamedTuple):
     steps: tuple[int, ...]
     keyframes: int
     before: int
+    settings: dict[str, list[Any]]
 
     def describe(self) -> str:
         """Which maps were joined where, and what stayed apart, as text."""
@@ -62,6 +65,11 @@ class MergeReport(NamedTuple):
         if len(pieces) > 1:
             lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
         lines.append(f"{self.keyframes} keyframes of {self.before}")
+        if self.settings:
+            lines.append(f"Made with different settings; the merged map has those of {self.maps[0]}:")
+        for name, (taken, *others) in self.settings.items():
+            values = (f"map {k}: {value}" for k, value in enumerate(others, 2) if value != taken)
+            lines.append(f"{name} {taken} ({', '.join(values)})")
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -83,6 +91,7 @@ class MergeReport(NamedTuple):
             "pieces": [list(piece) for piece in self.pieces],
             "keyframes": self.keyframes,
             "keyframes_before": self.before,
+            "settings": self.settings,
         }
 
 
@@ -126,6 +135,7 @@ def merge_maps(
         tuple(steps),
         made.kept_keyframes().count,
         before,
+        differing_settings([saved.config for saved in maps]),
     )
     _write(output, session, maps, found)
     return found

@@ -1,4 +1,5 @@
-"""Maps that hold the same session are not merged: continued, merged, cropped and corrected ones."""
+"""Maps that hold the same session are not merged: continued, merged, cropped and corrected ones. Settings
+that differ are told."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from ratslam.pipeline import merge as merging
 from ratslam.pipeline.map_care import crop_saved, undo_sequence
 from ratslam.pipeline.merge import merge_maps
 from ratslam.pipeline.merge_refusals import check_mergeable
-from ratslam.pipeline.saved_map import read_map
+from ratslam.pipeline.method_settings import differing_settings
+from ratslam.pipeline.saved_map import read_map, write_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from tests.ratslam.pipeline.test_map_formats import FILES
 
@@ -107,3 +109,32 @@ def test_of_two_sensors_both_maps_are_named(halves) -> None:
     )
     with pytest.raises(ratslam.InputError, match=words):
         check_mergeable([one, other])
+
+
+def test_settings_that_differ_are_told(halves, tmp_path: Path, monkeypatch) -> None:
+    """With the values of each map; the merged map has those that the report says."""
+    monkeypatch.setattr(merging, "join_all", lambda *_: [])
+    saved = read_map(halves[1])
+    keyframes = saved.config.keyframes.model_copy(update={"min_score": 77.0})
+    config = saved.config.model_copy(update={"keyframes": keyframes})
+    write_map(tmp_path / "two.npz", saved.open_session(), config, saved.source)
+    report = merge_maps([halves[0], tmp_path / "two.npz"], tmp_path / "both.npz")
+    ((name, values),) = report.settings.items()
+    assert (name, sorted(values)) == ("keyframes.min_score", [saved.config.keyframes.min_score, 77.0])
+    assert read_map(tmp_path / "both.npz").config.keyframes.min_score == values[0]
+    heading, line = report.describe().splitlines()[-2:]
+    assert str(report.maps[0]) in heading
+    assert line == f"keyframes.min_score {values[0]} (map 2: {values[1]})"
+    assert report.to_json()["settings"] == {name: values}
+    assert merge_maps(halves, tmp_path / "alike.npz").settings == {}
+
+
+def test_what_is_no_setting_of_the_method_may_differ() -> None:
+    config = read_map(WHOLE).config
+    session = config.session.model_copy(update={"seed": 5, "reserve": 64})
+    assert differing_settings([config, config.model_copy(update={"session": session, "cells": None})]) == {}
+    session = config.session.model_copy(update={"precision": "float32"})
+    other = config.model_copy(update={"session": session})
+    assert differing_settings([config, config, other]) == {
+        "session.precision": ["float64", "float64", "float32"]
+    }
