@@ -61,7 +61,7 @@ def _check_sessions(maps: Sequence[SavedMap]) -> None:
             whole = [len(known.first) == common.keyframes for known in (seen, again)]
             raise InputError(str(second.path), found, OTHERS, _cure(first.path, second, common, whole))
         if first.recording and first.recording == second.recording:
-            found = f"of the same recording ({first.source.name}) as {first.path}, with other settings"
+            found = f"its last session is of the same recording ({first.source.name}) as that of {first.path}"
             raise InputError(str(second.path), found, OTHERS, "leave one of them out")
 
 
