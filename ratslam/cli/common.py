@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,10 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C; the results up to then are on disk."""
 
 
+NEGATIVE = re.compile(r"-\.?\d")
+"""Beginning of an argument that is a value, such as -0.1,0.2, and no option (as in Python from 3.14 on)."""
+
+
 class CommandParser(argparse.ArgumentParser):
     """The parser of one command; a shell completes its arguments of type `Path` with file names.
 
@@ -31,6 +36,10 @@ class CommandParser(argparse.ArgumentParser):
     """
 
     group = help = ""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = NEGATIVE
 
     def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
         action = super().add_argument(*names, **options)

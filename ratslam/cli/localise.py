@@ -26,7 +26,8 @@ def add_commands(commands: Commands) -> None:
     localise.add_argument("map", type=Path, metavar="MAP", help="a run directory or its map.npz")
     localise.add_argument(
         "recording", type=Path, metavar="RECORDING",
-        help="configuration with the recording or simulation to localise, or a recording of the map's sensor",
+        help="configuration with the recording or simulation to localise, or a recording of the map's sensor "
+        "(the method and its settings are those of the map)",
     )  # fmt: skip
     add_set(localise)
     localise.add_argument(
@@ -58,9 +59,12 @@ def _localise(arguments: argparse.Namespace) -> int:
 
 def _read_recording(arguments: argparse.Namespace, saved: SavedMap) -> RunConfig:
     from ratslam.config.run_config import load_config
-    from ratslam.pipeline.localise import recorded_alike
+    from ratslam.pipeline.localise import check_assignments, recorded_alike
 
     file: Path = arguments.recording
     if file.suffix in CONFIGURATIONS and not file.is_dir():
-        return load_config(file, arguments.set)
-    return recorded_alike(file, saved, arguments.set)
+        config = load_config(file, arguments.set)
+    else:
+        config = recorded_alike(file, saved, arguments.set)
+    check_assignments(arguments.set, saved)
+    return config

@@ -43,9 +43,7 @@ def add_commands(commands: Commands) -> None:
     )
     _add_map(crop)
     part = crop.add_mutually_exclusive_group(required=True)
-    part.add_argument(
-        "--box", metavar="X0,Y0,X1,Y1", help="keyframes in this box, m; --box=-1,0,2,1 if X0 is negative"
-    )
+    part.add_argument("--box", metavar="X0,Y0,X1,Y1", help="keyframes in this box, m, such as -1,-0.5,2,1")
     part.add_argument(
         "--steps", metavar="A:B", help="keyframes of the steps A to B - 1, from 0; either may be left out"
     )
@@ -132,7 +130,7 @@ def read_box(text: str) -> tuple[float, float, float, float]:
         x0, y0, x1, y1 = (float(part) for part in text.split(","))
     except ValueError:
         raise InputError("--box", repr(text), "four numbers X0,Y0,X1,Y1, m") from None
-    if not (x0 < x1 and y0 < y1):
+    if not (x0 < x1 and y0 < y1):  # nor with NaN
         raise InputError("--box", repr(text), "X0 < X1 and Y0 < Y1, m")
     return x0, y0, x1, y1
 

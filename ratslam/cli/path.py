@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax
+from ratslam.cli.common import Commands, prepare_jax, require_new_file
 from tactile.base.errors import InputError
 
+if TYPE_CHECKING:
+    from ratslam.atlas.route import Way
+
+Place = tuple[float, float] | int
+"""A point x, y (m) or the number of an experience."""
 NO_WAY = 1
 """Exit code where no way joins start and goal."""
 
@@ -17,29 +24,31 @@ NO_WAY = 1
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     path = commands.add(
-        "path", _path, "find the way on a saved map", "path runs/maze --from here --to 0.5,0.2", "maps"
+        "path", _path, "find the way on a saved map", "path runs/maze --from here --to -0.5,0.2", "maps"
     )
     path.add_argument("map", type=Path, metavar="MAP", help="run directory, or its map.npz")
     path.add_argument(
         "--from", dest="start", default="here", metavar="X,Y|EXPERIENCE|here",
-        help="start: a point of the map, m, an experience, or the map's last pose (default)",
+        help="start: a point, m, such as -0.1,0.2, an experience, or the map's last pose (default)",
     )  # fmt: skip
     path.add_argument(
-        "--to",
-        dest="goal",
-        required=True,
-        metavar="X,Y|EXPERIENCE",
-        help="goal: a point, m, or an experience",
-    )
+        "--to", dest="goal", required=True, metavar="X,Y|EXPERIENCE",
+        help="goal: a point, m, such as -0.1,0.2, or an experience; the way ends at the first experience "
+        "within 0.02 m of it, at any heading",
+    )  # fmt: skip
     path.add_argument(
         "--mode", choices=("time", "temporal"), default="time",
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
-    path.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw the way")
+    path.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw the way to a new file")
     path.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _path(arguments: argparse.Namespace) -> int:
+    start = None if arguments.start == "here" else read_place(arguments.start, "--from")
+    goal = read_place(arguments.goal, "--to")
+    if arguments.output is not None:
+        _require_new_picture(arguments.output)
     prepare_jax()
     from ratslam.atlas.route import NoWay
     from ratslam.pipeline.map_way import draw_map_way, find_map_way
@@ -47,32 +56,54 @@ def _path(arguments: argparse.Namespace) -> int:
 
     saved = read_map(arguments.map, lambda line: print(f"ratslam: {line}", file=sys.stderr))
     made = saved.open_session().map
-    start = None if arguments.start == "here" else _place(arguments.start, "--from")
     try:
-        way = find_map_way(made, saved, start, _place(arguments.goal, "--to"), arguments.mode)
+        way = find_map_way(made, saved, start, goal, arguments.mode)
     except NoWay as error:
         print(f"ratslam: no way: {error}", file=sys.stderr)
         return NO_WAY
     if arguments.output is not None:
         draw_map_way(arguments.output, made, saved, way)
     content = way._asdict() | {"poses": way.poses.tolist()}
-    if arguments.json:
-        print(json.dumps(content))
-        return 0
-    places = way.experiences
-    print(
-        f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
-    )
-    print(f"expected {way.expected:.0f} s by the number of traversals of each link")
+    print(json.dumps(content) if arguments.json else render_way(way, goal))
     return 0
 
 
-def _place(text: str, where: str) -> tuple[float, float] | int:
-    """A point x, y (m) or the number of an experience."""
+def render_way(way: Way, goal: Place) -> str:
+    """A way to a goal as text."""
+    places = way.experiences
+    lines = [
+        f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
+    ]
+    if not isinstance(goal, int):
+        apart = math.dist(way.poses[-1][:2], goal)
+        lines.append(f"ends {apart:.2f} m from {goal[0]:g},{goal[1]:g}")
+    elif places[-1] != goal:
+        lines.append(f"ends at {places[-1]}, which is so near to {goal} that it counts as the same place")
+    lines.append(
+        f"expected {way.expected:.0f} s, as a link may be blocked: one driven n times before is counted as "
+        "free with probability (n + 1) / (n + 2)"
+    )
+    return "\n".join(lines)
+
+
+def read_place(text: str, where: str) -> Place:
+    """The place of a text.
+
+    Raises:
+        InputError: it is not a place.
+    """
     try:
         if "," not in text:
             return int(text)
         x, y = map(float, text.split(","))
+        if math.isfinite(x) and math.isfinite(y):
+            return x, y
     except ValueError:
-        raise InputError(where, repr(text), "X,Y in m, or the number of an experience") from None
-    return x, y
+        pass
+    raise InputError(where, repr(text), "X,Y in m (finite numbers), or the number of an experience")
+
+
+def _require_new_picture(path: Path) -> None:
+    if path.suffix.lower() != ".png":
+        raise InputError(f"-o {path}", "not the name of a picture", "a new file that ends in .png")
+    require_new_file(path)

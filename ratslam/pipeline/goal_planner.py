@@ -117,7 +117,7 @@ def experience_at(
         farthest: largest distance of x, y from it, m. where: of the goal, for errors.
 
     Raises:
-        InputError: there is no such experience, or none that near.
+        InputError: there is no such experience, none that near, or x or y is not finite.
     """
     if isinstance(goal, int):
         if goal not in graph:
@@ -125,6 +125,8 @@ def experience_at(
             raise InputError(where, f"experience {goal}", f"a number from 0 to {last}")
         return goal
     place = np.array(goal[:2], float)
+    if not np.isfinite(place).all():
+        raise InputError(where, f"({place[0]:g}, {place[1]:g})", "finite numbers x, y, m")
     found = nearest_experience(graph, place, farthest)
     if found is not None:
         return found

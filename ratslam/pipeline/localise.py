@@ -30,6 +30,8 @@ NOT_LOCALISED = {
     **dict.fromkeys(LOCALISING.values(), "which is a session in another map, and no map of its own"),
 }
 """Why nothing can be localised in the maps of a method."""
+OWN = (*SourceConfig.model_fields, "score", "cells")
+"""Sections that a session has of its own in a saved map."""
 
 
 class LocalisationSummary(NamedTuple):
@@ -80,11 +82,33 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
             found = f"{found}, {reason}"
         cure = "map the place again with `backend: recall`, or by whiskers with `backend: grid`"
         raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
-    own = {name: getattr(config, name) for name in (*SourceConfig.model_fields, "score", "cells")}
+    own = {name: getattr(config, name) for name in OWN}
     place = config.localise.model_copy(update={"map": saved.path.resolve()})
     return saved.config.model_copy(
         update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
     )
+
+
+def check_assignments(assignments: Sequence[str], saved: SavedMap) -> None:
+    """Refuses settings that a session in a saved map cannot have of its own (`localising`).
+
+    Args:
+        assignments: each `a.b=value`, with names of settings.
+
+    Raises:
+        InputError: a setting would have no effect.
+    """
+    for assignment in assignments:
+        name = assignment.partition("=")[0]
+        section = name.partition(".")[0]
+        if name == "localise.map":
+            found = f"the map is {saved.path}, as given before the recording"
+        elif section in (*OWN, "localise", "include"):
+            continue
+        else:
+            found = f"without effect: {section} is as {saved.path} was made"
+        expected = f"settings of {', '.join(OWN)} or localise"
+        raise InputError(f"--set {name}", found, expected, "leave it out, or map the place anew with it")
 
 
 def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ()) -> RunConfig:

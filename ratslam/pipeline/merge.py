@@ -23,9 +23,9 @@ from ratslam.core.session import Session
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.estimate import START
 from ratslam.pipeline.map_results import write_merged_results
-from ratslam.pipeline.saved_map import NAME, SavedMap, digest_of, read_map, write_map
-from ratslam.pipeline.sensor import check_same_sensor
-from tactile.base.errors import InputError
+from ratslam.pipeline.merge_refusals import check_mergeable, keyframes_of
+from ratslam.pipeline.method_settings import differing_settings
+from ratslam.pipeline.saved_map import NAME, SavedMap, read_map, write_map
 
 
 class MergeReport(NamedTuple):
@@ -35,7 +35,8 @@ class MergeReport(NamedTuple):
         maps: the inputs in the order of their steps in the merged map. joins: what joined pieces, in order,
             with the numbers of the maps that had them. pieces: [n] for each piece of the merged map the
             numbers of the maps with steps in it. steps: [n] of each map. keyframes: not merged, of the merged
-            map. before: the same of all maps together.
+            map. before: the same of all maps together. settings: of the method, by name, that are not the
+            same in all maps, with the value in each; those of the first were taken.
     """
 
     maps: tuple[Path, ...]
@@ -44,6 +45,7 @@ class MergeReport(NamedTuple):
     steps: tuple[int, ...]
     keyframes: int
     before: int
+    settings: dict[str, list[Any]]
 
     def describe(self) -> str:
         """Which maps were joined where, and what stayed apart, as text."""
@@ -63,6 +65,11 @@ class MergeReport(NamedTuple):
         if len(pieces) > 1:
             lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
         lines.append(f"{self.keyframes} keyframes of {self.before}")
+        if self.settings:
+            lines.append(f"Made with different settings; the merged map has those of {self.maps[0]}:")
+        for name, (taken, *others) in self.settings.items():
+            values = (f"map {k}: {value}" for k, value in enumerate(others, 2) if value != taken)
+            lines.append(f"{name} {taken} ({', '.join(values)})")
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -84,6 +91,7 @@ class MergeReport(NamedTuple):
             "pieces": [list(piece) for piece in self.pieces],
             "keyframes": self.keyframes,
             "keyframes_before": self.before,
+            "settings": self.settings,
         }
 
 
@@ -100,7 +108,7 @@ def merge_maps(
         InputError: a map cannot be read or merged, or the output exists.
     """
     maps = sorted((read_map(path, report) for path in paths), key=lambda one: one.digest)
-    _check(maps)
+    check_mergeable(maps)
     session, made = _open(maps[0])
     backend = session.backend
     assert isinstance(backend, RecallBackend)
@@ -127,6 +135,7 @@ def merge_maps(
         tuple(steps),
         made.kept_keyframes().count,
         before,
+        differing_settings([saved.config for saved in maps]),
     )
     _write(output, session, maps, found)
     return found
@@ -153,30 +162,7 @@ def _stretches(made: KeyframeMap) -> int:
 
 def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
     session = saved.open_session()
-    if not isinstance(session.map, KeyframeMap) or not session.map.kept_keyframes().count:
-        found = f"a map of `backend: {saved.config.backend}` without keyframes"
-        raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
-    return session, session.map
-
-
-def _check(maps: Sequence[SavedMap]) -> None:
-    """Raises `InputError` if maps cannot be merged."""
-    if len(maps) < 2:
-        raise InputError("merge", "one map", "two or more maps")
-    for saved in maps:
-        if saved.config.backend != "recall":
-            reason = "has no keyframes whose views could be compared"
-            found = f"a map of `backend: {saved.config.backend}`, which {reason}"
-            raise InputError(str(saved.path), found, "maps of `backend: recall`")
-        check_same_sensor(str(maps[0].path), maps[0].sensor, saved.sensor)
-    contents: dict[str, Path] = {}
-    for saved in maps:
-        content = digest_of(saved.arrays)
-        if content in contents:
-            raise InputError(
-                str(saved.path), f"the same map as {contents[content]}", "maps of other sessions"
-            )
-        contents[content] = saved.path
+    return session, keyframes_of(saved, session.map)
 
 
 def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:

@@ -81,19 +81,28 @@ def sensor_of(config: RunConfig, source: Source) -> Sensor:
 
 
 def disagreement(of_map: Sensor, other: Sensor) -> str:
-    """The first way in which another sensor differs from that of a map, as a clause; '' if they agree.
+    """The first way in which another sensor differs from that of a map, as a clause; '' if they agree."""
+    found = first_difference(of_map, other)
+    if found is None:
+        return ""
+    what, ours, others = found
+    return f"{what} is {others} and was {ours} when the map was made"
+
+
+def first_difference(one: Sensor, other: Sensor) -> tuple[str, Any, Any] | None:
+    """What differs first between two sensors, and its values; None if they agree.
 
     Settings that only one of them knows do not count.
     """
     for name in ("kind", "view_shape", "whiskers", "unit", "cell"):
-        ours, others = getattr(of_map, name), getattr(other, name)
+        ours, others = getattr(one, name), getattr(other, name)
         if ours != others:
-            return f"{WORDS[name]} is {others} and was {ours} when the map was made"
-    known = of_map.geometry | of_map.transform
+            return WORDS[name], ours, others
+    known = one.geometry | one.transform
     for key, value in (other.geometry | other.transform).items():
         if known.get(key, value) != value:
-            return f"{key} is {value} and was {known[key]} when the map was made"
-    return ""
+            return key, known[key], value
+    return None
 
 
 def check_same_sensor(where: str, of_map: Sensor, other: Sensor) -> None:

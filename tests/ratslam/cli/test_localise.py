@@ -13,6 +13,8 @@ import pytest
 import ratslam
 from ratslam.backends.localise import LOG_ODDS
 from ratslam.cli import main
+from ratslam.pipeline.localise import check_assignments
+from ratslam.pipeline.saved_map import read_map
 from tests.ratslam.pipeline.test_saved_map import rewritten
 
 ROOT = Path(__file__).parents[3]
@@ -150,3 +152,26 @@ def test_a_run_directory_without_a_map_is_refused(
 def test_a_configuration_without_a_map_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     error = refused(capsys, tmp_path / "run", "run", str(SQUARE), "--set", "backend=localise")
     assert "localise.map: missing; expected the file of a map" in error
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("backend=grid", "--set backend: without effect: backend is as "),
+        ("keyframes.min_score=9", "--set keyframes.min_score: without effect: keyframes is as "),
+        ("session.precision=float32", "--set session.precision: without effect: session is as "),
+        ("localise.map=other", "--set localise.map: the map is "),
+    ],
+)
+def test_settings_that_follow_from_the_map_are_refused(
+    setting: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = refused(capsys, tmp_path / "run", "localise", str(TOUCH), str(SQUARE), "--set", setting)
+    assert words in error
+    assert str(TOUCH) in error
+    assert "leave it out" in error
+
+
+def test_settings_of_the_session_are_its_own() -> None:
+    own = ["recording.limits.speed=3", "score.relations=null", "localise.log_odds=3", "touch.image.smooth=1"]
+    check_assignments(own, read_map(TOUCH))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -45,12 +46,12 @@ something beside the output."""
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A map, and the second half of it."""
+    """The halves of a map."""
     folder = tmp_path_factory.mktemp("maps")
-    whole, half = folder / "whole.npz", folder / "half.npz"
-    whole.write_bytes(FILES[-1].read_bytes())
-    crop_saved(read_map(whole), lambda made: keyframes_of_steps(made, 180, 360), half)
-    return [whole, half]
+    halves = [folder / "first.npz", folder / "second.npz"]
+    for begin, half in zip((0, 180), halves, strict=True):
+        crop_saved(read_map(FILES[-1]), partial(keyframes_of_steps, first=begin, last=begin + 180), half)
+    return halves
 
 
 def is_killed(moment: int, output: Path, maps: list[Path]) -> bool:
@@ -71,7 +72,7 @@ def check_kill(moment: int, output: Path, maps: list[Path]) -> bool:
         assert all(path.name.startswith(".") for path in output.parent.iterdir())
     else:
         assert list(output.parent.iterdir()) == [output]
-        assert read_map(output).steps == 540
+        assert read_map(output).steps == 360
     return killed
 
 
@@ -88,7 +89,7 @@ def test_a_killed_merge_leaves_the_maps_and_no_half_map(
     assert left
     monkeypatch.setattr(merging, "join_all", lambda *_: [])
     merge_maps(maps, output)
-    assert read_map(output).steps == 540
+    assert read_map(output).steps == 360
     assert {path.name for path in output.parent.iterdir()} == left | {name}
 
 
