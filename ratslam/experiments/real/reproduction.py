@@ -20,7 +20,7 @@ UNPROVEN = """\
 - No whisker of these recordings is known to be bent for good, and no touch recording is longer than a minute:
   hours of drift are made of the drift of that one reach.
 - The Create is one drive of nine minutes in one room.
-- No session was driven live: arm, head and Create ran as emulators.
+- No live session ran on real hardware: arm, head and Create were emulators.
 """
 
 
