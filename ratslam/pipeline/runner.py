@@ -291,10 +291,12 @@ def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> 
     saved = read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     saved.restore(session)
-    same = bool(source.digest) and saved.recording == source.digest
-    if not same and isinstance(session.map, KeyframeMap):
-        session.begin_piece()  # the robot may have been carried since
-    return session.steps if same else 0, saved.estimate
+    samples = saved.samples_of(source.digest)
+    if samples is None:
+        session.begin_recording()
+        if isinstance(session.map, KeyframeMap):
+            session.begin_piece()  # the robot may have been carried since
+    return samples or 0, saved.estimate
 
 
 def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:
