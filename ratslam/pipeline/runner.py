@@ -290,7 +290,7 @@ def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> 
     """Restores a map; returns how many samples of the source it has already processed, and its estimate."""
     saved = read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
-    saved.restore(session)
+    saved.restore(session, config)
     samples = saved.samples_of(source.digest)
     if samples is None:
         session.begin_recording()

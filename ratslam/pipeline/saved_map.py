@@ -26,6 +26,7 @@ from ratslam.core.checkpoint import with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.pipeline.map_settings import check_same_method, check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
 from robot.sources.description import SourceDescription, describe
@@ -109,22 +110,28 @@ class SavedMap:
             InputError: the arrays do not fit the configuration.
         """
         session = build_session(self.config, self.source)
-        self.restore(session)
+        self.restore(session, self.config)
         return session
 
-    def restore(self, session: Session) -> None:
+    def restore(self, session: Session, config: RunConfig) -> None:
         """Replaces the state and the map of a session by those saved.
 
+        Args:
+            config: of the session, completed.
+
         Raises:
-            InputError: the session has another configuration or view shape, or the arrays are incomplete.
+            InputError: the session has another method, other settings that the arrays do not fit, which are
+                named, or another view shape; or the arrays are incomplete.
         """
         cure = "continue with the configuration and the sensor of the map"
+        check_same_method(str(self.path), self.config, config)
         try:
             session.restore(dict(self.arrays))
             found = _mismatch(self.arrays, session.arrays())
         except SPOILT as error:
             found = f"without {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         if found:
+            check_same_settings(str(self.path), self.config, config)
             expected = "a map made with this configuration"
             raise InputError(str(self.path), found, expected, cure) from None
 

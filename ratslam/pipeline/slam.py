@@ -149,7 +149,7 @@ class Slam:
             slam.session.warm(slam._blank)
             return slam
         slam._build(saved.config, saved.source)
-        saved.restore(slam.session)
+        saved.restore(slam.session, saved.config)
         slam.estimate = saved.estimate
         if slam._frontend is not None and saved.frontend:
             try:

@@ -171,4 +171,4 @@ def test_arrays_that_do_not_fit_are_refused(
 ) -> None:
     saved = read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes))
     with pytest.raises(InputError, match=message):
-        saved.restore(session)
+        saved.restore(session, saved.config)

@@ -113,7 +113,8 @@ KINDS = (
 def refusal(path: Path) -> str:
     """The error of opening a map; '' if it opens."""
     try:
-        read_map(path).restore(session())
+        saved = read_map(path)
+        saved.restore(session(), saved.config)
     except InputError as error:
         return str(error)
     return ""
