@@ -26,7 +26,7 @@ from ratslam.core.checkpoint import with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
-from ratslam.pipeline.map_settings import check_same_method, check_same_settings
+from ratslam.pipeline.map_settings import check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
 from robot.sources.description import SourceDescription, describe
@@ -117,14 +117,13 @@ class SavedMap:
         """Replaces the state and the map of a session by those saved.
 
         Args:
-            config: of the session, completed.
+            config: of the session, completed; of the map's method.
 
         Raises:
-            InputError: the session has another method, other settings that the arrays do not fit, which are
-                named, or another view shape; or the arrays are incomplete.
+            InputError: the session has other settings that the arrays do not fit, which are named, or another
+                view shape; or the arrays are incomplete.
         """
         cure = "continue with the configuration and the sensor of the map"
-        check_same_method(str(self.path), self.config, config)
         try:
             session.restore(dict(self.arrays))
             found = _mismatch(self.arrays, session.arrays())

@@ -15,9 +15,10 @@ import ratslam.pipeline.runner
 from ratslam.config.run_config import LoopConfig
 from ratslam.core.session import Session
 from ratslam.pipeline.build_session import build_session
+from ratslam.pipeline.continuation import resume_session
 from ratslam.pipeline.run import process_source
 from ratslam.pipeline.runner import open_runner
-from ratslam.pipeline.saved_map import SavedMap, digest_of, read_map
+from ratslam.pipeline.saved_map import SavedMap, describe_readings, digest_of, read_map, write_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.in_memory import InMemorySource
 from robot.sources.source import Sample
@@ -162,3 +163,25 @@ def test_a_map_in_the_first_format_that_does_not_tell_its_samples_is_refused(
     with pytest.raises(InputError, match=message):
         run(second(), tmp_path / "refused", old)
     assert run(part("wednesday", slice(160, 170)), tmp_path / "other", old).samples_of("wednesday") == 10
+
+
+@pytest.mark.parametrize("recording", ["tuesday", ""])
+def test_another_recording_cannot_go_on_in_a_map_of_one_piece(recording: str, tmp_path: Path) -> None:
+    config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
+    session, source = build_session(config, first()), describe_readings(first())
+    write_map(tmp_path / "map.npz", session, config, source, recording="monday")
+    assert resume_session(session, tmp_path, config, first())[0] == 0
+    message = (
+        rf"map\.npz: a map of `backend: classic`, which is one piece; {recording or 'loop'} is not the "
+        "recording that was mapped last.*expected that recording, which goes on.*by itself, or map both with"
+    )
+    other = replace(second(), name=recording or "loop", digest=recording)
+    with pytest.raises(InputError, match=message):
+        resume_session(session, tmp_path, config, other)
+    assert session.steps == session.earlier == 0
+
+
+def test_another_method_is_refused_before_its_pieces(monday: Path, tmp_path: Path) -> None:
+    config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
+    with pytest.raises(InputError, match=r"backend is classic and was recall.*`--set backend=recall`"):
+        resume_session(build_session(config, first()), monday, config, second())
