@@ -13,6 +13,8 @@ from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import align, position_errors
 from tactile.base.se2 import compose
 
+FAR = 2.0
+"""Distance of a jump that no correction within a piece makes, in diagonals of the box of dead reckoning."""
 GAP = 0.1
 """Distance between two pieces in a picture, as a share of the width of the first one."""
 
@@ -62,6 +64,20 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
         nodes[of_node == one] = compose(moved, nodes[of_node == one])
         right = final[steps, 0].max() + GAP * np.ptp(final[:, 0][run.piece == run.piece[0]])
     return run._replace(final=final, online=online, nodes=nodes)
+
+
+def tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:
+    """The step at which online poses jump farther than a correction within a piece could move them, and how
+    far, m; None without one. A piece lies far from all others until it is tied to them.
+
+    Args:
+        poses: [T, 3] online, each in the map of its time. odometry: [T, 3] dead reckoning.
+    """
+    if len(poses) < 2:
+        return None
+    moved = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    step, reach = int(moved.argmax()) + 1, np.hypot(*np.ptp(odometry[:, :2], axis=0))
+    return (step, float(moved.max())) if moved.max() > FAR * reach > 0 else None
 
 
 def unjoined_share(piece: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from evaluation.metrics.energy_metric import (
 )
 from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
-from evaluation.metrics.map_pieces import ate_within_pieces, energy_within_pieces, unjoined_share
+from evaluation.metrics.map_pieces import ate_within_pieces, energy_within_pieces, tie_jump, unjoined_share
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import ate, online_errors, position_error, rpe, summarize_errors
@@ -128,16 +128,26 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
     raw_now = summarize_errors(online_errors(odometry, truth))
     known, step = len(run.online_error) > 0, rpe(final, truth)
     now = summarize_errors(run.online_error if known else online_errors(online, truth))
-    note = "in the map of that time" if known else "of the online poses"
+    note, tied = "in the map of that time" if known else "of the online poses", _tie_note(run)
+    unfinished = np.array_equal(run.final, run.online)
     return {
-        "ate_final": Finding(ate(final, truth), raw_ate),
-        "ate_online": Finding(ate(online, truth), raw_ate),
+        "ate_final": Finding(ate(final, truth), raw_ate, tied if unfinished else ""),
+        "ate_online": Finding(ate(online, truth), raw_ate, tied),
         "anytime_median": Finding(now.median, raw_now.median, note),
         "anytime_late": Finding(now.late, raw_now.late, note),
         "anytime_jump": Finding(now.jump, raw_now.jump, note),
         "rpe_translation": Finding(step.translation, raw_rpe.translation),
         "rpe_rotation_deg": Finding(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
     }
+
+
+def _tie_note(run: RunArrays) -> str:
+    """A remark on errors of online poses that were in a piece of their own at first; '' for others."""
+    jump = tie_jump(run.online, run.odometry)
+    if jump is None:
+        return ""
+    step, distance = jump
+    return f"with a jump of {distance:.1f} m at t = {run.time[step]:.1f} s, as where a new piece is tied"
 
 
 def piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:

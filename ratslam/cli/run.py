@@ -19,7 +19,8 @@ def add_commands(commands: Commands) -> None:
     run.add_argument(
         "--continue", dest="resume", type=Path, metavar="MAP",
         help="map to continue: a run directory, or a map file (.npz). The same recording goes on after the "
-        "last sample mapped; another begins a separate piece, joined once its views place it in the map",
+        "last sample mapped; another begins a separate piece, joined once its views place it in the map, and "
+        "is refused in maps of methods other than `backend: recall`, which are one piece",
     )  # fmt: skip
     run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)

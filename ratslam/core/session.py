@@ -27,6 +27,8 @@ from tactile.base.types import Observation
 
 CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
+UNKNOWN = -1
+"""`Session.earlier` of a checkpoint that does not tell it."""
 
 
 class Probe(NamedTuple):
@@ -79,6 +81,10 @@ class Session:
         probe: looks at the state after the steps, for `Step.probed` and `Step.seldom`; the results are the
             same with and without it, and without it nothing else is computed.
 
+    Attributes:
+        map: of the steps. state: of the kernel. steps: number of observations in the map. earlier: how many
+            of these came before the present recording (`begin_recording`), or `UNKNOWN`.
+
     Raises:
         ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
     """
@@ -105,7 +111,7 @@ class Session:
     def restart(self, seed: int = 0) -> None:
         """Goes back to the start with an empty map; the compiled functions are kept."""
         self.map: Map = self.backend.new_map()
-        self.steps = 0
+        self.steps = self.earlier = 0
         self._capacity = capacity_at(0, self.reserve)
         self.state = self._init(jax.random.key(seed), self._capacity)
 
@@ -132,6 +138,10 @@ class Session:
         state = self.backend.begin_piece(self.state)
         self.state = self.backend.apply_map_feedback(state, self.map.feedback())
 
+    def begin_recording(self) -> None:
+        """Counts the next step as the first of a recording: all steps so far are of earlier ones."""
+        self.earlier = self.steps
+
     def warm(self, observation: Observation) -> None:
         """Compiles for observations like this one; results of later steps do not change."""
         self._layout = self._layout or layout_of(observation)
@@ -146,6 +156,7 @@ class Session:
             | {f"map/{name}": value for name, value in self.map.arrays().items()}
             | {
                 "steps": np.array(self.steps),
+                "earlier": np.array(self.earlier),
                 "reserve": np.array(self.reserve),
                 "capacity": np.array(self._capacity),
             }
@@ -168,9 +179,10 @@ class Session:
         self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
         self.map.restore(with_prefix(arrays, "map/"))
         self.steps, self.reserve, self._capacity = steps, reserve, capacity
+        self.earlier = int(arrays["earlier"])
 
     def change_rows(self, rows: int, steps: int, change: Callable[[State], State]) -> None:
-        """Follows a map that was changed as a whole.
+        """Follows a map that was changed as a whole; its steps count as those of earlier recordings.
 
         Args:
             rows: of the memory thereafter. steps: in the map. change: makes the new state of one with
@@ -178,6 +190,7 @@ class Session:
         """
         self._hold(rows)
         self.state, self.steps = change(self.state), steps
+        self.begin_recording()
 
     def compilations(self) -> int:
         """Number of compilations of the chunk function: one per capacity."""

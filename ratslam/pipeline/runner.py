@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,7 +24,6 @@ from ratslam.config.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.core.types import Action
-from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.artifacts import (
     WhiskerView,
     save_closure_views,
@@ -35,6 +33,7 @@ from ratslam.pipeline.artifacts import (
 )
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.cell_recorder import open_cell_recorder
+from ratslam.pipeline.continuation import resume_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.map_results import score_and_plot, write_map_results
@@ -205,7 +204,7 @@ def open_runner(
     build_metrics(config.score.metrics)
     check_finished_map(config, source)
     session = session or build_session(config, source)
-    skip, estimate = _resume(session, resume, config, source) if resume else (0, START)
+    skip, estimate = resume_session(session, resume, config, source) if resume else (0, START)
     if source.length is not None and source.length <= skip:
         found = f"already holds all {skip} samples of {source.name}"
         raise InputError(str(resume), found, "that of an unfinished run")
@@ -284,17 +283,6 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
     if config.backend in LOCALISING.values() and config.localise.map is not None:
         saved = read_map(config.localise.map)
         check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
-
-
-def _resume(session: Session, path: Path, config: RunConfig, source: Source) -> tuple[int, PoseEstimate]:
-    """Restores a map; returns how many samples of the source it has already processed, and its estimate."""
-    saved = read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
-    check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
-    saved.restore(session)
-    same = bool(source.digest) and saved.recording == source.digest
-    if not same and isinstance(session.map, KeyframeMap):
-        session.begin_piece()  # the robot may have been carried since
-    return session.steps if same else 0, saved.estimate
 
 
 def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:

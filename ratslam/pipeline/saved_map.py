@@ -23,9 +23,10 @@ from ratslam.backends.registry import BACKENDS
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
 from ratslam.core.checkpoint import with_prefix
-from ratslam.core.session import Session
+from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.pipeline.map_settings import check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
 from robot.sources.description import SourceDescription, describe
@@ -34,8 +35,10 @@ from robot.touch_source import TouchSource, open_touch_source
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.errors import InputError
 
-FORMAT = "ratslam-map-1"
+FORMAT = "ratslam-map-2"
 """Name and version of the format; a later version reads it."""
+FORMATS = ("ratslam-map-1", FORMAT)
+"""The formats that are read; the first does not tell `Session.earlier`."""
 NAME = "map.npz"
 """The map file of a run directory."""
 EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
@@ -79,6 +82,22 @@ class SavedMap:
         """Number of observations in the map."""
         return int(self.arrays["steps"])
 
+    def samples_of(self, recording: str) -> int | None:
+        """Number of samples of a recording, by its sha256, that are in the map; None if it is not the one
+        mapped last, or has no sha256.
+
+        Raises:
+            InputError: the file is of an earlier version that does not tell.
+        """
+        if not recording or recording != self.recording:
+            return None
+        earlier = int(self.arrays["earlier"])
+        if earlier == UNKNOWN:
+            found = f"{self.steps} steps of several recordings, and not how many are of the last one"
+            cure = "continue the map that this one went on from, or map the recording anew"
+            raise InputError(str(self.path), found, f"a file of the format {FORMAT}", cure)
+        return self.steps - earlier
+
     @property
     def sensor(self) -> Sensor:
         """The sensor that the map was made with."""
@@ -91,14 +110,18 @@ class SavedMap:
             InputError: the arrays do not fit the configuration.
         """
         session = build_session(self.config, self.source)
-        self.restore(session)
+        self.restore(session, self.config)
         return session
 
-    def restore(self, session: Session) -> None:
+    def restore(self, session: Session, config: RunConfig) -> None:
         """Replaces the state and the map of a session by those saved.
 
+        Args:
+            config: of the session, completed; of the map's method.
+
         Raises:
-            InputError: the session has another configuration or view shape, or the arrays are incomplete.
+            InputError: the session has other settings that the arrays do not fit, which are named, or another
+                view shape; or the arrays are incomplete.
         """
         cure = "continue with the configuration and the sensor of the map"
         try:
@@ -107,6 +130,7 @@ class SavedMap:
         except SPOILT as error:
             found = f"without {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         if found:
+            check_same_settings(str(self.path), self.config, config)
             expected = "a map made with this configuration"
             raise InputError(str(self.path), found, expected, cure) from None
 
@@ -134,6 +158,8 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     if digest_of(arrays) != texts["sha256"]:
         found = "damaged: the content does not match its sha256"
         raise InputError(str(file), found, "the file as it was written", "restore it from a copy")
+    if texts["format"] != FORMAT:
+        arrays["earlier"] = _earlier_steps(arrays)
     return _saved_map(file, arrays, texts)
 
 
@@ -192,12 +218,14 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
     try:
         source = SourceDescription.from_json(texts["source"])
         estimate = read_estimate(with_prefix(arrays, ESTIMATE))
-        steps = int(arrays["steps"])
+        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
     except SPOILT as error:
         missing = f"without {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(str(file), missing, EXPECTED) from None
     if steps < 0:
         raise InputError(str(file), f"{steps} steps", EXPECTED)
+    if not UNKNOWN <= earlier <= steps:
+        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
     return SavedMap(
@@ -226,11 +254,20 @@ def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], 
             source = describe_readings(observed)
     recording = str(arrays.pop("digest", ""))
     texts = {"format": FORMAT, "config": dump(config), "source": source.to_json(), "recording": recording}
+    arrays["earlier"] = _earlier_steps(arrays)
     arrays |= {name: np.array(value) for name, value in texts.items()}
     digest = digest_of(arrays)
     if report is not None:
         report(f"{file}: of an earlier version; read as {FORMAT}")
     return _saved_map(file, arrays, texts | {"sha256": digest})
+
+
+def _earlier_steps(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """`Session.earlier` of a file that does not hold it: 0, or unknown if a recording began a further piece
+    of the map."""
+    names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
+    begun = any(np.any(arrays[name]) for name in names if name in arrays)
+    return np.array(UNKNOWN if begun else 0)
 
 
 def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:
@@ -279,10 +316,10 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
 
 
 def _check_format(file: Path, array: np.ndarray) -> None:
-    if array.shape or array.dtype.kind != "U" or str(array) != FORMAT:
+    if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
         found = repr(str(array)[:40]) if not array.shape else "numbers"
         cure = "update ratslam if a newer version wrote it"
-        raise InputError(str(file), f"the map format {found}", FORMAT, cure)
+        raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
 
 
 def _text(file: Path, arrays: Mapping[str, np.ndarray], name: str) -> str:

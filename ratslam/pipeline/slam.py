@@ -118,7 +118,8 @@ class Slam:
         return self.map.trajectory() if self.steps else np.zeros((0, 3))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the map (`ratslam.pipeline.saved_map`), with which a run continues too.
+        """Writes the map (`ratslam.pipeline.saved_map`), with which a run continues too, as with
+        another recording (`ratslam.pipeline.continuation`).
 
         Args:
             path: of the file; its folder is made, and an older file is replaced.
@@ -149,7 +150,7 @@ class Slam:
             slam.session.warm(slam._blank)
             return slam
         slam._build(saved.config, saved.source)
-        saved.restore(slam.session)
+        saved.restore(slam.session, saved.config)
         slam.estimate = saved.estimate
         if slam._frontend is not None and saved.frontend:
             try:

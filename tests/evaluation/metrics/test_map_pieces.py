@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.metrics.energy_metric import energy, energy_all_pairs
-from evaluation.metrics.map_pieces import energy_within_pieces, unjoined_share
-from tactile.base.se2 import compose
+from evaluation.metrics.map_pieces import energy_within_pieces, tie_jump, unjoined_share
+from tactile.base.se2 import compose, integrate
 
 law = settings(derandomize=True, deadline=None, max_examples=60)
 
@@ -69,3 +69,30 @@ def test_without_steps_nothing_is_defined():
     none = np.zeros((0, 3))
     assert np.isnan(unjoined_share(np.zeros(0, int)))
     assert energy_within_pieces(none, none, np.zeros(0, int)).pairs == 0
+
+
+def walked(seed: int, steps: int = 80) -> np.ndarray:
+    """[steps, 3] a walk of steps of up to 0.1 m."""
+    rng = np.random.default_rng(seed)
+    motion = np.column_stack([rng.uniform(0, 0.1, steps), np.zeros(steps), rng.normal(0, 0.3, steps)])
+    return integrate(motion)
+
+
+@given(seed=st.integers(0, 99), at=st.integers(1, 79), apart=st.floats(50, 1000))
+def test_a_piece_that_is_tied_jumps(seed, at, apart):
+    odometry = walked(seed)
+    online = odometry.copy()
+    online[:at, 0] += apart
+    step, distance = tie_jump(online, odometry)
+    assert step == at
+    assert distance == pytest.approx(apart, abs=0.1)
+
+
+@given(seed=st.integers(0, 99), at=st.integers(1, 79), share=st.floats(0, 1))
+def test_a_correction_within_a_piece_is_no_tie(seed, at, share):
+    """It moves a pose by the drift at most, which is not more than dead reckoning went."""
+    odometry = walked(seed)
+    online = odometry.copy()
+    online[at:, :2] -= share * odometry[at, :2]
+    assert tie_jump(online, odometry) is None
+    assert tie_jump(odometry[:at], odometry[:at]) is None

@@ -48,6 +48,20 @@ def test_the_score_of_pieces_does_not_depend_on_where_they_lie(circle, parted):
     assert card["energy_all"].odometry == score_run(circle).quantities["energy_all"].odometry
 
 
+def test_a_piece_that_was_tied_is_remarked_beside_errors_of_online_poses(circle):
+    tied = len(circle.time) // 3
+    online = circle.online.copy()
+    online[:tied] = compose(AWAY, online[:tied])
+    note = f"m at t = {circle.time[tied]:.1f} s, as where a new piece is tied"
+    card = score_run(circle._replace(online=online)).quantities
+    assert card["ate_online"].value > 1
+    assert card["ate_online"].note.endswith(note)
+    assert card["ate_final"] == score_run(circle).quantities["ate_final"]
+    killed = score_run(circle._replace(online=online, final=online)).quantities
+    assert killed["ate_final"].note.endswith(note)
+    assert score_run(circle).quantities["ate_online"].note == ""
+
+
 def test_each_piece_is_aligned_by_itself(circle, parted):
     noise = np.random.default_rng(0).normal(0, 0.01, circle.final.shape)
     final, piece = compose(parted.final, noise), parted.piece

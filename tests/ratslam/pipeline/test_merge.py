@@ -91,13 +91,14 @@ def test_the_order_of_arguments_does_not_matter(maps: dict[str, Path], joined: P
 def test_a_merged_map_goes_on_as_any_other(joined: Path) -> None:
     readings = walk_of(1, 31001).readings[:40]
     session = empty_session()
-    read_map(joined).restore(session)
+    saved = read_map(joined)
+    saved.restore(session, saved.config)
     before = session.steps
     session.begin_piece()
     live = [session.step(reading).pose for reading in readings]
     assert len(session.map.trajectory()) == session.steps == before + len(readings)
     again = empty_session()
-    read_map(joined).restore(again)
+    saved.restore(again, saved.config)
     again.begin_piece()
     assert np.array_equal(live, [step.pose for step in again.replay(readings)])
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from ratslam.core.session import Session
-from ratslam.pipeline.saved_map import digest_of, read_map
+from ratslam.pipeline.saved_map import FORMAT, digest_of, read_map
 from tactile.base.errors import InputError
 
-FILE = Path(__file__).parents[2] / "data" / "maps" / "ratslam-map-1.npz"
+FILE = Path(__file__).parents[2] / "data" / "maps" / f"{FORMAT}.npz"
 FEW, MANY = 24, 200
 
 
@@ -87,7 +87,7 @@ def of_other_shape(stream: np.random.Generator) -> bytes:
 
 
 def of_other_version(stream: np.random.Generator) -> bytes:
-    name = f"ratslam-map-{stream.integers(2, 99)}" if stream.random() < 0.5 else "\0" * 9
+    name = f"ratslam-map-{stream.integers(3, 99)}" if stream.random() < 0.5 else "\0" * 9
     return signed(content()[1] | {"format": np.array(name)})
 
 
@@ -113,7 +113,8 @@ KINDS = (
 def refusal(path: Path) -> str:
     """The error of opening a map; '' if it opens."""
     try:
-        read_map(path).restore(session())
+        saved = read_map(path)
+        saved.restore(session(), saved.config)
     except InputError as error:
         return str(error)
     return ""

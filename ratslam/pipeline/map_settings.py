@@ -1,0 +1,67 @@
+"""The settings that a map depends on, and what differs in those of a session that is to go on from it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from typing import Any
+
+from ratslam.backends.registry import BACKENDS, LOCALISING
+from ratslam.config.run_config import RunConfig
+from tactile.base.errors import InputError
+
+
+def check_same_method(where: str, of_map: RunConfig, other: RunConfig) -> None:
+    """Raises `InputError` if a session with another method is to go on from a map.
+
+    Args:
+        where: the map, for the error.
+    """
+    if of_map.backend != other.backend:
+        raise _error(where, {"backend": (of_map.backend, other.backend)}, _method_cure(of_map))
+
+
+def check_same_settings(where: str, of_map: RunConfig, other: RunConfig) -> None:
+    """The same with other settings of the method or another precision; all that differ are named. Both are
+    completed.
+    """
+    pair = _settings(of_map), _settings(other)
+    names = dict.fromkeys([*pair[0], *pair[1]])
+    values = {name: (pair[0].get(name), pair[1].get(name)) for name in names}
+    different = {name: both for name, both in values.items() if both[0] != both[1]}
+    if different:
+        assigned = (shlex.quote(f"{name}={_text(both[0])}") for name, both in different.items())
+        cure = " ".join(f"--set {assignment}" for assignment in assigned)
+        raise _error(where, different, f"`{cure}` takes those of the map")
+
+
+def _method_cure(of_map: RunConfig) -> str:
+    if of_map.backend in LOCALISING.values():
+        return f"continue the map in which that session was localised, {of_map.localise.map}"
+    return f"`--set backend={of_map.backend}` takes that of the map"
+
+
+def _error(where: str, different: dict[str, tuple[Any, Any]], cure: str) -> InputError:
+    pairs = [f"{name} is {_text(ours)} and was {_text(was)}" for name, (was, ours) in different.items()]
+    found = f"made with other settings: {', '.join(pairs)} when the map was made"
+    return InputError(where, found, "a map made with this configuration", cure)
+
+
+def _settings(config: RunConfig) -> dict[str, Any]:
+    """What a method's state and map depend on, by dotted names as in a configuration."""
+    builtin = config.backend in BACKENDS.builtin
+    kind = BACKENDS.get(config.backend, "backend").config_class
+    names = list(kind.model_fields) if builtin else ["backend_settings"]
+    plain = config.model_dump(mode="json", include={*names})
+    precision = {"session.precision": config.session.precision}
+    return {key: value for name in names for key, value in _flat(name, plain[name])} | precision
+
+
+def _flat(name: str, value: Any) -> list[tuple[str, Any]]:
+    if not isinstance(value, dict) or not value:
+        return [(name, value)]
+    return [pair for key, inner in value.items() for pair in _flat(f"{name}.{key}", inner)]
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
