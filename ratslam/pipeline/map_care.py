@@ -17,8 +17,9 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.map_results import rewrite_results
-from ratslam.pipeline.saved_map import NAME, SavedMap, write_map
+from ratslam.pipeline.folder_change import change_folder, finish_change, unfinished_change
+from ratslam.pipeline.map_results import holds_results, rewrite_results
+from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.pipeline.sensor import disagreement
 from tactile.base.errors import InputError
 
@@ -115,14 +116,14 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
 
 def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
     """Removes the closures of a sequence from a map, solves it without them, and writes it. If it replaces
-    the map of a run directory, the files there that follow from the map are written anew.
+    the map of a run directory, the files there that follow from the map are written anew: all, or none.
 
     Returns:
         whether they were.
 
     Raises:
-        InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, or the map
-            has no closure sequences.
+        InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, the map
+            has no closure sequences, or a file of the run directory is missing or malformed.
     """
     session, made = _keyframe_session(saved, "undo")
     try:
@@ -130,12 +131,38 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
     except ValueError as error:
         cure = f"`ratslam map info {saved.path} --json` lists them"
         raise InputError(str(saved.path), str(error), "an accepted sequence", cure) from None
-    write_map(
-        output, session, saved.config, saved.source,
-        recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
-    )  # fmt: skip
-    replaced = output == saved.path and output.name == NAME
-    return replaced and rewrite_results(output.parent, made, saved.config.score)
+
+    def write(file: Path) -> None:
+        write_map(
+            file, session, saved.config, saved.source,
+            recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
+        )  # fmt: skip
+
+    folder = output.parent
+    if output != saved.path or output.name != NAME or not holds_results(folder):
+        write(output)
+        return False
+
+    def change(shown: Path) -> None:
+        write(shown / NAME)
+        rewrite_results(shown, made, saved.config.score)
+
+    change_folder(folder, str(sequence), NAME, change)
+    return True
+
+
+def finish_undo(path: Path) -> int | None:
+    """Puts the files of an undo in their places that was killed when all of them were made.
+
+    Args:
+        path: of the map. Returns: the sequence that was undone, None if nothing was to be done.
+    """
+    folder = map_file(path).parent
+    sequence = unfinished_change(folder)
+    if sequence is None:
+        return None
+    finish_change(folder)
+    return int(sequence)
 
 
 def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:

@@ -26,6 +26,7 @@ from ratslam.core.checkpoint import with_prefix
 from ratslam.core.session import Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.pipeline.folder_change import unfinished_change
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
 from robot.sources.description import SourceDescription, describe
@@ -120,13 +121,18 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     """The map in a run directory or a map file.
 
     Args:
-        report: called with one sentence if the file is of an earlier format and was converted.
+        report: called with one sentence if the file is of an earlier format and was converted, or if a change
+            of its folder was cut off.
 
     Raises:
         InputError: there is none; it is broken, incomplete, of an unknown format, or made by a backend that
             is not registered.
     """
     file = map_file(path)
+    undone = unfinished_change(file.parent)
+    if undone is not None and report is not None:
+        cure = f"repeat `ratslam map undo {path} {undone}` to complete it"
+        report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
     arrays = _read_arrays(file)
     if "format" not in arrays:
         return _convert(file, arrays, report)
