@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ratslam.pipeline.map_results import holds_results, rewrite_results
 from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.pipeline.sensor import disagreement
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file, require_writable
 
 Choose = Callable[[KeyframeMap], np.ndarray]
 """Chooses the keyframes of a map that remain: [E] bool."""
@@ -139,7 +141,10 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
         )  # fmt: skip
 
     folder = output.parent
-    if output != saved.path or output.name != NAME or not holds_results(folder):
+    if output != saved.path:
+        make_new_file(output, write)
+        return False
+    if output.name != NAME or not holds_results(folder):
         write(output)
         return False
 
@@ -149,6 +154,25 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
 
     change_folder(folder, str(sequence), NAME, change)
     return True
+
+
+def replaced_file(path: Path) -> Path:
+    """The file that an undo of a map replaces, which a link may name.
+
+    Raises:
+        InputError: it is read-only, its folder cannot be written in, or it is that of another folder.
+    """
+    file, cure = map_file(path), "or write a new map with -o"
+    if file.is_symlink():
+        if path.is_dir():
+            found = f"a link to {file.resolve()}, whose folder has files of its own"
+            raise InputError(str(file), found, "a map in its run directory", f"undo it there, {cure}")
+        file = file.resolve()
+    if file.exists():
+        if not file.stat().st_mode & 0o222 or not os.access(file, os.W_OK):
+            raise InputError(str(file), "read-only", "a map that may be changed", f"`chmod u+w` it, {cure}")
+        require_writable(file)
+    return file
 
 
 def finish_undo(path: Path) -> int | None:
@@ -185,7 +209,11 @@ def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
     if cropped.elsewhere:
         session.begin_piece()
     estimate = saved.estimate._replace(place=-1)  # places are numbered anew
-    write_map(output, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
+
+    def write(file: Path) -> None:
+        write_map(file, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
+
+    make_new_file(output, write)
     return steps
 
 
