@@ -68,7 +68,7 @@ def unfinished_change(folder: Path) -> str | None:
     """The name of a complete change that was killed before all its files were in place; None without one."""
     try:
         return json.loads((folder / READY / RECORD).read_text(encoding="utf-8"))["what"]
-    except FileNotFoundError:
+    except OSError:  # no record, or no folder that can be read
         return None
 
 

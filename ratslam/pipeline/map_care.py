@@ -18,6 +18,7 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.keyframes.map_solution import Obstacle
 from ratslam.pipeline.folder_change import change_folder, finish_change, unfinished_change
 from ratslam.pipeline.map_results import holds_results, rewrite_results
 from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
@@ -25,6 +26,13 @@ from ratslam.pipeline.sensor import disagreement
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file, require_writable
 
+CURES = {
+    Obstacle.NOT_ACCEPTED: "`ratslam map info {path} --json` lists them",
+    Obstacle.MERGED: "if it is wrong, cut one of its passes out with `ratslam map crop --steps`, or map the "
+    "recordings again with `--set keyframes.merge_stood=0`",
+    Obstacle.ONLY_LINK: "if it is wrong, cut one of the sides out with `ratslam map crop --steps`",
+}
+"""What can be done instead of an undo, by why it cannot be made."""
 Choose = Callable[[KeyframeMap], np.ndarray]
 """Chooses the keyframes of a map that remain: [E] bool."""
 
@@ -78,7 +86,8 @@ def _verdicts(made: KeyframeMap) -> np.ndarray:
 
 
 def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
-    """The accepted closure sequences: number, first and last step, the steps matched, evidence."""
+    """The accepted closure sequences: number, first and last step, the steps matched, evidence, and whether
+    it can be undone."""
     log, step = made.solution().log, made.keyframe_steps()
     found = []
     for number in np.flatnonzero(_verdicts(made) == Verdict.ACCEPTED).tolist():
@@ -89,6 +98,7 @@ def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
                 "steps": step[members[[0, -1], 0]].tolist(),
                 "match_steps": step[members[[0, -1], 1]].tolist(),
                 "evidence": round(log.score(number), 2),
+                "can_be_undone": made.solution().obstacle(number, made.log) is None,
             }
         )
     return found
@@ -128,11 +138,12 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
             has no closure sequences, or a file of the run directory is missing or malformed.
     """
     session, made = _keyframe_session(saved, "undo")
-    try:
-        made.undo(sequence)
-    except ValueError as error:
-        cure = f"`ratslam map info {saved.path} --json` lists them"
-        raise InputError(str(saved.path), str(error), "an accepted sequence", cure) from None
+    obstacle = made.solution().obstacle(sequence, made.log)
+    if obstacle is not None:
+        expected = "an accepted sequence that can be undone"
+        cure = CURES[obstacle].format(path=saved.path)
+        raise InputError(str(saved.path), f"sequence {sequence} {obstacle}", expected, cure)
+    made.undo(sequence)
 
     def write(file: Path) -> None:
         write_map(

@@ -7,6 +7,7 @@ configuration, the description of the readings, and a sha256 over all of it.
 from __future__ import annotations
 
 import hashlib
+import stat
 import struct
 import tokenize
 import zipfile
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.backends.registry import BACKENDS
+from ratslam.backends.registry import BACKENDS, LOCALISING
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
 from ratslam.core.checkpoint import with_prefix
@@ -44,6 +45,8 @@ TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND = "estimate/", "frontend/"
+ARCHIVE = b"PK"
+"""Beginning of every map file, by which a damaged one is told from another file."""
 MOST_BYTES = 8 << 30
 """Largest size of all arrays of a map file."""
 SPOILT = (
@@ -109,12 +112,28 @@ class SavedMap:
             found = f"without {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         if found:
             expected = "a map made with this configuration"
+            if self.config.backend in LOCALISING.values():
+                place = self.config.localise.map
+                expected = f"{place} as it was when this session was localised in it"
+                cure = "restore that map from a copy, or localise the recording again"
             raise InputError(str(self.path), found, expected, cure) from None
 
 
 def map_file(path: Path) -> Path:
     """The map file of a run directory, or the file itself."""
     return path / NAME if path.is_dir() else path
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path is a map by the names in its file."""
+    file = map_file(path)
+    try:
+        if not file.is_file():
+            return False
+        with zipfile.ZipFile(file) as archive:
+            return {"steps.npy", "config.npy"} <= set(archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMap:
@@ -131,7 +150,7 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     file = map_file(path)
     undone = unfinished_change(file.parent)
     if undone is not None and report is not None:
-        cure = f"repeat `ratslam map undo {path} {undone}` to complete it"
+        cure = f"repeat `ratslam map undo {file.parent} {undone}` to complete it"
         report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
     arrays = _read_arrays(file)
     if "format" not in arrays:
@@ -255,6 +274,7 @@ def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray
 
 def _read_arrays(file: Path) -> dict[str, np.ndarray]:
     """All arrays of a file that is a map by the names in it and by its size."""
+    begin = _begin(file)
     try:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
@@ -269,11 +289,29 @@ def _read_arrays(file: Path) -> dict[str, np.ndarray]:
             return {name: _array(archive, info) for name, info in members.items()}
     except InputError:
         raise
-    except FileNotFoundError:
-        raise InputError(str(file), "no such file", EXPECTED) from None
     except SPOILT as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(str(file), f"not a map ({reason})", EXPECTED) from None
+        spoilt = f"damaged, or not a map ({reason})" if begin == ARCHIVE else "not a map"
+        found = spoilt if begin else "empty, so not a map"
+        raise InputError(str(file), found, EXPECTED, "restore it from a copy if it was one") from None
+
+
+def _begin(file: Path) -> bytes:
+    """The first bytes of a file.
+
+    Raises:
+        InputError: there is none, it is not a plain file, or it cannot be read.
+    """
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise InputError(str(file), "neither a file nor a folder", EXPECTED)
+        with file.open("rb") as opened:
+            return opened.read(len(ARCHIVE))
+    except FileNotFoundError:
+        raise InputError(str(file), "no such file", EXPECTED) from None
+    except OSError as error:
+        found = f"cannot be read ({error.strerror})"
+        raise InputError(str(file), found, EXPECTED, "check the path and its permissions") from None
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
