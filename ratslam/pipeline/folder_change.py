@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import mkdtemp
 
-from tactile.base.atomic_write import flush_to_disk, write_text_atomically
-from tactile.base.errors import InputError
+from tactile.base.atomic_write import errors_of, flush_to_disk, write_text_atomically
+from tactile.base.errors import InputError, InputErrors
 
 READY = ".change"
 """Folder of a complete change within the folder that it changes."""
@@ -38,30 +38,26 @@ def change_folder(folder: Path, what: str, last: str, change: Callable[[Path], N
         InputError: another process changes the folder, or an error of `change`, which names `folder`.
     """
     folder = folder.resolve()
-    with _alone(folder):
-        making = Path(mkdtemp(dir=folder, prefix=MAKING))
+    with _alone(folder), _workplace(folder) as making:
+        shown = making / FILES / folder.name
+        shown.mkdir(parents=True)
+        before = [file for file in folder.iterdir() if not file.name.startswith(".")]
+        for file in before:
+            (shown / file.name).symlink_to(file)
+        with _errors_of(folder, shown):
+            change(shown)
+        removed = [file.name for file in before if not os.path.lexists(shown / file.name)]
+        _keep_new(shown)
+        record = {"what": what, "removed": removed, "last": last}
+        write_text_atomically(making / RECORD, json.dumps(record) + "\n")
+        flush_to_disk(making / RECORD)
         try:
-            shown = making / FILES / folder.name
-            shown.mkdir(parents=True)
-            before = [file for file in folder.iterdir() if not file.name.startswith(".")]
-            for file in before:
-                (shown / file.name).symlink_to(file)
-            with _errors_of(folder, shown):
-                change(shown)
-            removed = [file.name for file in before if not os.path.lexists(shown / file.name)]
-            _keep_new(shown)
-            write_text_atomically(
-                making / RECORD, json.dumps({"what": what, "removed": removed, "last": last}) + "\n"
-            )
-            flush_to_disk(making / RECORD)
             making.rename(folder / READY)
             _put_in_place(folder)
         except KeyboardInterrupt:
             if unfinished_change(folder) is None:
                 raise
             _put_in_place(folder)  # takes no time, and half of it would be neither the old nor the new
-        finally:
-            shutil.rmtree(making, ignore_errors=True)
 
 
 def unfinished_change(folder: Path) -> str | None:
@@ -81,16 +77,27 @@ def finish_change(folder: Path) -> None:
 
 
 def _put_in_place(folder: Path) -> None:
-    """May be repeated after it was stopped anywhere."""
+    """May be repeated after it was stopped anywhere.
+
+    Raises:
+        InputError: a file cannot be put in place.
+    """
     ready = folder / READY
     record = json.loads((ready / RECORD).read_text(encoding="utf-8"))
-    for name in record["removed"]:
-        (folder / name).unlink(missing_ok=True)
     new = sorted((ready / FILES).glob("*/*"), key=lambda file: (file.name == record["last"], file.name))
-    for file in new:
-        file.replace(folder / file.name)
-    done = folder / f"{MAKING}{os.getpid()}"  # without a record of half of the folder, if removal is stopped
-    ready.rename(done)
+    try:
+        for name in record["removed"]:
+            (folder / name).unlink(missing_ok=True)
+        for file in new:
+            file.replace(folder / file.name)
+        done = (
+            folder / f"{MAKING}{os.getpid()}"
+        )  # so that a removal that is stopped leaves no half of a change
+        ready.rename(done)
+    except OSError as error:
+        found = f"its new files are complete, but cannot be put in place ({error.strerror})"
+        cure = "repeat the command to complete it"
+        raise InputError(str(folder), found, "a folder whose files can be replaced", cure) from error
     shutil.rmtree(done, ignore_errors=True)
 
 
@@ -104,10 +111,26 @@ def _keep_new(shown: Path) -> None:
 
 
 @contextmanager
+def _workplace(folder: Path) -> Iterator[Path]:
+    """A hidden folder in which the change is made; errors of it name the folder."""
+    try:
+        making = Path(mkdtemp(dir=folder, prefix=MAKING))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+    try:
+        with errors_of(folder, making):
+            yield making
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
+
+
+@contextmanager
 def _errors_of(folder: Path, shown: Path) -> Iterator[None]:
     """Names the files of `folder` in errors instead of those that show them."""
     try:
         yield
+    except InputErrors:
+        raise
     except InputError as error:
         where, found = (text.replace(str(shown), str(folder)) for text in (error.where, error.found))
         raise InputError(where, found, error.expected, error.cure) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from ratslam.cli import main
 from ratslam.pipeline import folder_change
 from ratslam.pipeline.map_care import map_info, undo_sequence
 from ratslam.pipeline.saved_map import read_map
+from tactile.base.errors import InputError
 from tests.helpers.square_run import copy_square_run
 
 MAKE = """
@@ -74,6 +76,41 @@ def test_a_change_that_is_killed_at_any_moment_is_none_or_can_be_completed(tmp_p
     assert seen(folder) == NEW
     assert list(folder.glob(".*")) == []
     assert completed.count(True) >= 4
+
+
+def test_a_folder_whose_files_cannot_be_replaced_asks_for_a_repeat(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "a").write_text("old")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "hidden")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", refuse)
+        with pytest.raises(
+            InputError, match=r"put in place \(Permission denied\).*repeat the command"
+        ) as caught:
+            folder_change.change_folder(
+                tmp_path, "change", "a", lambda shown: os.replace(_written(shown / "b"), shown / "a")
+            )
+    assert str(caught.value).startswith(f"{tmp_path}: ")
+    assert seen(tmp_path) == {"a": "old"}
+    folder_change.finish_change(tmp_path)
+    assert seen(tmp_path) == {"a": "new"}
+
+
+def test_two_changes_of_a_folder_at_once_are_refused(tmp_path: Path) -> None:
+    def change(shown: Path) -> None:
+        with pytest.raises(InputError, match="another process changes this folder"):
+            folder_change.change_folder(tmp_path, "second", "a", lambda _: None)
+        _written(shown / "a")
+
+    folder_change.change_folder(tmp_path, "first", "a", change)
+    assert seen(tmp_path) == {"a": "new"}
+
+
+def _written(path: Path) -> Path:
+    path.write_text("new")
+    return path
 
 
 @pytest.fixture
