@@ -17,14 +17,14 @@ FinishedMap = TypeVar("FinishedMap", bound=Map)
 
 
 def map_file(config: LocaliseConfig) -> Path:
-    """The file of the map.
+    """The file of the map, also of one that is named by its run directory.
 
     Raises:
         InputError: the configuration names none.
     """
     if config.map is None:
         raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
-    return config.map
+    return config.map / "map.npz" if config.map.is_dir() else config.map
 
 
 def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
@@ -36,6 +36,10 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
     Raises:
         InputError: the file cannot be read, was made with other settings, or holds a map without a step.
     """
+    if not path.is_file():
+        found = "neither a file nor a folder" if path.exists() else "no such file"
+        cure = "put it back, or set localise.map to where it is"
+        raise InputError(str(path), found, "the map in which the session is localised", cure)
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}

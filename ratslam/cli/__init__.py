@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import sys
+from contextlib import suppress
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
 from ratslam.cli import (
@@ -24,6 +26,7 @@ from ratslam.cli import (
     tools,
 )
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
+from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError
 
 MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
@@ -48,25 +51,39 @@ def main(argv: list[str] | None = None) -> int:
         return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     try:
-        return arguments.command(arguments)
+        code = arguments.command(arguments)
+        sys.stdout.flush()
+        return code
     except InputError as error:
         print("\n".join(f"ratslam: error: {line}" for line in str(error).splitlines()), file=sys.stderr)
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        cure = (
-            "free some space or choose another folder with -o"
-            if full
-            else "check the path and its permissions"
-        )
-        print(
-            f"ratslam: error: {where}{error.strerror or error}; files written so far are complete; {cure}",
-            file=sys.stderr,
-        )
+        print(f"ratslam: error: {_describe(error)}", file=sys.stderr)
+        if _is_of_printing(error):
+            _leave_output()
     except KeyboardInterrupt:
         print("ratslam: interrupted", file=sys.stderr)
         return INTERRUPTED
     return INPUT_ERROR
+
+
+def _describe(error: OSError) -> str:
+    """The file, what is wrong with it, and what to do."""
+    where = "the output: " if _is_of_printing(error) else f"{error.filename}: " if error.filename else ""
+    full = "free some space or choose another folder with -o"
+    cure = full if error.errno in FULL else "check the path and its permissions"
+    cures = [] if error.errno == errno.EPIPE else [cure]
+    return where + "; ".join([error.strerror or str(error), *getattr(error, "__notes__", ()), *cures])
+
+
+def _is_of_printing(error: OSError) -> bool:
+    """Whether nothing could be printed: all files are named in their errors."""
+    return error.filename is None and error.errno in (errno.EPIPE, *FULL)
+
+
+def _leave_output() -> None:
+    """What was not printed stays so: without this, Python would try again at the end, and say so."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Program(argparse.ArgumentParser):

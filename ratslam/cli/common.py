@@ -13,7 +13,7 @@ import shtab
 
 from ratslam.config.packaged import packaged_configs
 from ratslam.core.xla_flags import add_xla_flags
-from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file as require_new_file
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -113,18 +113,6 @@ def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: st
     """Adds an option for a positive integer; the default 0 stands for the number of cores."""
     help = f"{help} (default {default or 'the number of cores'})"
     parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
-
-
-def require_new_file(path: Path) -> None:
-    """Checks, before anything is measured, that a file can be made.
-
-    Raises:
-        InputError: it exists already, or its folder does not.
-    """
-    if path.exists():
-        raise InputError(str(path), "exists already", "a new file", "choose another with -o")
-    if not path.parent.is_dir():
-        raise InputError(str(path.parent), "no such folder", "an existing folder", "make it first")
 
 
 def positive_integer(text: str) -> int:

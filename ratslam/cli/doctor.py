@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
-from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file
 
 if TYPE_CHECKING:
     from ratslam.doctor.diagnosis import Diagnosis
@@ -65,7 +65,8 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
         return diagnosis
     require_new_file(output)
     first = f"# Reads {arguments.path}; written by `python -m ratslam doctor`.\n"
-    write_text_atomically(output, first + dump_data(diagnosis.config))
+    text = first + dump_data(diagnosis.config)
+    make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
 
 

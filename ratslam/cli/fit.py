@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
-from tactile.base.atomic_write import write_text_atomically
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -46,7 +46,8 @@ def _fit(arguments: argparse.Namespace) -> int:
     if not rig.quantities and not rig.settings:
         raise InputError(str(arguments.record), "nothing that tells of the rig", "true poses or whiskers")
     if output is not None:
-        write_text_atomically(output, rig_file(rig, str(arguments.record)))
+        text = rig_file(rig, str(arguments.record))
+        make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
         print(f"{output}: written")
     return 0
 

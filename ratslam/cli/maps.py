@@ -87,12 +87,21 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 
 def _undo(arguments: argparse.Namespace) -> int:
-    if arguments.output:
-        require_new_file(arguments.output)
-    saved = _read(arguments.map)
-    from ratslam.pipeline.map_care import undo_sequence
+    output: Path | None = arguments.output
+    if output is not None:
+        require_new_file(output)
+    prepare_jax()
+    from ratslam.pipeline.map_care import finish_undo, replaced_file, undo_sequence
 
-    output = arguments.output or saved.path
+    if output is None:
+        output = arguments.map = replaced_file(arguments.map)
+        finished = finish_undo(output)
+        if finished is not None:
+            folder = output.parent
+            print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
+        if finished == arguments.sequence:
+            return 0
+    saved = _read(arguments.map)
     rewritten = undo_sequence(saved, arguments.sequence, output)
     print(f"{output}: the map without sequence {arguments.sequence}")
     if rewritten:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from ratslam.export.run_files import ExportedRun, read_exported_run
 from ratslam.pose_graph.io import read_json
 from ratslam.rats.spikes import SpikeConfig, write_spikes
 from robot.recordings.mcap_writer import existing_error
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file, new_folder, require_new_file
 
 Warn = Callable[[str], None]
 PARTED = "the map is in several pieces, whose poses cannot be compared"
@@ -51,10 +50,7 @@ def export_run(
         raise InputError(str(output), f"an unknown suffix {output.suffix!r}", FORMATS)
     if not directory.is_dir():
         raise InputError(str(directory), "no such folder", "a run directory")
-    if output.exists():
-        raise existing_error(output)
-    if not output.absolute().parent.is_dir():
-        raise InputError(str(output.parent), "no such folder", "a folder for the new file")
+    require_new_file(output)
     if suffix in CELL_WRITERS:
         CELL_WRITERS[suffix](directory, output, spikes or SpikeConfig())
     else:
@@ -71,18 +67,14 @@ def _read_run(directory: Path, warn: Warn) -> ExportedRun:
 def _write_mcap(directory: Path, output: Path, warn: Warn) -> None:
     ros = RosMessages()
     exported = _read_run(directory, warn)
-    write_atomically(output, lambda path: write_mcap(path, exported, ros))
+    make_new_file(output, lambda path: write_mcap(path, exported, ros))
 
 
 def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
     ros = RosMessages()
     exported = _read_run(directory, warn)
-    parent = output.absolute().parent
-    with tempfile.TemporaryDirectory(prefix=".", dir=parent) as folder:
-        bag = Path(folder) / output.name
-        bag.mkdir()
-        write_bag(bag, output.name, exported, ros)
-        bag.rename(output)
+    with new_folder(output) as folder:
+        write_bag(folder, output.name, exported, ros)
 
 
 def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
@@ -94,7 +86,7 @@ def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
         if beside.exists():
             raise existing_error(beside)
         warn(f"{PARTED}; {beside} says which of them each pose is in")
-        write_atomically(beside, lambda path: shutil.copyfile(pieces, path))
+        make_new_file(beside, lambda path: shutil.copyfile(pieces, path))
     _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
 
 
@@ -110,7 +102,7 @@ def _write_graphml(directory: Path, output: Path, warn: Warn) -> None:
     import networkx  # slow to import
 
     graph = read_json(_file(directory / "map.json", "a map of experiences"))
-    write_atomically(output, lambda path: networkx.write_graphml_xml(graph, path))
+    make_new_file(output, lambda path: networkx.write_graphml_xml(graph, path))
 
 
 def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
@@ -124,16 +116,17 @@ def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
 
 def _write_nwb(directory: Path, output: Path, config: SpikeConfig) -> None:
     cells = read_run_cells(directory, config)
-    write_atomically(output, lambda path: write_nwb(path, *cells))
+    make_new_file(output, lambda path: write_nwb(path, *cells))
 
 
 def _write_spikes(directory: Path, output: Path, config: SpikeConfig) -> None:
     cells = read_run_cells(directory, config)
-    write_atomically(output, lambda path: write_spikes(path, cells.spikes))
+    make_new_file(output, lambda path: write_spikes(path, cells.spikes))
 
 
 def _write_scores(directory: Path, output: Path, config: SpikeConfig) -> None:
-    write_scores(output, score_run_cells(directory, config.peak_rate))
+    scores = score_run_cells(directory, config.peak_rate)
+    make_new_file(output, lambda path: write_scores(path, scores))
 
 
 WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
@@ -154,7 +147,7 @@ CELL_WRITERS: dict[str, Callable[[Path, Path, SpikeConfig], None]] = {
 
 def _copy(file: Path, output: Path, what: str) -> None:
     _file(file, what)
-    write_atomically(output, lambda path: shutil.copyfile(file, path))
+    make_new_file(output, lambda path: shutil.copyfile(file, path))
 
 
 def _file(file: Path, what: str) -> Path:

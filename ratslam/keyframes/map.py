@@ -239,15 +239,11 @@ class KeyframeMap(Checkpointed, Map):
         """Removes the closures of a sequence and optimises without them.
 
         Raises:
-            ValueError: no such sequence is accepted, its keyframes are merged, or it joins broken parts.
+            ValueError: it has an `Obstacle`.
         """
-        solution = self.solution()
-        if not 0 <= sequence < self.log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:
-            raise ValueError(f"sequence {sequence} is not an accepted closure sequence of this map")
-        if self.log.has_merged(sequence):
-            raise ValueError(f"keyframes of sequence {sequence} are merged with those that it joins them to")
-        if np.any(solution.cut.rows == sequence):
-            raise ValueError(f"sequence {sequence} is the only link across a break of the odometry")
+        obstacle = self.solution().obstacle(sequence, self.log)
+        if obstacle is not None:
+            raise ValueError(f"sequence {sequence} {obstacle}")
         self.log.judge(sequence, Verdict.UNDONE)
         self._optimise()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from enum import StrEnum
 from functools import partial
 from typing import NamedTuple
 
@@ -34,6 +35,14 @@ Place = Callable[[np.ndarray], np.ndarray]
 """Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
 
 
+class Obstacle(StrEnum):
+    """Why a closure sequence cannot be undone, as a clause."""
+
+    NOT_ACCEPTED = "is not an accepted closure sequence of this map"
+    MERGED = "has keyframes that are merged with those that it joins them to"
+    ONLY_LINK = "is the only link across a break of the odometry"
+
+
 class MapSolution(NamedTuple):
     """Optimised poses and bias, the closure log with its verdicts, and the odometry breaks ([N]
     sequences)."""
@@ -54,6 +63,18 @@ class MapSolution(NamedTuple):
         if doubted:
             return number_pieces(graph.begins.rows, np.zeros((0, 2), int))
         return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
+
+    def obstacle(self, sequence: int, log: ClosureLog) -> Obstacle | None:
+        """Why a sequence cannot be undone; None if it can.
+
+        Args:
+            log: the one from which this solution was selected.
+        """
+        if not 0 <= sequence < log.sequences or self.log.verdict(sequence) != Verdict.ACCEPTED:
+            return Obstacle.NOT_ACCEPTED
+        if log.has_merged(sequence):
+            return Obstacle.MERGED
+        return Obstacle.ONLY_LINK if np.any(self.cut.rows == sequence) else None
 
 
 def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:

@@ -20,7 +20,7 @@ from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.run import print_status, process_source
 from ratslam.pipeline.runner import open_runner
-from ratslam.pipeline.saved_map import SavedMap
+from ratslam.pipeline.saved_map import SavedMap, is_map
 from ratslam.pipeline.source import open_observations
 from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
@@ -119,8 +119,11 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
         assignments: settings to replace, each `a.b=value`.
 
     Raises:
-        InputErrors: the assignments have errors.
+        InputErrors: the assignments have errors. InputError: the file is a map.
     """
+    if is_map(file):
+        cure = "give the recording or the configuration whose poses are to be found"
+        raise InputError(str(file), "a map, which is no recording", "a recording of the map's sensor", cure)
     like, file = saved.config.recording, file.resolve()
     recording = RecordingConfig(file=file) if like is None else like.model_copy(update={"file": file})
     sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,27 @@ import numpy as np
 from ratslam.atlas.crop import crop_map
 from ratslam.atlas.difference import MapContent, difference, keyframe_content
 from ratslam.backends.recall import RecallBackend
+from ratslam.config.flat_settings import flat_settings
 from ratslam.config.strict_yaml import dump
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.keyframes.loop_closures import Verdict
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.map_results import rewrite_results
-from ratslam.pipeline.saved_map import NAME, SavedMap, write_map
+from ratslam.keyframes.map_solution import Obstacle
+from ratslam.pipeline.folder_change import change_folder, finish_change, unfinished_change
+from ratslam.pipeline.map_results import holds_results, rewrite_results
+from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.pipeline.sensor import disagreement
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file, require_writable
 
+CURES = {
+    Obstacle.NOT_ACCEPTED: "`ratslam map info {path} --json` lists them",
+    Obstacle.MERGED: "if it is wrong, cut one of its passes out with `ratslam map crop --steps`, or map the "
+    "recordings again with `--set keyframes.merge_stood=0`",
+    Obstacle.ONLY_LINK: "if it is wrong, cut one of the sides out with `ratslam map crop --steps`",
+}
+"""What can be done instead of an undo, by why it cannot be made."""
 Choose = Callable[[KeyframeMap], np.ndarray]
 """Chooses the keyframes of a map that remain: [E] bool."""
 
@@ -75,7 +87,8 @@ def _verdicts(made: KeyframeMap) -> np.ndarray:
 
 
 def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
-    """The accepted closure sequences: number, first and last step, the steps matched, evidence."""
+    """The accepted closure sequences: number, first and last step, the steps matched, evidence, and whether
+    it can be undone."""
     log, step = made.solution().log, made.keyframe_steps()
     found = []
     for number in np.flatnonzero(_verdicts(made) == Verdict.ACCEPTED).tolist():
@@ -86,6 +99,7 @@ def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
                 "steps": step[members[[0, -1], 0]].tolist(),
                 "match_steps": step[members[[0, -1], 1]].tolist(),
                 "evidence": round(log.score(number), 2),
+                "can_be_undone": made.solution().obstacle(number, made.log) is None,
             }
         )
     return found
@@ -100,7 +114,7 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
     """
     contents = [_content(saved) for saved in (first, second)]
     found = difference(*contents)._asdict()
-    settings = [_flat(saved.config.model_dump(mode="json")) for saved in (first, second)]
+    settings = [flat_settings(saved.config.model_dump(mode="json")) for saved in (first, second)]
     keys = sorted(settings[0].keys() | settings[1].keys())
     pairs = {key: [one.get(key) for one in settings] for key in keys}
     changed = {key: pair for key, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
@@ -115,27 +129,76 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
 
 def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
     """Removes the closures of a sequence from a map, solves it without them, and writes it. If it replaces
-    the map of a run directory, the files there that follow from the map are written anew.
+    the map of a run directory, the files there that follow from the map are written anew: all, or none.
 
     Returns:
         whether they were.
 
     Raises:
-        InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, or the map
-            has no closure sequences.
+        InputError: no such sequence is accepted, its keyframes are merged, it joins broken parts, the map
+            has no closure sequences, or a file of the run directory is missing or malformed.
     """
     session, made = _keyframe_session(saved, "undo")
-    try:
-        made.undo(sequence)
-    except ValueError as error:
-        cure = f"`ratslam map info {saved.path} --json` lists them"
-        raise InputError(str(saved.path), str(error), "an accepted sequence", cure) from None
-    write_map(
-        output, session, saved.config, saved.source,
-        recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
-    )  # fmt: skip
-    replaced = output == saved.path and output.name == NAME
-    return replaced and rewrite_results(output.parent, made, saved.config.score)
+    obstacle = made.solution().obstacle(sequence, made.log)
+    if obstacle is not None:
+        expected = "an accepted sequence that can be undone"
+        cure = CURES[obstacle].format(path=saved.path)
+        raise InputError(str(saved.path), f"sequence {sequence} {obstacle}", expected, cure)
+    made.undo(sequence)
+
+    def write(file: Path) -> None:
+        write_map(
+            file, session, saved.config, saved.source,
+            recording=saved.recording, estimate=saved.estimate, frontend=saved.frontend,
+        )  # fmt: skip
+
+    folder = output.parent
+    if output != saved.path:
+        make_new_file(output, write)
+        return False
+    if output.name != NAME or not holds_results(folder):
+        write(output)
+        return False
+
+    def change(shown: Path) -> None:
+        write(shown / NAME)
+        rewrite_results(shown, made, saved.config.score)
+
+    change_folder(folder, str(sequence), NAME, change)
+    return True
+
+
+def replaced_file(path: Path) -> Path:
+    """The file that an undo of a map replaces, which a link may name.
+
+    Raises:
+        InputError: it is read-only, its folder cannot be written in, or it is that of another folder.
+    """
+    file, cure = map_file(path), "or write a new map with -o"
+    if file.is_symlink():
+        if path.is_dir():
+            found = f"a link to {file.resolve()}, whose folder has files of its own"
+            raise InputError(str(file), found, "a map in its run directory", f"undo it there, {cure}")
+        file = file.resolve()
+    if file.exists():
+        if not file.stat().st_mode & 0o222 or not os.access(file, os.W_OK):
+            raise InputError(str(file), "read-only", "a map that may be changed", f"`chmod u+w` it, {cure}")
+        require_writable(file)
+    return file
+
+
+def finish_undo(path: Path) -> int | None:
+    """Puts the files of an undo in their places that was killed when all of them were made.
+
+    Args:
+        path: of the map. Returns: the sequence that was undone, None if nothing was to be done.
+    """
+    folder = map_file(path).parent
+    sequence = unfinished_change(folder)
+    if sequence is None:
+        return None
+    finish_change(folder)
+    return int(sequence)
 
 
 def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
@@ -158,7 +221,11 @@ def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
     if cropped.elsewhere:
         session.begin_piece()
     estimate = saved.estimate._replace(place=-1)  # places are numbered anew
-    write_map(output, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
+
+    def write(file: Path) -> None:
+        write_map(file, session, saved.config, saved.source, estimate=estimate, frontend=saved.frontend)
+
+    make_new_file(output, write)
     return steps
 
 
@@ -182,11 +249,3 @@ def _content(saved: SavedMap) -> MapContent:
 def _box(path: np.ndarray) -> list[float]:
     """Least x and y and largest x and y of poses [T, 3], m."""
     return [*path[:, :2].min(axis=0).tolist(), *path[:, :2].max(axis=0).tolist()] if len(path) else []
-
-
-def _flat(settings: dict[str, Any], before: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{before}{name}.") if isinstance(value, dict) else {before + name: value}
-    return flat

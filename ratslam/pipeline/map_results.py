@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
+from evaluation.artifacts.merged_map import NAME as MERGED
 from evaluation.artifacts.merged_map import is_merged, read_session_steps
 from evaluation.artifacts.pieces_table import NAME as PIECES
 from evaluation.artifacts.pieces_table import write_pieces
@@ -16,13 +17,14 @@ from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
-from evaluation.metrics.trajectory import write_tum
+from evaluation.metrics.trajectory import read_tum, write_tum
 from evaluation.plots.run_plots import plot_writers
 from evaluation.plots.session_plot import draw_sessions
 from ratslam.config.run_config import ScoreConfig
 from ratslam.core.backend import Map
 from ratslam.pipeline.report import NAME as REPORT
 from tactile.base.atomic_write import write_atomically, write_text_atomically
+from tactile.base.errors import InputError
 
 DERIVED = ("pieces.csv", "health.json", "calibration.yaml", "closures.csv")
 """Files that only some maps have."""
@@ -66,25 +68,34 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
     write_atomically(folder / "map.png", figure.savefig)
 
 
-def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> bool:
+def holds_results(folder: Path) -> bool:
+    """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
+    online = folder / "online.tum"
+    return is_merged(folder) or (online.exists() and online.stat().st_size > 0)
+
+
+def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:
     """Writes the files that follow from a map that was changed in its run directory or merged folder.
 
-    Returns:
-        whether the folder is one of these.
-
     Raises:
-        InputError: a file is missing or malformed.
+        InputError: a file is missing or malformed, or the run has steps that its map lacks.
     """
+    steps = len(made.pieces())
     if is_merged(folder):
-        write_merged_results(folder, made, folder.resolve().name, read_session_steps(folder))
-        return True
+        sessions = read_session_steps(folder)
+        if sum(sessions) != steps:
+            found = f"sessions of {sum(sessions)} steps beside a map of {steps}"
+            raise InputError(str(folder / MERGED), found, "those of the map")
+        write_merged_results(folder, made, folder.resolve().name, sessions)
+        return
     online = folder / "online.tum"
-    if not online.exists() or not online.stat().st_size:
-        return False
-    write_map_results(folder, made, np.loadtxt(online, usecols=0, ndmin=1))
+    time, _ = read_tum(online)
+    if len(time) > steps:
+        cure = "end it with `ratslam run --continue` first, or write the map alone to a new file with -o"
+        raise InputError(str(online), f"{len(time)} steps beside a map of {steps}", "a run that ended", cure)
+    write_map_results(folder, made, time)
     score_and_plot(folder, config)
     (folder / REPORT).unlink(missing_ok=True)
-    return True
 
 
 def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:

@@ -7,6 +7,7 @@ import shlex
 from typing import Any
 
 from ratslam.backends.registry import BACKENDS, LOCALISING
+from ratslam.config.flat_settings import flat_settings
 from ratslam.config.run_config import RunConfig
 from tactile.base.errors import InputError
 
@@ -54,13 +55,7 @@ def _settings(config: RunConfig) -> dict[str, Any]:
     names = list(kind.model_fields) if builtin else ["backend_settings"]
     plain = config.model_dump(mode="json", include={*names})
     precision = {"session.precision": config.session.precision}
-    return {key: value for name in names for key, value in _flat(name, plain[name])} | precision
-
-
-def _flat(name: str, value: Any) -> list[tuple[str, Any]]:
-    if not isinstance(value, dict) or not value:
-        return [(name, value)]
-    return [pair for key, inner in value.items() for pair in _flat(f"{name}.{key}", inner)]
+    return flat_settings({name: plain[name] for name in names}) | precision
 
 
 def _text(value: Any) -> str:

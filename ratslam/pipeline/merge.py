@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +23,7 @@ from ratslam.pipeline.map_results import write_merged_results
 from ratslam.pipeline.merge_refusals import check_mergeable, keyframes_of
 from ratslam.pipeline.method_settings import differing_settings
 from ratslam.pipeline.saved_map import NAME, SavedMap, read_map, write_map
+from tactile.base.new_file import make_new_file, new_folder
 
 
 class MergeReport(NamedTuple):
@@ -176,18 +174,13 @@ def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Mer
         write_map(file, session, first.config, source, estimate=estimate)
 
     if output.suffix == ".npz":
-        write(output)
+        make_new_file(output, write)
         return
-    folder = Path(mkdtemp(dir=output.parent, prefix=f".{output.name}."))
-    try:
+    with new_folder(output) as folder:
         write(folder / NAME)
         (folder / "config.yaml").write_text(dump(first.config), encoding="utf-8")
         (folder / REPORT).write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
         write_merged_results(folder, made, output.name, report.steps)
-        folder.chmod(0o755)
-        os.rename(folder, output)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _names(maps: Sequence[int]) -> str:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ratslam.atlas.overlap import Overlap, overlap, remembered
 from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.saved_map import SavedMap, digest_of
+from ratslam.pipeline.map_archive import digest_of
+from ratslam.pipeline.saved_map import SavedMap
 from ratslam.pipeline.sensor import first_difference
 from tactile.base.errors import InputError
 

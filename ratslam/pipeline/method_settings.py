@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ratslam.backends.config import RecallBackendConfig
+from ratslam.config.flat_settings import flat_settings
 from ratslam.config.run_config import RunConfig
 
 
@@ -19,12 +20,4 @@ def differing_settings(configs: Sequence[RunConfig]) -> dict[str, list[Any]]:
 
 def _method_settings(config: RunConfig) -> dict[str, Any]:
     settings = config.model_dump(mode="json", include=set(RecallBackendConfig.model_fields))
-    return _by_name(settings) | {"session.precision": config.session.precision}
-
-
-def _by_name(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in settings.items():
-        found |= _by_name(value, f"{before}{name}.") if isinstance(value, dict) else {before + name: value}
-    return found
+    return flat_settings(settings) | {"session.precision": config.session.precision}

@@ -6,8 +6,8 @@ interrupt, a kill or a full disk leaves a readable prefix.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -61,13 +61,28 @@ class RunDirectory:
     def append(self, lines: Mapping[str, Iterable[str]]) -> None:
         """Appends whole lines to the text files and flushes them."""
         for name, added in lines.items():
-            self._streams[name].write("".join(added))
-            self._streams[name].flush()
+            with self._writing(name):
+                self._streams[name].write("".join(added))
+                self._streams[name].flush()
 
     def text(self, name: str, content: str) -> None:
         """Writes a text file atomically."""
-        write_text_atomically(self.path / name, content)
+        with self._writing(name):
+            write_text_atomically(self.path / name, content)
 
     def file(self, name: str, write: Callable[[Path], Any]) -> None:
         """Writes any file atomically: `write(path)` gets a temporary path with the same suffix."""
-        write_atomically(self.path / name, write)
+        with self._writing(name):
+            write_atomically(self.path / name, write)
+
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[None]:
+        """Names the file in errors, and notes what holds of the others."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno is None:
+                raise
+            named = OSError(error.errno, error.strerror, error.filename or str(self.path / name))
+            named.add_note("the files written before are complete")
+            raise named from error

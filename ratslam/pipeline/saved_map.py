@@ -6,53 +6,46 @@ configuration, the description of the readings, and a sha256 over all of it.
 
 from __future__ import annotations
 
-import hashlib
-import struct
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ratslam.backends.registry import BACKENDS
+from ratslam.backends.registry import BACKENDS, LOCALISING
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
 from ratslam.core.checkpoint import with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.pipeline.folder_change import unfinished_change
+from ratslam.pipeline.map_archive import (
+    EXPECTED,
+    FORMAT,
+    SPOILT,
+    digest_of,
+    read_arrays,
+    text_of,
+    write_arrays,
+)
 from ratslam.pipeline.map_settings import check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
 from robot.sources.description import SourceDescription, describe
 from robot.sources.source import Source
 from robot.touch_source import TouchSource, open_touch_source
-from tactile.base.atomic_write import flush_to_disk, write_atomically
+from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
-FORMAT = "ratslam-map-2"
-"""Name and version of the format; a later version reads it."""
-FORMATS = ("ratslam-map-1", FORMAT)
-"""The formats that are read; the first does not tell `Session.earlier`."""
 NAME = "map.npz"
 """The map file of a run directory."""
-EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
 TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND = "estimate/", "frontend/"
-MOST_BYTES = 8 << 30
-"""Largest size of all arrays of a map file."""
-SPOILT = (
-    OSError, ValueError, LookupError, EOFError, TypeError, AttributeError, SyntaxError, RuntimeError,
-    MemoryError, OverflowError, tokenize.TokenError, struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""Errors of zipfile and NumPy in a spoilt file, and of a session in arrays that do not fit it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +125,10 @@ class SavedMap:
         if found:
             check_same_settings(str(self.path), self.config, config)
             expected = "a map made with this configuration"
+            if self.config.backend in LOCALISING.values():
+                place = self.config.localise.map
+                expected = f"{place} as it was when this session was localised in it"
+                cure = "restore that map from a copy, or localise the recording again"
             raise InputError(str(self.path), found, expected, cure) from None
 
 
@@ -140,21 +137,38 @@ def map_file(path: Path) -> Path:
     return path / NAME if path.is_dir() else path
 
 
+def is_map(path: Path) -> bool:
+    """Whether a path is a map by the names in its file."""
+    file = map_file(path)
+    try:
+        if not file.is_file():
+            return False
+        with zipfile.ZipFile(file) as archive:
+            return {"steps.npy", "config.npy"} <= set(archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
 def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMap:
     """The map in a run directory or a map file.
 
     Args:
-        report: called with one sentence if the file is of an earlier format and was converted.
+        report: called with one sentence if the file is of an earlier format and was converted, or if a change
+            of its folder was cut off.
 
     Raises:
         InputError: there is none; it is broken, incomplete, of an unknown format, or made by a backend that
             is not registered.
     """
     file = map_file(path)
-    arrays = _read_arrays(file)
+    undone = unfinished_change(file.parent)
+    if undone is not None and report is not None:
+        cure = f"repeat `ratslam map undo {file.parent} {undone}` to complete it"
+        report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
+    arrays = read_arrays(file)
     if "format" not in arrays:
         return _convert(file, arrays, report)
-    texts = {name: _text(file, arrays, name) for name in TEXTS}
+    texts = {name: text_of(file, arrays, name) for name in TEXTS}
     if digest_of(arrays) != texts["sha256"]:
         found = "damaged: the content does not match its sha256"
         raise InputError(str(file), found, "the file as it was written", "restore it from a copy")
@@ -188,7 +202,7 @@ def write_map(
     arrays |= {ESTIMATE + name: value for name, value in estimate_arrays(estimate).items()}
     arrays |= {FRONTEND + name: np.asarray(value) for name, value in (frontend or {}).items()}
     arrays["sha256"] = np.array(digest_of(arrays))
-    write_atomically(path, lambda temporary: _write_arrays(temporary, arrays))
+    write_atomically(path, lambda temporary: write_arrays(temporary, arrays))
 
 
 def describe_readings(source: Source) -> SourceDescription:
@@ -200,16 +214,6 @@ def describe_readings(source: Source) -> SourceDescription:
     return SourceDescription(
         source.view_shape, source.whiskers, source.rate_hz, describe(readings).info, source.name
     )
-
-
-def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
-    """The sha256 (hex) over names, dtypes, shapes and bytes of all arrays, sorted by name, but `sha256`."""
-    digest = hashlib.sha256()
-    for name in sorted(set(arrays) - {"sha256"}):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}\0{array.dtype.str}\0{arrays[name].shape}\0".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
@@ -238,9 +242,9 @@ def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], 
     """The map in a file written before there was a format: by `Slam.save`, which kept its configuration, or
     in a run directory, where it stands beside it."""
     if "source" in arrays:
-        config: RunConfig = validate(parse(_text(file, arrays, "config"), f"{file}: config"), LoopConfig)
+        config: RunConfig = validate(parse(text_of(file, arrays, "config"), f"{file}: config"), LoopConfig)
         try:
-            readings = SourceDescription.from_json(_text(file, arrays, "source"))
+            readings = SourceDescription.from_json(text_of(file, arrays, "source"))
         except ValueError as error:
             raise InputError(str(file), str(error), EXPECTED) from None
         source = describe_readings(open_touch_source(readings, config.touch))
@@ -282,56 +286,3 @@ def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray
             if found != expected:
                 return f"the array {name} of {what} {found} instead of {expected}"
     return ""
-
-
-def _read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """All arrays of a file that is a map by the names in it and by its size."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if "steps" not in members:
-                raise InputError(str(file), "an archive of other arrays", EXPECTED)
-            if "format" in members:
-                _check_format(file, _array(archive, members["format"]))
-            size = sum(info.file_size for info in members.values())
-            if size > MOST_BYTES:
-                found = f"arrays of {size / 2**30:.1f} GiB"
-                raise InputError(str(file), found, f"a map of at most {MOST_BYTES >> 30} GiB")
-            return {name: _array(archive, info) for name, info in members.items()}
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError(str(file), "no such file", EXPECTED) from None
-    except SPOILT as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(str(file), f"not a map ({reason})", EXPECTED) from None
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = BytesIO(archive.read(info))  # whole, so that its checksum is compared before it is parsed
-    array = np.lib.format.read_array(content, allow_pickle=False)
-    if array.dtype.hasobject or content.read(1):
-        raise ValueError(f"{info.filename} is not a plain array")
-    return array
-
-
-def _check_format(file: Path, array: np.ndarray) -> None:
-    if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
-        found = repr(str(array)[:40]) if not array.shape else "numbers"
-        cure = "update ratslam if a newer version wrote it"
-        raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
-
-
-def _text(file: Path, arrays: Mapping[str, np.ndarray], name: str) -> str:
-    """A text among the arrays of a file."""
-    found = arrays.get(name)
-    if found is None or found.shape or found.dtype.kind != "U":
-        problem = f"a file without {name!r}" if found is None else f"{name!r} is not a text"
-        raise InputError(str(file), problem, EXPECTED)
-    return str(found)
-
-
-def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    with path.open("wb") as file:  # with a path, NumPy would add a suffix
-        np.savez_compressed(file, **arrays)
-    flush_to_disk(path)

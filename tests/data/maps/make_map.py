@@ -16,7 +16,7 @@ import numpy as np
 import ratslam
 from ratslam.config.run_config import LoopConfig
 from ratslam.config.strict_yaml import parse, validate
-from ratslam.pipeline.saved_map import FORMAT
+from ratslam.pipeline.map_archive import FORMAT
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.description import describe
 

@@ -11,6 +11,7 @@ import pytest
 
 import ratslam
 from ratslam.cli import main
+from ratslam.keyframes.map_solution import MapSolution, Obstacle
 from ratslam.pipeline.saved_map import read_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from tests.helpers.square_run import copy_square_run
@@ -133,6 +134,27 @@ def test_what_cannot_be_cropped_is_refused(capsys, tmp_path: Path) -> None:
     assert "exists already" in refused(capsys, "crop", FILE, "--steps", ":9", "-o", FILE)
     assert "no such file" in refused(capsys, "info", tmp_path)
     assert not part.exists()
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "cure"),
+    [
+        (Obstacle.NOT_ACCEPTED, "--json` lists them"),
+        (Obstacle.MERGED, "keyframes.merge_stood=0"),
+        (Obstacle.ONLY_LINK, "map crop --steps"),
+    ],
+)
+def test_a_sequence_that_cannot_be_undone_has_another_cure(
+    obstacle: Obstacle, cure: str, capsys, tmp_path: Path, monkeypatch
+) -> None:
+    sequences = info(capsys, FILE)["accepted_sequences"]
+    assert all(one["can_be_undone"] for one in sequences)
+    monkeypatch.setattr(MapSolution, "obstacle", lambda *_: obstacle)
+    assert not any(one["can_be_undone"] for one in info(capsys, FILE)["accepted_sequences"])
+    said = refused(capsys, "undo", FILE, sequences[0]["sequence"], "-o", tmp_path / "undone.npz")
+    assert f"sequence {sequences[0]['sequence']} {obstacle}; " in said
+    assert cure in said
+    assert ("lists them" in said) == (obstacle == Obstacle.NOT_ACCEPTED)
 
 
 @pytest.mark.parametrize("backend", ["classic", pytest.param("grid", marks=pytest.mark.soak)])

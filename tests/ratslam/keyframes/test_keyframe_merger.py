@@ -9,6 +9,7 @@ import pytest
 
 from ratslam.keyframes import archive_selection
 from ratslam.keyframes.loop_closures import Verdict
+from ratslam.keyframes.map_solution import Obstacle
 from ratslam.keyframes.merging import NEAR
 from tactile.base.se2 import between, fit_rigid_motion
 from tests.ratslam.keyframes.map_cases import CELL
@@ -118,6 +119,7 @@ def test_a_merged_sequence_cannot_be_undone():
     accepted = set(drive.map.candidates()[drive.map.candidates()[:, 7] == Verdict.ACCEPTED, 5].astype(int))
     assert merged
     assert set(merged) < accepted
+    assert drive.map.solution().obstacle(merged[0], drive.map.log) == Obstacle.MERGED
     with pytest.raises(ValueError, match="merged"):
         drive.map.undo(merged[0])
 
@@ -126,6 +128,7 @@ def test_a_sequence_that_is_not_merged_can_be_undone():
     drive = driven().restored()
     last = drive.map.log.sequences - 2
     assert last not in merged_sequences(drive)
+    assert drive.map.solution().obstacle(last, drive.map.log) is None
     drive.map.undo(last)
     candidates = drive.map.candidates()
     assert set(candidates[candidates[:, 5] == last, 7]) == {Verdict.UNDONE}

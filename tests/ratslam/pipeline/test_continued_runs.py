@@ -16,9 +16,10 @@ from ratslam.config.run_config import LoopConfig
 from ratslam.core.session import Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.continuation import resume_session
+from ratslam.pipeline.map_archive import digest_of
 from ratslam.pipeline.run import process_source
 from ratslam.pipeline.runner import open_runner
-from ratslam.pipeline.saved_map import SavedMap, describe_readings, digest_of, read_map, write_map
+from ratslam.pipeline.saved_map import SavedMap, describe_readings, read_map, write_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.in_memory import InMemorySource
 from robot.sources.source import Sample

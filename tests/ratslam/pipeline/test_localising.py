@@ -9,7 +9,8 @@ import pytest
 from ratslam.backends.registry import LOCALISING
 from ratslam.config.run_config import LoopConfig
 from ratslam.pipeline.localise import localising
-from ratslam.pipeline.saved_map import FORMAT, SavedMap
+from ratslam.pipeline.map_archive import FORMAT
+from ratslam.pipeline.saved_map import SavedMap
 from robot.sources.description import SourceDescription
 from tactile.base.errors import InputError
 

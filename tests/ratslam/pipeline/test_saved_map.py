@@ -10,7 +10,8 @@ import pytest
 
 import ratslam
 from ratslam.core.session import Session
-from ratslam.pipeline.saved_map import FORMAT, digest_of, read_map, write_map
+from ratslam.pipeline.map_archive import FORMAT, digest_of
+from ratslam.pipeline.saved_map import read_map, write_map
 from ratslam.pipeline.sensor import check_same_sensor
 from tactile.base.errors import InputError
 

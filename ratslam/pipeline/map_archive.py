@@ -1,0 +1,125 @@
+"""The arrays of a map file, a NumPy archive (.npz) whose damage is told from other files."""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactile.base.atomic_write import flush_to_disk
+from tactile.base.errors import InputError
+
+FORMAT = "ratslam-map-2"
+"""Name and version of the format; a later version reads it."""
+FORMATS = ("ratslam-map-1", FORMAT)
+"""The formats that are read; the first does not tell `Session.earlier`."""
+EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
+ARCHIVE = b"PK"
+"""Beginning of every map file, by which a damaged one is told from another file."""
+MOST_BYTES = 8 << 30
+"""Largest size of all arrays of a map file."""
+SPOILT = (
+    OSError, ValueError, LookupError, EOFError, TypeError, AttributeError, SyntaxError, RuntimeError,
+    MemoryError, OverflowError, tokenize.TokenError, struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""Errors of zipfile and NumPy in a spoilt file, and of a session in arrays that do not fit it."""
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """All arrays of a file that is a map by the names in it and by its size.
+
+    Raises:
+        InputError: it is no such file, damaged, of an unknown format, or cannot be read.
+    """
+    begin = _begin(file)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if "steps" not in members:
+                raise InputError(str(file), "an archive of other arrays", EXPECTED)
+            if "format" in members:
+                _check_format(file, _array(archive, members["format"]))
+            size = sum(info.file_size for info in members.values())
+            if size > MOST_BYTES:
+                found = f"arrays of {size / 2**30:.1f} GiB"
+                raise InputError(str(file), found, f"a map of at most {MOST_BYTES >> 30} GiB")
+            return {name: _array(archive, info) for name, info in members.items()}
+    except InputError:
+        raise
+    except SPOILT as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        spoilt = f"damaged, or not a map ({reason})" if begin == ARCHIVE else "not a map"
+        found = spoilt if begin else "empty, so not a map"
+        raise InputError(str(file), found, EXPECTED, "restore it from a copy if it was one") from None
+
+
+def _begin(file: Path) -> bytes:
+    """The first bytes of a file.
+
+    Raises:
+        InputError: there is none, it is not a plain file, or it cannot be read.
+    """
+    try:
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise InputError(str(file), "neither a file nor a folder", EXPECTED)
+        with file.open("rb") as opened:
+            return opened.read(len(ARCHIVE))
+    except FileNotFoundError:
+        raise InputError(str(file), "no such file", EXPECTED) from None
+    except OSError as error:
+        found = f"cannot be read ({error.strerror})"
+        raise InputError(str(file), found, EXPECTED, "check the path and its permissions") from None
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    content = BytesIO(archive.read(info))  # whole, so that its checksum is compared before it is parsed
+    array = np.lib.format.read_array(content, allow_pickle=False)
+    if array.dtype.hasobject or content.read(1):
+        raise ValueError(f"{info.filename} is not a plain array")
+    return array
+
+
+def _check_format(file: Path, array: np.ndarray) -> None:
+    if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
+        found = repr(str(array)[:40]) if not array.shape else "numbers"
+        cure = "update ratslam if a newer version wrote it"
+        raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
+
+
+def text_of(file: Path, arrays: Mapping[str, np.ndarray], name: str) -> str:
+    """A text among the arrays of a file.
+
+    Raises:
+        InputError: there is no such text.
+    """
+    found = arrays.get(name)
+    if found is None or found.shape or found.dtype.kind != "U":
+        problem = f"a file without {name!r}" if found is None else f"{name!r} is not a text"
+        raise InputError(str(file), problem, EXPECTED)
+    return str(found)
+
+
+def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
+    """The sha256 (hex) over names, dtypes, shapes and bytes of all arrays, sorted by name, but `sha256`."""
+    digest = hashlib.sha256()
+    for name in sorted(set(arrays) - {"sha256"}):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name}\0{array.dtype.str}\0{arrays[name].shape}\0".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Writes the arrays to a file that may be moved to its place afterwards."""
+    with path.open("wb") as file:  # with a path, NumPy would add a suffix
+        np.savez_compressed(file, **arrays)
+    flush_to_disk(path)
