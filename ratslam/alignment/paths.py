@@ -90,6 +90,14 @@ def counted_beside(ground: Ground, path: Path) -> np.ndarray:
     return np.where(still & (path.odds < 0), BESIDE_SHARE * path.odds, path.odds)
 
 
+def at_undriven_headings(ground: Ground, path: Path) -> np.ndarray:
+    """[n] bool: on the driven way, but at no heading that was driven there, so that a right pose and a wrong
+    one may both look unlike it."""
+    near = np.array([ground.is_near(pose, NEAR) for pose in path.poses])
+    apart = np.array([np.hypot(*(ground.poses[:, :2] - pose[:2]).T).min() for pose in path.poses])
+    return ~near & (apart < NEAR * ground.reach)
+
+
 def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
     """[n] the log-odds of each keyframe, nat, less where a keyframe before has said nearly the same.
 

@@ -19,7 +19,7 @@ from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.hypotheses import same_pose
-from ratslam.alignment.paths import NEAR, Path, counted_beside
+from ratslam.alignment.paths import NEAR, Path, at_undriven_headings, counted_beside
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.map_traverse import MapTraverse
 from ratslam.atlas.placement import find_placements
@@ -227,6 +227,14 @@ def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
     motion = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
     variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
     return [Motion(*one) for one in zip(motion, variance, strict=True)]
+
+
+def _weighed(ground: Ground, path: Path) -> Path:
+    """A path without evidence against it at headings that the other session never drove, and with less in runs
+    beside its way: two sessions drive different routes, and turn at different places."""
+    odds = counted_beside(ground, path)
+    undriven = at_undriven_headings(ground, path)
+    return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))
 
 
 def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
