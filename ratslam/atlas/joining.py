@@ -230,8 +230,8 @@ def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
 
 
 def _weighed(ground: Ground, path: Path) -> Path:
-    """A path without evidence against it at headings that the other session never drove, and with less in runs
-    beside its way: two sessions drive different routes, and turn at different places."""
+    """A path without evidence against it at headings that the other session never drove, and with less in
+    runs beside its way: two sessions drive different routes, and turn at different places."""
     odds = counted_beside(ground, path)
     undriven = at_undriven_headings(ground, path)
     return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))

@@ -15,6 +15,7 @@ from ratslam.alignment.paths import (
     BESIDE_SHARE,
     NEAR,
     Path,
+    at_undriven_headings,
     counted_beside,
     keyframe_odds,
     less_where_dependent,
@@ -87,6 +88,14 @@ def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyf
     poses = np.concatenate([lap[:3], across, lap[8:11]])
     counted = count(LOOP.ground, Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)))
     np.testing.assert_array_equal(counted, [-1.0] * 4 + [-BESIDE_SHARE] * 4 + [-1.0] * 3)
+
+
+def test_headings_are_undriven_on_the_way_where_nobody_drove_there_and_faced_so() -> None:
+    driven, away = LOOP.ground.poses[3], np.array([50.0, 0.0, 0.0])
+    across = compose(driven, np.array([0.0, 0.0, np.pi / 2]))
+    poses = np.stack([driven, across, driven + away, across + away])
+    path = Path(poses, np.zeros((4, 3, 3)), np.full(4, -1.0))
+    assert at_undriven_headings(LOOP.ground, path).tolist() == [False, True, False, False]
 
 
 def test_evidence_for_a_path_counts_beside_the_way_and_where_it_comes_again() -> None:
