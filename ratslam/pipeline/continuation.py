@@ -38,10 +38,8 @@ def resume_session(
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)
-    if samples is None:
-        _require_pieces(
-            session.map, saved, source
-        )  # before settings that follow from the source are compared
+    if samples is None:  # before settings that follow from the source are compared
+        _require_pieces(session.map, saved, source)
     saved.restore(session, config)
     if samples is None:
         session.begin_recording()

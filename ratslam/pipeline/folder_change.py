@@ -90,10 +90,8 @@ def _put_in_place(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
         for file in new:
             file.replace(folder / file.name)
-        done = (
-            folder / f"{MAKING}{os.getpid()}"
-        )  # so that a removal that is stopped leaves no half of a change
-        ready.rename(done)
+        done = folder / f"{MAKING}{os.getpid()}"
+        ready.rename(done)  # so that a removal that is stopped leaves no half of a change
     except OSError as error:
         found = f"its new files are complete, but cannot be put in place ({error.strerror})"
         cure = "repeat the command to complete it"
