@@ -62,10 +62,12 @@ def _live(arguments: argparse.Namespace) -> int:
 
     config, _ = _read_live_config(arguments, arguments.head)
     if arguments.localise is not None:
-        from ratslam.pipeline.localise import localising
+        from ratslam.pipeline.localise import check_assignments, localising
         from ratslam.pipeline.saved_map import read_map
 
-        config = localising(config, read_map(arguments.localise))
+        saved = read_map(arguments.localise)
+        check_assignments(arguments.set, saved)
+        config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
     with monitor() as start_monitor:
         ended, card = run_live_session(config, directory, _print, armed=start_monitor, view=target)

@@ -166,10 +166,11 @@ def test_a_configuration_without_a_map_is_refused(tmp_path: Path, capsys: pytest
 def test_settings_that_follow_from_the_map_are_refused(
     setting: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = refused(capsys, tmp_path / "run", "localise", str(TOUCH), str(SQUARE), "--set", setting)
-    assert words in error
-    assert str(TOUCH) in error
-    assert "leave it out" in error
+    for command in (["localise", str(TOUCH), str(SQUARE)], ["live", "live_maze", "--localise", str(TOUCH)]):
+        error = refused(capsys, tmp_path / "run", *command, "--set", setting)
+        assert words in error
+        assert str(TOUCH) in error
+        assert "leave it out" in error
 
 
 def test_settings_of_the_session_are_its_own() -> None:
