@@ -64,6 +64,7 @@ def test_a_run_directory_is_a_finished_map(tmp_path: Path) -> None:
     assert map_file(LocaliseConfig(map=FILE)) == FILE
 
 
+@pytest.mark.soak
 def test_a_localised_session_names_its_map_that_was_changed_or_moved(tmp_path: Path) -> None:
     place, session = tmp_path / "place.npz", tmp_path / "session.npz"
     shutil.copy(FILE, place)
