@@ -113,7 +113,10 @@ def _draw_panel(axes: style.Axes, panel: Panel) -> None:
             axes.plot(steps, curve, color=COLOURS[1 + number % 4], lw=1.1, alpha=0.6, label=label)
             label = ""
     if len(panel.curves) > 1:
-        axes.legend(frameon=False, fontsize=8.5, labelcolor=style.INK)
+        axes.legend(
+            frameon=False, fontsize=8.5, labelcolor=style.INK,
+            loc="lower left", bbox_to_anchor=(0, 1), ncols=len(panel.curves),
+        )  # fmt: skip
     for label, limit in panel.limits.items():
         axes.axhline(limit, color=style.VERMILLION, lw=1.0, ls="--", zorder=0.8)
         across = axes.get_yaxis_transform()
