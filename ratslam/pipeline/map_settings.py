@@ -1,9 +1,10 @@
-"""The settings that a map depends on, and what differs in those of a session that is to go on from it."""
+"""The settings that a map depends on, and which differ between maps or in a session that is to go on."""
 
 from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from typing import Any
 
 from ratslam.backends.registry import BACKENDS, LOCALISING
@@ -19,21 +20,27 @@ def check_same_method(where: str, of_map: RunConfig, other: RunConfig) -> None:
         where: the map, for the error.
     """
     if of_map.backend != other.backend:
-        raise _error(where, {"backend": (of_map.backend, other.backend)}, _method_cure(of_map))
+        raise _error(where, {"backend": [of_map.backend, other.backend]}, _method_cure(of_map))
 
 
 def check_same_settings(where: str, of_map: RunConfig, other: RunConfig) -> None:
     """The same with other settings of the method or another precision; all that differ are named. Both are
     completed.
     """
-    pair = _settings(of_map), _settings(other)
-    names = dict.fromkeys([*pair[0], *pair[1]])
-    values = {name: (pair[0].get(name), pair[1].get(name)) for name in names}
-    different = {name: both for name, both in values.items() if both[0] != both[1]}
+    different = differing_settings([of_map, other])
     if different:
         assigned = (shlex.quote(f"{name}={_text(both[0])}") for name, both in different.items())
         cure = " ".join(f"--set {assignment}" for assignment in assigned)
         raise _error(where, different, f"`{cure}` takes those of the map")
+
+
+def differing_settings(configs: Sequence[RunConfig]) -> dict[str, list[Any]]:
+    """The settings of the method and the precision that are not the same in all completed configurations, by
+    their dotted names, with the value in each."""
+    each = [_settings(config) for config in configs]
+    names = dict.fromkeys(name for settings in each for name in settings)
+    values = {name: [settings.get(name) for settings in each] for name in names}
+    return {name: found for name, found in values.items() if any(value != found[0] for value in found)}
 
 
 def _method_cure(of_map: RunConfig) -> str:
@@ -42,7 +49,7 @@ def _method_cure(of_map: RunConfig) -> str:
     return f"`--set backend={of_map.backend}` takes that of the map"
 
 
-def _error(where: str, different: dict[str, tuple[Any, Any]], cure: str) -> InputError:
+def _error(where: str, different: dict[str, list[Any]], cure: str) -> InputError:
     pairs = [f"{name} is {_text(ours)} and was {_text(was)}" for name, (was, ours) in different.items()]
     found = f"made with other settings: {', '.join(pairs)} when the map was made"
     return InputError(where, found, "a map made with this configuration", cure)

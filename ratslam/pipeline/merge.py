@@ -20,8 +20,8 @@ from ratslam.core.session import Session
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.estimate import START
 from ratslam.pipeline.map_results import write_merged_results
+from ratslam.pipeline.map_settings import differing_settings
 from ratslam.pipeline.merge_refusals import check_mergeable, keyframes_of
-from ratslam.pipeline.method_settings import differing_settings
 from ratslam.pipeline.saved_map import NAME, SavedMap, read_map, write_map
 from tactile.base.new_file import make_new_file, new_folder
 
