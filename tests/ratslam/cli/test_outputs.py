@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -107,8 +108,8 @@ def test_an_output_that_appears_during_the_work_stays(tmp_path: Path, capsys, mo
 
     write_map = map_care.write_map
 
-    def write(*arguments: object, **named: object) -> None:
-        write_map(*arguments, **named)  # type: ignore[arg-type]
+    def write(*arguments: Any, **named: Any) -> None:
+        write_map(*arguments, **named)
         output.write_text("theirs")
 
     monkeypatch.setattr(map_care, "write_map", write)
