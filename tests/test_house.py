@@ -75,3 +75,16 @@ def test_tests_use_no_private_names() -> None:
                 if re.match(r"_[a-z]", name) and name not in allowed
             ]
     assert found == []
+
+
+def test_private_functions_and_classes_are_used() -> None:
+    """Every private function and class of a module is used in it."""
+    unused = []
+    for name, text in sources():
+        tree = ast.parse(text)
+        named = [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        named += [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and re.match(r"_[a-zA-Z]", node.name):
+                unused += [(name, node.name)] if node.name not in named else []
+    assert unused == []

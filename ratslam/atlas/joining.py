@@ -18,8 +18,7 @@ from ratslam.alignment.comparison import Comparison
 from ratslam.alignment.following import Motion
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.hypotheses import same_pose
-from ratslam.alignment.paths import NEAR, Path, at_undriven_headings, counted_beside
+from ratslam.alignment.paths import Path, at_undriven_headings, counted_beside
 from ratslam.atlas.cross_closures import closures_along
 from ratslam.atlas.map_traverse import MapTraverse
 from ratslam.atlas.placement import find_placements
@@ -41,8 +40,8 @@ HOPELESS = -60.0
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
 COMMON = 1 / 3
-"""Least share of the keyframes of one of the pieces that lies on the ground of the other: a part of another
-place that is alike counts as often as it is driven."""
+"""Least share of one of the pieces, of its keyframes that can be compared, that lies on the other one's ground:
+a part of another place that is alike counts as often as it is driven."""
 STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 
@@ -90,8 +89,8 @@ class _Found(NamedTuple):
 
     Attributes:
         onto: [N] keyframes of the ground that are not merged. frames: [n] keyframes placed on it. ground: of
-            `onto` and all merged with these. on: [n] bool, those on the ground. motion: [3] brings them
-            there.
+            `onto` and all merged with these. on: [n] bool, those on the ground. common: their share of
+            those that can be compared. motion: [3] brings them there.
     """
 
     onto: np.ndarray
@@ -99,6 +98,7 @@ class _Found(NamedTuple):
     ground: Ground
     path: Path
     on: np.ndarray
+    common: float
     motion: np.ndarray
     needed: float
 
@@ -157,7 +157,7 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     back = found and _place(map, views, other, one)
     if not found or not back or not _agree(graph, found, back):
         return None
-    if max(found.on.mean(), back.on.mean()) < COMMON:
+    if max(found.common, back.common) < COMMON:
         return None
     sequences = _closures(graph, views, found)
     start = compose(found.motion, graph.pose.rows[other[0]])
@@ -198,20 +198,19 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     ground, odds = views.ground(poses), views.odds(every, poses)
     motions = _motions(graph, own)
     session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, HOPELESS)
-    paths = [
-        path._replace(odds=counted_beside(ground, path)) for path in find_placements(ground, odds, session)
-    ]
+    paths = [_weighed(ground, path) for path in find_placements(ground, odds, session)]
     paths.sort(key=lambda path: -path.odds.sum())
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
     if not paths or paths[0].odds.sum() < needed:
         return None
     best, *others = paths
-    on = (best.odds != 0) & np.array([ground.is_near(pose, NEAR) for pose in best.poses])
+    on = (best.odds != 0) & np.array([ground.is_near(pose) for pose in best.poses])
+    common = float(on.sum() / max(session.views.shows.sum(), 1))
     rivals = [float(path.odds.sum()) for path in others if not _is_like(ground, best, path, on)]
     if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
     moved = fit_rigid_motion(own[on], best.poses[on])
-    return _Found(onto, frames, ground, best, on, moved, needed)
+    return _Found(onto, frames, ground, best, on, common, moved, needed)
 
 
 def _compare(
@@ -238,17 +237,20 @@ def _weighed(ground: Ground, path: Path) -> Path:
 
 
 def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
-    """Whether two paths are together at most of the keyframes `on` the ground [n]."""
-    poses = zip(path.poses[on], other.poses[on], strict=True)
-    return bool(np.mean([same_pose(ground, one[None], pose)[0] for one, pose in poses]) > 0.5)
+    """Whether two paths place the keyframes `on` the ground [n] alike."""
+    return _is_small(ground, between(path.poses[on], other.poses[on]))
 
 
 def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
     """Whether two placements, of either piece in the other, are the same."""
     own = graph.pose.rows[found.frames][found.on]
-    apart = between(compose(found.motion, own), compose(inverse(back.motion), own))
+    return _is_small(found.ground, between(compose(found.motion, own), compose(inverse(back.motion), own)))
+
+
+def _is_small(ground: Ground, apart: np.ndarray) -> bool:
+    """Whether the medians of differences [n, 3] of poses are less than the bend of two maps of one place."""
     far, turned = np.median(np.hypot(*apart[:, :2].T)), np.median(np.abs(wrap(apart[:, 2])))
-    return bool(far < 2 * found.ground.reach and turned < found.ground.reach_heading)
+    return bool(far < 2 * ground.reach and turned < ground.reach_heading)
 
 
 def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Candidate]]:
