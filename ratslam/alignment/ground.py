@@ -16,6 +16,12 @@ REACH_HEADING = 0.3
 between two sector shifts."""
 
 
+NEAR = 0.5
+"""Largest distance and turn from a keyframe at which a view counts by its gain, as shares of the ground's
+reaches: beside the driven way, and at headings that were not driven, views differ although the pose is
+right."""
+
+
 class Match(NamedTuple):
     """The row of a sector shift, a keyframe of a ground, and the gain of a view there, nat."""
 
@@ -30,7 +36,7 @@ class Ground(NamedTuple):
     Attributes:
         poses: [N, 3] m, m, rad. turns: [S] heading of the robot less that of the keyframe at each sector
             shift, rad. reach, reach_heading: m and rad. variance: [3] of a pose found by comparing views, m²,
-            m², rad².
+            m², rad². near_share: share of the reaches within which a view counts by its gain.
     """
 
     poses: np.ndarray
@@ -38,6 +44,7 @@ class Ground(NamedTuple):
     reach: float
     reach_heading: float
     variance: np.ndarray
+    near_share: float = NEAR
 
     def near(self, pose: np.ndarray, reach: float, reach_heading: float) -> tuple[np.ndarray, np.ndarray]:
         """The sector shifts [n] and keyframes [n] at which a robot at `pose` [3] is compared.
@@ -76,8 +83,9 @@ class Ground(NamedTuple):
         best = int(np.argmax(gains))
         return Match(int(shift[best]), int(frame[best]), float(gains[best]))
 
-    def is_near(self, pose: np.ndarray, share: float) -> bool:
-        """Whether a robot at `pose` [3] is compared with a keyframe within this share of both reaches."""
+    def is_near(self, pose: np.ndarray) -> bool:
+        """Whether a robot at `pose` [3] is so near a keyframe that its view counts by its gain."""
+        share = self.near_share
         return len(self.near(pose, share * self.reach, share * self.reach_heading)[0]) > 0
 
     def is_passed(self, pose: np.ndarray) -> bool:
@@ -97,13 +105,19 @@ class Ground(NamedTuple):
 
 
 def ground_of(
-    poses: np.ndarray, recall: RecallConfig, cell: float, sector_angle: float, variance: np.ndarray
+    poses: np.ndarray,
+    recall: RecallConfig,
+    cell: float,
+    sector_angle: float,
+    variance: np.ndarray,
+    near_share: float = NEAR,
 ) -> Ground:
     """Keyframes at these poses [N, 3] as ground.
 
     Args:
-        cell: size of a pose cell, m. sector_angle: turn per sector shift, rad. variance: see `Ground`.
+        cell: size of a pose cell, m. sector_angle: turn per sector shift, rad.
+        variance, near_share: see `Ground`.
     """
     turns = -sector_shifts(recall) * sector_angle
     least = 0.6 * abs(sector_angle) if len(turns) > 2 else 0.0
-    return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance)
+    return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near_share)

@@ -134,20 +134,31 @@ class Hypotheses(Checkpointed):
         self._drop(ground)
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
-        """Adds a supposed pose [3] of the newest keyframe unless there is one like it.
-
-        It has the log-odds of its own way back to the start of the session; or, of another supposed pose that
-        odometry has made uncertain, those of being right and here.
-        """
+        """Adds a supposed pose [3] of the newest keyframe, with the log-odds of its own way back to the start
+        of the session, unless there is one like it."""
         if same_pose(ground, self.pose.rows, pose).any():
             return
         at = Supposed(pose, np.diag(ground.variance))
-        total = float(views.follow_back(ground, odds, at, HOPELESS).odds.sum())
-        for k in range(self.count):
-            if not self.at(k).is_comparable(ground):
-                total = max(total, float(self.log_odds.rows[k]) + self.at(k).log_share(ground, pose))
-        if total >= HOPELESS:
-            self.add(at, total)
+        self._add_unless_hopeless(at, float(views.follow_back(ground, odds, at, HOPELESS).odds.sum()))
+
+    def continue_uncertain(self, ground: Ground, odds: GainOdds, recalled: Recalled) -> None:
+        """Supposes the recalled pose if it continues another one, which odometry has made uncertain: with the
+        log-odds of the likeliest of these, of being here, and of the view."""
+        uncertain = [k for k in range(self.count) if not self.at(k).is_comparable(ground)]
+        if not uncertain:
+            return
+        here = [self.log_odds.rows[k] + self.at(k).log_share(ground, recalled.pose) for k in uncertain]
+        log_odds = float(max(here)) + odds.of(recalled.gain)
+        same = np.flatnonzero(same_pose(ground, self.pose.rows, recalled.pose))
+        same = np.setdiff1d(same, uncertain)
+        if len(same):
+            self.log_odds.rows[same] = np.maximum(self.log_odds.rows[same], log_odds)
+        else:
+            self._add_unless_hopeless(Supposed(recalled.pose, np.diag(ground.variance)), log_odds)
+
+    def _add_unless_hopeless(self, at: Supposed, log_odds: float) -> None:
+        if log_odds >= HOPELESS:
+            self.add(at, log_odds)
 
     def add(self, at: Supposed, log_odds: float) -> None:
         """Adds a supposed pose of the newest keyframe with the log-odds of the session so far."""

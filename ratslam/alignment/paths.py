@@ -11,10 +11,6 @@ from ratslam.alignment.following import Motion, Supposed, advance
 from ratslam.alignment.gain_odds import LEAVING, GainOdds
 from ratslam.alignment.ground import Ground
 
-NEAR = 0.5
-"""Largest distance and turn from a keyframe at which a view counts by its gain, as shares of the ground's
-reaches: beside the driven way, and at headings that were not driven, views differ although the pose is
-right."""
 BESIDE = -1.0
 """Least log-odds of a view on ground that was driven, but not near the way: one or two in a hundred views of
 a map's own revisits lie there, and three in ten of paths that only look alike."""
@@ -73,7 +69,7 @@ def keyframe_odds(
     """
     if gain is None:
         return 0.0, inside
-    if ground.is_near(pose, NEAR):
+    if ground.is_near(pose):
         return odds.of(gain), True
     if ground.is_passed(pose):
         return (BESIDE if np.isnan(gain) else min(max(odds.of(gain), BESIDE), 0.0)), inside
@@ -85,7 +81,7 @@ def keyframe_odds(
 def counted_beside(ground: Ground, path: Path) -> np.ndarray:
     """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the first:
     a path beside the way stays there for some keyframes, and the map may be bent there."""
-    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose, NEAR) for pose in path.poses])
+    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose) for pose in path.poses])
     still = beside & np.concatenate([[False], beside[:-1]])
     return np.where(still & (path.odds < 0), BESIDE_SHARE * path.odds, path.odds)
 
@@ -93,9 +89,9 @@ def counted_beside(ground: Ground, path: Path) -> np.ndarray:
 def at_undriven_headings(ground: Ground, path: Path) -> np.ndarray:
     """[n] bool: on the driven way, but at no heading that was driven there, so that a right pose and a wrong
     one may both look unlike it."""
-    near = np.array([ground.is_near(pose, NEAR) for pose in path.poses])
+    near = np.array([ground.is_near(pose) for pose in path.poses])
     apart = np.array([np.hypot(*(ground.poses[:, :2] - pose[:2]).T).min() for pose in path.poses])
-    return ~near & (apart < NEAR * ground.reach)
+    return ~near & (apart < ground.near_share * ground.reach)
 
 
 def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
@@ -107,6 +103,6 @@ def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
     apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
     keyframe = np.arange(len(apart))
     earlier = keyframe[:, None] - keyframe >= AGAIN
-    again = (earlier & (apart < NEAR * ground.reach)).any(axis=1)
+    again = (earlier & (apart < ground.near_share * ground.reach)).any(axis=1)
     odds = counted_beside(ground, path)
     return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)

@@ -119,7 +119,10 @@ class Localiser(Checkpointed, Map):
     def localisation(self) -> LocalisedPose:
         """The robot's pose now, and whether it is known."""
         now = move(Supposed(self._newest, self._covariance), self._moved())
-        return LocalisedPose(Localisation(self._state), *now, self._mass, self._log_odds)
+        state = Localisation(self._state)
+        if state == Localisation.FOUND and not now.is_comparable(self.place.ground):
+            state = Localisation.LOST  # nothing was seen for long
+        return LocalisedPose(state, *now, self._mass, self._log_odds)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         del estimate
@@ -197,9 +200,12 @@ class Localiser(Checkpointed, Map):
         self._views.append(moved, gain)
         self._frame.append(len(self._pose.rows))
         recalled = self._recall(evidence, moved, gain)
-        self._hypotheses.advance(ground, odds, moved, gain, recalled)
+        confirmed = recalled if self._recalled.is_confirmed else None
+        self._hypotheses.advance(ground, odds, moved, gain, confirmed)
         if recalled is not None:
-            self._hypotheses.propose(ground, odds, self._views, recalled.pose)
+            self._hypotheses.continue_uncertain(ground, odds, recalled)
+        if confirmed is not None:
+            self._hypotheses.propose(ground, odds, self._views, confirmed.pose)
         self._travel = HALT
         self._judge(moved)
         known = self._state == Localisation.FOUND and gain is not None
@@ -213,11 +219,11 @@ class Localiser(Checkpointed, Map):
         return Motion(graph.correct(motion, length), variance)
 
     def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:
-        """The recalled pose once some in a row agree with odometry."""
+        """The recalled pose of the newest keyframe."""
         shift, match = int(evidence.shift_row), int(evidence.match)
         ground, posterior = self.place.ground, float(evidence.posterior)
         self._recalled = self._recalled.onwards(ground, moved, shift, match, posterior)
-        if gain is None or not self._recalled.is_confirmed:
+        if gain is None or not self._recalled.now:
             return None
         return Recalled(self._recalled.pose, float(gain[shift, match]))
 

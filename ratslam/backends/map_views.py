@@ -86,7 +86,10 @@ class MapViews:
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
         graph = self.graph
-        return ground_of(poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance())
+        return ground_of(
+            poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance(),
+            graph.appearance.NEAR_SHARE,
+        )  # fmt: skip
 
     def odds(
         self,
@@ -112,7 +115,8 @@ class MapViews:
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
 
-        return compare_with_itself(self.ground(poses), guard, gains, held, weighing)
+        prior = self.graph.appearance.gain_prior(weighing.prior)
+        return compare_with_itself(self.ground(poses), guard, gains, held, weighing, prior)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.
@@ -185,10 +189,11 @@ class MapViews:
         return lax.scan(look, memory, (views, labels, motions, real))
 
     def _gains_of_many(self, memory: Memory, views: Array, labels: Array) -> Array:
-        """[n, S, C] gains of stored views [D, n]."""
+        """[n, S, C] gains of stored views [D, n]; NaN of those that cannot be compared."""
 
         def look(memory: Memory, one: tuple[Array, Array]) -> tuple[Memory, Array]:
             memory, likelihood = self.recall.likelihood(self.config, memory, *one)
-            return memory, self._gain(memory, likelihood)
+            shows = likelihood.certain & likelihood.informative
+            return memory, jnp.where(shows, self._gain(memory, likelihood), jnp.nan)
 
         return lax.scan(look, memory, (views.T, labels))[1]

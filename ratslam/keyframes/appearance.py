@@ -1,4 +1,4 @@
-"""Views of the keyframes: given ids, views or whisker images, and the metric by which recall compares them.
+"""Views of the keyframes: views or whisker images, and the metric by which recall compares them.
 
 Each class stores the views of all keyframes, gives recall the metric, and measures how badly a keyframe would
 fit at another pose. The properties of the sensor are estimated from the session itself.
@@ -9,10 +9,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy, deepcopy
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from ratslam.alignment.gain_odds import GainPrior
+from ratslam.alignment.ground import NEAR
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
@@ -44,8 +46,6 @@ LOG_ODDS_INTERVAL = 40
 """Keyframes between two estimates of the log-odds of whisker images."""
 NEW_IMAGE_LOG_ODDS = 3.0
 """Log-odds that stand for a whisker image never seen before."""
-SAME_ID_LOG_ODDS = 3.0
-"""Log-odds of one place where the given ids are equal, and against it where they differ."""
 NEUTRAL_MISFIT = 0.5
 """Misfit of a keyframe without others to compare it with."""
 NEUTRAL_IMAGE_MISFIT = float(np.log(2))
@@ -70,6 +70,9 @@ class ConfirmedPairs(NamedTuple):
 
 class Appearance(Checkpointed, ABC):
     """Views of all keyframes."""
+
+    NEAR_SHARE: ClassVar = NEAR
+    """See `Ground.near_share`."""
 
     def present(self) -> Appearance:
         """The present metric with the views so far, whose memory is shared: a view never changes."""
@@ -105,6 +108,10 @@ class Appearance(Checkpointed, ABC):
     def extend(self, other: Appearance) -> None:
         """Adds the views of another map of the same sensor; the metric is learned anew by `relearn`."""
 
+    def gain_prior(self, usual: GainPrior) -> GainPrior:
+        """Gains of views before any were counted; `usual` if nothing else is known of them."""
+        return usual
+
     def relearn(self, pairs: ConfirmedPairs) -> None:
         """Learns the metric anew from all views and these confirmed pairs."""
 
@@ -130,43 +137,6 @@ class Appearance(Checkpointed, ABC):
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
         (`reversed` [n] bool); 0 or more."""
-
-
-class LabelAppearance(Appearance):
-    """Ids given with the recording."""
-
-    def __init__(self) -> None:
-        self._label = GrowableArray((), np.int64)
-
-    def metric(self) -> ViewMetric:
-        return ViewMetric(0.0, 0.0, NO_LIKENESS)
-
-    def view_of(self, observation: Observation) -> np.ndarray:
-        return np.zeros(0)
-
-    def append(self, observation: Observation, turn: float, length: float) -> None:
-        self._label.append(int(observation.label))
-
-    def extend(self, other: Appearance) -> None:
-        assert isinstance(other, LabelAppearance)
-        self._label.extend(other._label.rows)
-
-    def take(self, frames: np.ndarray) -> None:
-        self._label.replace(self._label.rows[frames])
-
-    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros((len(frames), 0)), self._label.rows[frames]
-
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return (self._label.rows[others] != self._label.rows[frame]).astype(float)
-
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return SAME_ID_LOG_ODDS * (1 - 2 * self.unlikeness(frame, others, reversed))
-
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
-        if not len(near):
-            return NEUTRAL_MISFIT
-        return float(self.unlikeness(frame, near, reversed).min())
 
 
 class ViewAppearance(Appearance):

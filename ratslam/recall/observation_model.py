@@ -148,6 +148,20 @@ def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> Obse
     )
 
 
+def label_gains(distinct: int) -> tuple[float, float]:
+    """Log-likelihood of a known id at a keyframe with the same id, and with another one, less that at a new
+    place, nat.
+
+    Args:
+        distinct: number of known ids.
+    """
+    same, other = (
+        LABELS["same"] * max(distinct, 1) / LABELS["new_known"],
+        LABELS["other"] / LABELS["new_known"],
+    )
+    return LABEL_TEMPER * float(np.log(same)), LABEL_TEMPER * float(np.log(other))
+
+
 def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
     """[S, C] mean absolute difference between view[k:] and the stored views' [:-k] for each shift k; infinite
     for shifts that are not allowed because the sectors are not known to be ordered."""

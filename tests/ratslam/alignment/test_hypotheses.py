@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ratslam.alignment.following import Motion, Supposed
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.hypotheses import SPAN, Hypotheses, SessionViews
+from ratslam.alignment.hypotheses import SPAN, Hypotheses, Recalled, SessionViews
 from tactile.base.se2 import compose
 from tests.ratslam.alignment.alignment_cases import (
     POSES,
@@ -189,3 +189,39 @@ def test_restored_hypotheses_and_views_go_on_to_the_same_bits() -> None:
         assert expected.keys() == found.keys()
         for name in expected:
             np.testing.assert_array_equal(found[name], expected[name])
+
+
+def uncertain(pose: np.ndarray, deviation: float) -> Supposed:
+    return Supposed(pose, np.diag([deviation**2, deviation**2, 0.01]))
+
+
+def test_a_recalled_pose_continues_one_that_odometry_has_made_uncertain() -> None:
+    known, here = Hypotheses(), compose(LOOP.poses[5], np.array([0.1, 0.0, 0.0]))
+    at = uncertain(LOOP.poses[5], 0.2)
+    known.add(at, 20.0)
+    known.continue_uncertain(LOOP.ground, ODDS, Recalled(here, 3.0))
+    assert known.count == 2
+    assert_same_pose(known.pose.rows[1], here)
+    expected = 20.0 + at.log_share(LOOP.ground, here) + ODDS.of(3.0)
+    assert known.log_odds.rows[1] == expected < 20.0 + ODDS.of(3.0)
+
+
+def test_nothing_continues_where_no_pose_is_uncertain() -> None:
+    known = Hypotheses()
+    for _ in range(2):
+        known.continue_uncertain(LOOP.ground, ODDS, Recalled(LOOP.poses[30], 3.0))
+        known.clear()
+        known.add(uncertain(LOOP.poses[5], 0.01), 20.0)
+    assert known.count == 1
+
+
+def test_a_pose_that_is_known_already_takes_the_log_odds_of_the_likelier_way_there() -> None:
+    for log_odds, likelier in ((3.0, True), (50.0, False)):
+        known, here = Hypotheses(), LOOP.poses[8]
+        known.add(uncertain(LOOP.poses[5], 0.2), 20.0)
+        known.add(uncertain(here, 0.01), log_odds)
+        known.continue_uncertain(LOOP.ground, ODDS, Recalled(here, 3.0))
+        assert known.count == 2
+        assert (known.log_odds.rows[1] > log_odds) == likelier
+        assert known.log_odds.rows[1] >= log_odds
+        assert known.log_odds.rows[0] == 20.0

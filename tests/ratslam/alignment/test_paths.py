@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.alignment.gain_odds import LEAVING
+from ratslam.alignment.ground import NEAR
 from ratslam.alignment.paths import (
     AGAIN,
     AGAIN_SHARE,
     BESIDE,
     BESIDE_SHARE,
-    NEAR,
     Path,
     at_undriven_headings,
     counted_beside,
@@ -50,6 +50,13 @@ def test_a_heading_that_was_not_driven_does_not_mean_that_the_ground_was_left() 
     assert keyframe_odds(ground, ODDS, across, np.nan, True) == (BESIDE, True)
     assert keyframe_odds(ground, ODDS, away, np.nan, True) == (LEAVING, False)
     assert keyframe_odds(ground, ODDS, away, np.nan, False) == (0.0, False)
+
+
+def test_what_is_seen_from_afar_counts_anywhere_within_reach() -> None:
+    ground, beside = LOOP.ground, compose(LOOP.ground.poses[5], np.array([0.0, 0.9 * LOOP.ground.reach, 0.0]))
+    assert keyframe_odds(ground, ODDS, beside, 3.0, True) == (0.0, True)
+    far = ground._replace(near_share=1.0)
+    assert keyframe_odds(far, ODDS, beside, 3.0, True) == (ODDS.of(3.0), True)
 
 
 def test_a_view_of_nothing_and_one_of_keyframes_beyond_reach_decide_nothing() -> None:

@@ -7,15 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ratslam.alignment.gain_odds import GainPrior, learn_gain_odds
 from ratslam.keyframes.appearance import (
     LOG_ODDS_INTERVAL,
     NEUTRAL_IMAGE_MISFIT,
     NEUTRAL_MISFIT,
     ConfirmedPairs,
-    LabelAppearance,
     ViewAppearance,
     WhiskerAppearance,
 )
+from ratslam.keyframes.label_appearance import LabelAppearance
+from ratslam.recall.observation_model import label_gains
 from tests.ratslam.keyframes.appearance_cases import (
     PIXELS,
     SIZE,
@@ -45,6 +47,17 @@ def test_equal_views_are_likelier_of_one_place(kind):
     assert odds[same].mean() > odds[~same].mean() + 0.5
     order = [frames.unlikeness(7, np.arange(100), ahead), odds[7]]
     assert (np.diff(order[1][np.argsort(order[0], kind="stable")]) <= 0).all()
+
+
+def test_an_id_tells_a_true_pose_from_a_false_one_before_any_was_counted():
+    usual = GainPrior(true=(2.0, 1.0), false=(0.5, 1.0))
+    assert viewed(images(np.random.default_rng(0), 50)).gain_prior(usual) == usual
+    for count in (3, 30, 300):
+        prior = labelled(range(count)).gain_prior(usual)
+        assert (prior.true[0], prior.false[0]) == label_gains(count)
+        odds, none = learn_gain_odds(np.zeros(0), np.zeros(0), prior), np.zeros(0)
+        assert odds.of(prior.true[0]) > 2 > -2 > odds.of(prior.false[0])
+        assert odds.expected > 2 > learn_gain_odds(none, none, usual).expected
 
 
 @pytest.mark.parametrize("kind", ["touch", "views", "labels"])

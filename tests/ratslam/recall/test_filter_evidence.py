@@ -19,7 +19,13 @@ from ratslam.recall.memory import (
     current_pose,
     store_keyframe,
 )
-from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood
+from ratslam.recall.observation_model import (
+    LABEL_TEMPER,
+    LABELS,
+    SAMPLES,
+    ObservationLikelihood,
+    label_gains,
+)
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
 from tests.ratslam.recall.recall_cases import (
@@ -192,6 +198,8 @@ def test_ids_are_evidence_for_and_against_frames():
     assert weighing.likelihood[0, 9] == pytest.approx(LABELS["same"] ** LABEL_TEMPER)
     assert weighing.novelty == pytest.approx((LABELS["new_known"] / known) ** LABEL_TEMPER)
     assert weighing.likelihood[0, 9] > weighing.novelty > weighing.likelihood[0, 30]
+    gains = np.log(weighing.likelihood[0, [9, 30]] / weighing.novelty)
+    assert label_gains(known) == pytest.approx(gains)
     assert new[2].likelihood[0, :40] == pytest.approx(LABELS["unknown"] ** LABEL_TEMPER)
     assert new[2].novelty > new[2].likelihood.max()
     assert np.isnan(weighing.background).all()
