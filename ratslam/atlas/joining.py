@@ -40,8 +40,8 @@ HOPELESS = -60.0
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
 COMMON = 1 / 3
-"""Least share of one of the pieces, of its keyframes that can be compared, that lies on the other one's ground:
-a part of another place that is alike counts as often as it is driven."""
+"""Least share of one of two pieces, of its keyframes that can be compared, that lies on the other's ground: a
+part of another place that is alike counts as often as it is driven."""
 STANDING = 0.5
 """Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
 

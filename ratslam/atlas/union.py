@@ -16,6 +16,7 @@ from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import INTERRUPTED
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.optimizer import CalibrationPrior
+from ratslam.keyframes.step_record import leading_to
 from tactile.base.se2 import bend_motion, between
 
 Arrays = dict[str, np.ndarray]
@@ -166,14 +167,17 @@ def _archive(a: Arrays, b: Arrays, counts: Counts, bend: Bend) -> Arrays:
 
 
 def _steps(a: Arrays, b: Arrays, ever: int, bend: Bend) -> Arrays:
-    """Steps; those of the second map before its first keyframe count to that."""
+    """Steps; those of the second map before its first keyframe lead to that."""
     frame, motion = b["steps/frame"], b["steps/motion"].copy()
-    early = frame < 0
+    early, led = frame == -1, frame < -1
     motion[early, :3] = between(b["graph/pose"][0], motion[early, :3])
     motion[:, :3] = np.where(early[:, None], motion[:, :3], bend.motions(motion[:, :3], motion[:, 3]))
     motion[early, 3] = 0.0
+    number = np.where(early, leading_to(ever), np.where(led, frame - ever, frame + ever))
+    first = a["steps/frame"]
+    settled = np.where(first <= leading_to(ever), ever - 1, first)
     return {
-        "steps/frame": np.concatenate([a["steps/frame"], np.maximum(frame, 0) + ever]),
+        "steps/frame": np.concatenate([settled, number]),
         "steps/motion": np.concatenate([a["steps/motion"], motion]),
     }
 

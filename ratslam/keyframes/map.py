@@ -37,7 +37,7 @@ from ratslam.keyframes.map_solution import MapSolution, selected_solution, solve
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
-from ratslam.keyframes.step_record import StepRecord
+from ratslam.keyframes.step_record import StepRecord, leading_to
 from ratslam.keyframes.travel import HALT
 from ratslam.keyframes.verification import continues_sequence, has_same_heading
 from ratslam.pose_graph import Edges
@@ -204,7 +204,8 @@ class KeyframeMap(Checkpointed, Map):
         return self._steps.first_steps(self._graph.ever)
 
     def begin_piece(self) -> None:
-        """The next keyframe begins a piece; steps until then count to the keyframe before."""
+        """The next keyframe begins a piece; steps until then lead to it."""
+        self._steps.settle(self._graph.ever)
         self._begins = self._graph.count > 0
         self._travel = HALT
         self._since = self._turned = 0.0
@@ -231,7 +232,8 @@ class KeyframeMap(Checkpointed, Map):
                 self._optimise()
             self._judge()
             change = self._arrive(matched)
-        self._steps.append(self._graph.ever - 1, self._travel)
+        ever = self._graph.ever
+        self._steps.append(leading_to(ever) if self._begins or not ever else ever - 1, self._travel)
         self._forget_solution()
         return estimate._replace(place=change.place, previous=change.previous, action=change.action)
 
@@ -257,6 +259,8 @@ class KeyframeMap(Checkpointed, Map):
 
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
+        if self._begins or not self._graph.count:
+            self._steps.arrive(self._graph.ever, self._travel)
         if self._begins:
             self._graph.begin_piece()
             motion, length, turn = HALT

@@ -2,26 +2,47 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.travel import Travel
-from tactile.base.se2 import compose, correct_heading
+from tactile.base.se2 import between, compose, correct_heading
 
 
 class StepRecord(Checkpointed):
-    """The keyframe of each of T steps and the motion since; keyframes are numbered as they were taken."""
+    """The keyframe of each of T steps and the motion from there; keyframes are numbered as they were taken.
+
+    The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from it back
+    to them. Number -1: from the origin, before any keyframe.
+    """
 
     def __init__(self) -> None:
         self._frame = GrowableArray((), np.int64)
-        self._motion = GrowableArray((4,), np.float64)  # since that keyframe, and its length
+        self._motion = GrowableArray((4,), np.float64)  # from that keyframe, and its length
 
     def append(self, frame: int, travel: Travel) -> None:
-        """Adds a step; frame: -1 before the first keyframe."""
+        """Adds a step.
+
+        Args:
+            frame: see the class. travel: since that keyframe, or since the piece begins.
+        """
         self._frame.append(frame)
         self._motion.append([*travel.motion, travel.length])
+
+    def arrive(self, frame: int, travel: Travel) -> None:
+        """The steps that lead to a keyframe are known from it, once it is taken after `travel`."""
+        rows = np.flatnonzero(self._frame.rows == leading_to(frame))
+        self._motion.rows[rows, :3] = between(travel.motion, self._motion.rows[rows, :3])
+        self._motion.rows[rows, 3] -= travel.length
+
+    def settle(self, count: int) -> None:
+        """The steps that lead to no keyframe of the `count` taken belong to the newest one."""
+        frame = self._frame.rows
+        frame[frame <= leading_to(count)] = count - 1
 
     def take(self, number: np.ndarray) -> np.ndarray:
         """Reduces the record to the steps of keyframes that remain; steps before the first keyframe remain
@@ -33,24 +54,21 @@ class StepRecord(Checkpointed):
         Returns:
             [t] the former numbers of the steps.
         """
-        frame = self._frame.rows
-        steps = np.flatnonzero(number[np.maximum(frame, 0)] >= 0)
-        self._frame.replace(np.where(frame >= 0, number[frame], -1)[steps])
+        self.settle(len(number))
+        frame, owner = self._frame.rows, number[self._owners(len(number))]
+        steps = np.flatnonzero(owner >= 0)
+        led = np.where(frame < -1, leading_to(owner), -1)
+        self._frame.replace(np.where(frame >= 0, owner, led)[steps])
         self._motion.replace(self._motion.rows[steps])
         return steps
 
-    def frames(self) -> np.ndarray:
-        """[T] the keyframe of each step."""
-        return self._frame.rows
-
     def first_steps(self, count: int) -> np.ndarray:
         """[count] the step at which each keyframe was taken."""
-        return np.searchsorted(self._frame.rows, np.arange(count))
+        return np.searchsorted(np.maximum.accumulate(self._frame.rows), np.arange(count))
 
     def of_keyframes(self, values: np.ndarray) -> np.ndarray:
         """[T] the value of each step's keyframe, of values [E]; zeros without keyframes."""
-        frame = self._frame.rows
-        return values[np.maximum(frame, 0)] if len(values) else np.zeros_like(frame)
+        return values[self._owners(len(values))] if len(values) else np.zeros_like(self._frame.rows)
 
     def poses(self, fit: MapFit) -> np.ndarray:
         """[T, 3] of all steps by a fit of the keyframes."""
@@ -58,5 +76,15 @@ class StepRecord(Checkpointed):
         moved = correct_heading(motion[:, :3], motion[:, 3], fit.bias, fit.turn_error)
         if not len(fit.poses):
             return moved
-        origin = np.where(frame[:, None] >= 0, fit.poses[np.maximum(frame, 0)], 0.0)
+        origin = np.where(frame[:, None] == -1, 0.0, fit.poses[self._owners(len(fit.poses))])
         return compose(origin, moved)
+
+    def _owners(self, count: int) -> np.ndarray:
+        """[T] the keyframe of each step, of `count` keyframes taken."""
+        frame = self._frame.rows
+        return np.minimum(np.where(frame < -1, leading_to(frame), np.maximum(frame, 0)), count - 1)
+
+
+def leading_to(frame: Any) -> Any:
+    """The number of a step before the first keyframe of a piece, and the keyframe of such a number."""
+    return -2 - frame
