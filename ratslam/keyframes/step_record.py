@@ -16,8 +16,8 @@ from tactile.base.se2 import between, compose, correct_heading
 class StepRecord(Checkpointed):
     """The keyframe of each of T steps and the motion from there; keyframes are numbered as they were taken.
 
-    The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from it back
-    to them. Number -1: from the origin, before any keyframe.
+    The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from it
+    back to them. Number -1: from the origin, before any keyframe.
     """
 
     def __init__(self) -> None:

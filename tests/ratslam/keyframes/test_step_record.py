@@ -27,7 +27,7 @@ def travelled(steps: int) -> Travel:
 
 
 def record(taken: bool = True) -> StepRecord:
-    """Two keyframes, each followed by a step; three steps of a new piece, the third of which is its keyframe."""
+    """Two keyframes, each followed by a step; three steps of a new piece, the third being its keyframe."""
     steps = StepRecord()
     for frame in (0, 1):
         steps.append(frame, HALT)
