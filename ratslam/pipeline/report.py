@@ -10,6 +10,7 @@ from evaluation.report.run_report import read_run_report
 from ratslam.config.changed_settings import ChangedSetting, changed_settings
 from ratslam.config.packaged import read_citation
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_writable
 
 NAME = "report.html"
 """Name of the page in a run directory."""
@@ -22,9 +23,11 @@ def write_report(directories: Sequence[Path], path: Path) -> None:
         directories: of runs, also of interrupted or killed ones. path: the file, replaced if it exists.
 
     Raises:
-        InputError: a folder holds no run or a malformed one, or the extra [report] is not installed.
+        InputError: a folder holds no run or a malformed one, the file cannot be written, or the extra
+            [report] is not installed.
     """
     check_report_libraries("report")
+    require_writable(path)
     runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
     write_page(path, runs, read_citation())
 

@@ -37,8 +37,10 @@ def require_writable(path: Path) -> None:
     """Checks that a file can be made at a path, or replaced there.
 
     Raises:
-        InputError: its folder cannot be written in, or its name is too long.
+        InputError: a folder is there, its own folder cannot be written in, or its name is too long.
     """
+    if os.path.isdir(path):
+        raise InputError(str(path), "a folder", "a file")
     temporary = temporary_path(path)
     try:
         temporary.touch()

@@ -54,6 +54,17 @@ def test_folders_without_a_run_are_refused(
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.parametrize("name", ["folder", "missing/page.html"])
+def test_a_page_that_cannot_be_written_is_refused_before_the_runs_are_read(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    assert main(["report", str(tmp_path / "no run"), "-o", str(tmp_path / name)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path / name}: " in line
+    assert "no run" not in line
+
+
 def test_without_its_libraries_nothing_is_begun(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
