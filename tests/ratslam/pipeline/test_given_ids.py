@@ -25,8 +25,8 @@ UNCERTAIN = 0.9
 """Largest standard deviation of the position of a robot that is found, m."""
 SETTINGS = """
 templates: {source: labels}
-pose_cells: {cells_xy: 21, cell_size: 0.5}
-session: {reserve: 512}
+pose_cells: {cells_xy: 11, cell_size: 0.5, engine: dense}
+session: {reserve: 128}
 """
 
 
@@ -120,6 +120,18 @@ def test_a_robot_that_sees_no_id_for_long_is_lost_and_found_again(map_file: Path
 def test_in_a_building_with_other_ids_it_is_never_found(map_file: Path) -> None:
     state, _ = states(map_file, drive(100, 150, 4, first_id=1000))
     assert not (state == Localisation.FOUND).any()
+
+
+def test_a_building_with_the_same_ids_elsewhere_is_not_this_map(map_file: Path) -> None:
+    session = drive(100, 300, 8)
+    markers = len(lap()) // MARKED
+    mixed = [
+        one._replace(label=np.int32(11 * one.label % markers)) if one.label >= 0 else one
+        for one in session.readings
+    ]
+    state, _ = states(map_file, Drive(mixed, session.truth))
+    assert not (state == Localisation.FOUND).any()
+    assert state[-1] == Localisation.NOT_THIS_MAP
 
 
 def test_sessions_that_saw_the_same_ids_become_one_map(map_file: Path, folder: Path) -> None:
