@@ -115,7 +115,7 @@ def _draw_panel(axes: style.Axes, panel: Panel) -> None:
     if len(panel.curves) > 1:
         axes.legend(
             frameon=False, fontsize=8.5, labelcolor=style.INK,
-            loc="lower left", bbox_to_anchor=(0, 1), ncols=len(panel.curves),
+            loc="lower right", bbox_to_anchor=(1, 1), ncols=len(panel.curves),
         )  # fmt: skip
     for label, limit in panel.limits.items():
         axes.axhline(limit, color=style.VERMILLION, lw=1.0, ls="--", zorder=0.8)
