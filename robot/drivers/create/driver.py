@@ -193,13 +193,13 @@ class CreateDriver:
         try:
             while not self._ending.is_set():
                 due = time.monotonic() + 1 / self.config.rate
+                # Before the first command: a program that hangs right after it is guarded too.
+                if not guard.beat() and loop.active_stop is None:
+                    loop.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
                 loop.poll()
                 self._polled.set()
                 if loop.active_stop and loop.active_stop.reason is StopReason.UNPLUGGED:
                     return
-                if not guard.beat() and loop.active_stop is None:
-                    loop.halt(StopReason.UNGUARDED, "the watchdog process does not respond")
-                    continue  # stops the wheels at once
                 self._wake.wait(max(0.0, due - time.monotonic()))
                 self._wake.clear()
         finally:  # the watchdog then stops the wheels

@@ -237,6 +237,34 @@ def test_the_watchdog_stops_a_killed_or_hanging_program(emulated: Emulated, how:
         process.wait()
 
 
+HANGS = """
+import os, signal, time
+from robot.drivers.create import protocol
+from robot.drivers.create.serial_link import SerialLink
+send, ask = SerialLink.send, SerialLink.ask
+def ask_slowly(link, elapsed):
+    time.sleep(0.3)  # so that the first poll commands the first motion
+    return ask(link, elapsed)
+SerialLink.ask = ask_slowly
+def send_and_hang(link, command):
+    send(link, command)
+    if command == protocol.drive(100, 100):
+        os.kill(os.getpid(), signal.SIGSTOP)
+        time.sleep(1000)  # this thread may still run for a moment
+SerialLink.send = send_and_hang
+"""
+
+
+def test_a_program_that_hangs_right_after_its_first_command_is_stopped(emulated: Emulated) -> None:
+    process = subprocess.Popen([sys.executable, "-c", HANGS + DRIVES, emulated.path])
+    try:
+        until(lambda: emulated.do("state")["wheels"] == [100, 100])
+        until(lambda: emulated.do("state")["wheels"] == [0, 0])
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_the_robot_stops_when_the_watchdog_ends(emulated: Emulated) -> None:
     with create(emulated) as driver:
         driver.drive(0.1, 0.0)
