@@ -55,7 +55,7 @@ def test_a_packaged_session_runs(name: str, session: Session) -> None:
     assert all(np.isfinite(estimate.pose).all() and not estimate.lost for estimate in estimates)
 
 
-@pytest.mark.parametrize("backend", ["classic", "recall"])
+@pytest.mark.parametrize("backend", ["classic", pytest.param("recall", marks=pytest.mark.soak)])
 def test_both_methods_map_the_box(backend: str, tmp_path: Path) -> None:
     result = ratslam.run(load_config("rat_box", (*SHORT, f"backend={backend}")), tmp_path / "run")
     assert len(result.trajectory) == 80
