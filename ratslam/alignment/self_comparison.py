@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.alignment.following import STILL, Motion, Supposed, advance_all
-from ratslam.alignment.gain_odds import GainOdds, GainPrior, learn_gain_odds
+from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.weighing import PLAIN, Weighing
 from tactile.base.se2 import between, wrap
@@ -48,19 +48,13 @@ class Stretch(NamedTuple):
 
 
 def compare_with_itself(
-    ground: Ground,
-    guard: int,
-    gains: Gains,
-    held: np.ndarray | None = None,
-    weighing: Weighing = PLAIN,
-    prior: GainPrior | None = None,
+    ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None, weighing: Weighing = PLAIN
 ) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
         guard: number of keyframes before a stretch that do not count as ground. held: [N] bool, the keyframes
-            that are ground for a session; None: all. weighing: of the gains. prior: of the gains that are
-            counted; None: that of `weighing`.
+            that are ground for a session; None: all. weighing: of the gains.
     """
     count = len(ground.poses)
     held = np.ones(count, bool) if held is None else held
@@ -73,7 +67,7 @@ def compare_with_itself(
             here, *elsewhere = stretch.follow(np.stack([stretch.start, *_alike(stretch)]), LENGTH)
             true.append(_continued(here, weighing.matching))
             false += [_continued(gain, weighing.matching) for gain in elsewhere]
-    return learn_gain_odds(np.concatenate(true), np.concatenate(false), prior or weighing.prior)
+    return learn_gain_odds(np.concatenate(true), np.concatenate(false), weighing.prior)
 
 
 def _stretch(ground: Ground, begin: int, guard: int, gains: Gains, held: np.ndarray) -> Stretch:

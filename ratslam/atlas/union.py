@@ -16,7 +16,7 @@ from ratslam.keyframes.experiences import Experiences
 from ratslam.keyframes.keyframe_graph import INTERRUPTED
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.optimizer import CalibrationPrior
-from ratslam.keyframes.step_record import leading_to
+from ratslam.keyframes.step_record import leading_to, settled
 from tactile.base.se2 import bend_motion, between
 
 Arrays = dict[str, np.ndarray]
@@ -174,10 +174,8 @@ def _steps(a: Arrays, b: Arrays, ever: int, bend: Bend) -> Arrays:
     motion[:, :3] = np.where(early[:, None], motion[:, :3], bend.motions(motion[:, :3], motion[:, 3]))
     motion[early, 3] = 0.0
     number = np.where(early, leading_to(ever), np.where(led, frame - ever, frame + ever))
-    first = a["steps/frame"]
-    settled = np.where(first <= leading_to(ever), ever - 1, first)
     return {
-        "steps/frame": np.concatenate([settled, number]),
+        "steps/frame": np.concatenate([settled(a["steps/frame"], ever), number]),
         "steps/motion": np.concatenate([a["steps/motion"], motion]),
     }
 

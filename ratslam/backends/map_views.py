@@ -115,8 +115,8 @@ class MapViews:
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
 
-        prior = self.graph.appearance.gain_prior(weighing.prior)
-        return compare_with_itself(self.ground(poses), guard, gains, held, weighing, prior)
+        weighing = weighing._replace(prior=self.graph.appearance.gain_prior(weighing.prior))
+        return compare_with_itself(self.ground(poses), guard, gains, held, weighing)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.

@@ -41,8 +41,7 @@ class StepRecord(Checkpointed):
 
     def settle(self, count: int) -> None:
         """The steps that lead to no keyframe of the `count` taken belong to the newest one."""
-        frame = self._frame.rows
-        frame[frame <= leading_to(count)] = count - 1
+        self._frame.rows[:] = settled(self._frame.rows, count)
 
     def take(self, number: np.ndarray) -> np.ndarray:
         """Reduces the record to the steps of keyframes that remain; steps before the first keyframe remain
@@ -83,6 +82,11 @@ class StepRecord(Checkpointed):
         """[T] the keyframe of each step, of `count` keyframes taken."""
         frame = self._frame.rows
         return np.minimum(np.where(frame < -1, leading_to(frame), np.maximum(frame, 0)), count - 1)
+
+
+def settled(frame: np.ndarray, count: int) -> np.ndarray:
+    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the newest."""
+    return np.where(frame <= leading_to(count), count - 1, frame)
 
 
 def leading_to(frame: Any) -> Any:
