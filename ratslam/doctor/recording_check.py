@@ -12,7 +12,7 @@ from ratslam.config.strict_yaml import dump_data, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
 from ratslam.pipeline.source import open_source
-from robot.recordings.unit_check import MotionTrack, TypicalMotion, typical_motion
+from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source
 from tactile.base.errors import InputError

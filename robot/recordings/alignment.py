@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robot.recordings.input_judge import Cures, InputJudge, MotionTrack, unit_cure
 from robot.recordings.sanity_checks import RowName
-from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
@@ -38,6 +38,9 @@ class RecordingRows:
         shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
         errors: found so far. views, seen, label, truth, contact, point: as in `InMemorySource`.
         sensors: the whiskers that make contacts, if any.
+        held: whether the odometry was recorded as velocities. poses: [N, 3] as recorded, where poses were.
+        place: names a row; None: by its number. clock: what to do if the clock is at fault. cures: what to
+        set for a unit.
     """
 
     time: np.ndarray
@@ -49,6 +52,11 @@ class RecordingRows:
     contact: np.ndarray | None = None
     point: np.ndarray | None = None
     sensors: PlanarWhiskersInfo | None = None
+    held: bool = False
+    poses: np.ndarray | None = None
+    place: RowName | None = None
+    clock: str = ""
+    cures: Cures = unit_cure
     views: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
     label: np.ndarray = field(init=False)
@@ -67,18 +75,19 @@ class RecordingRows:
         tips = base + sensors.length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.point = tips * self.contact[:, :, None]
 
-    def source(self, name: str, digest: str, where: str, limits: UnitLimits) -> InMemorySource:
-        """The recording as a `Source`, after the unit check.
+    def source(self, name: str, digest: str, where: str, judge: InputJudge) -> InMemorySource:
+        """The recording as a `Source`, after it was judged.
 
         Raises:
-            InputError: rows have errors, or the units are impossible.
+            InputError: rows have errors, or the odometry cannot be believed.
         """
         everywhere = np.ones(len(self.time), bool)
-        track = MotionTrack(self.time, everywhere, self.motion, self.truth)
-        raise_errors(self.errors + unit_errors(track, where, limits))
+        track = MotionTrack(self.time, everywhere, self.motion, self.truth, self.held, self.poses)
+        place = self.place or (lambda row: f"{where}, row {row}")
+        raise_errors(self.errors + judge.errors(track, place, where, self.clock, self.cures, not self.errors))
         return InMemorySource(
             name=name,
-            digest=digest,
+            digest=judge.stretch.digest(digest),
             time=self.time,
             motion=self.motion,
             moved=everywhere,

@@ -10,8 +10,8 @@ import numpy as np
 from robot.recordings.alignment import interpolated_poses, nearest_rows, range_errors, range_pixels
 from robot.recordings.csv_config import ContactColumns, LabelColumns, PairColumns, TruthColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile
+from robot.recordings.input_judge import UnitLimits, heading_errors
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
-from robot.recordings.unit_check import UnitLimits, heading_errors
 from robot.sources.source_info import PlanarWhiskersInfo
 from tactile.base.errors import InputError
 

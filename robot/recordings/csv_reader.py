@@ -11,8 +11,8 @@ from robot.recordings.alignment import RecordingRows
 from robot.recordings.csv_alignment import align_contacts, align_labels, align_truth, align_views, sensors_of
 from robot.recordings.csv_config import ContactColumns, CsvConfig, PoseColumns, VelocityColumns, ViewColumns
 from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
+from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
 from robot.recordings.sanity_checks import clock_errors
-from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits, heading_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
@@ -22,7 +22,7 @@ ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
 
 
-def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
+def read_csv_recording(path: Path, config: CsvConfig, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
     """A CSV recording as a `Source`: one sample per row of the odometry file.
 
     Raises:
@@ -34,10 +34,13 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
     base = files[path]
     raise_errors(_absences(base, files, config))
 
-    time = base.column(config.time)
+    time, limits = base.column(config.time), judge.limits
     errors = base.faults(config.time) + clock_errors(time, config.time, base.place)
     motion, faults = _motion(base, time, config, limits)
     recording = RecordingRows(time, motion, (config.rows, config.columns, 1), errors=errors + faults)
+    recording.held, recording.place = config.velocity is not None, base.place
+    if config.pose is not None:
+        recording.poses = np.column_stack([base.column(name) for name in config.pose.model_dump().values()])
     if config.views is not None:
         rows, values, faults = align_views(base, files, config.views, time, recording.shape)
         recording.errors += faults
@@ -57,7 +60,7 @@ def read_csv_recording(path: Path, config: CsvConfig, limits: UnitLimits = DEFAU
         file = files[config.truth.file or path]
         recording.truth, faults = align_truth(file, config.truth, time, limits, file is base)
         recording.errors += faults
-    return recording.source(path.stem, digest_of_files(list(files.values())), str(path), limits)
+    return recording.source(path.stem, digest_of_files(list(files.values())), str(path), judge)
 
 
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:

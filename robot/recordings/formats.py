@@ -11,17 +11,17 @@ from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.recordings.camera.video import VideoConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
-from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
+from robot.recordings.input_judge import DEFAULT_LIMITS, InputJudge, UnitLimits
+from robot.recordings.stretch import Stretch, StretchConfig
 from robot.sources.input_files import require_file
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_odometry
 from robot.sources.registry import SOURCES, SourceEntry, Warn
 from robot.sources.source import Source
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 
 
-class RecordingConfig(Settings):
+class RecordingConfig(StretchConfig):
     """A recording to run on."""
 
     file: Path
@@ -77,47 +77,46 @@ def _companion(recording: Path, folder: Path, file: Path) -> Path:
     return max(found, key=lambda path: len(path.name), default=beside / file.name)
 
 
-def _open_mcap(config: RecordingConfig, warn: Warn) -> Source:
+def _open_mcap(config: RecordingConfig, judge: InputJudge) -> Source:
     from robot.recordings.mcap_reader import Recording
     from robot.recordings.mcap_scanner import is_foreign
 
     if is_foreign(config.file):
-        return _open_bag(config, warn)
-    return Recording(config.file, config.limits, warn)
+        return _open_bag(config, judge)
+    return Recording(config.file, judge)
 
 
-def _open_bag(config: RecordingConfig, warn: Warn) -> Source:
+def _open_bag(config: RecordingConfig, judge: InputJudge) -> Source:
     from robot.recordings.bags.reader import read_bag
 
     return read_bag(
         config.file,
         config.topics or TopicsConfig(),
-        config.limits,
-        warn,
+        judge,
         image=config.image,
         visual_odometry=config.visual_odometry,
     )
 
 
-def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
+def _open_npz(config: RecordingConfig, judge: InputJudge) -> Source:
     from robot.recordings.npz_trace import read_trace
 
-    return read_trace(config.file, config.limits)
+    return read_trace(config.file, judge)
 
 
-def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
+def _open_csv(config: RecordingConfig, judge: InputJudge) -> Source:
     from robot.recordings.csv_reader import read_csv_recording
 
-    return read_csv_recording(config.file, config.table, config.limits)
+    return read_csv_recording(config.file, config.table, judge)
 
 
-def _open_video(config: RecordingConfig, warn: Warn) -> Source:
+def _open_video(config: RecordingConfig, judge: InputJudge) -> Source:
     from robot.recordings.camera.video_recording import read_video
 
-    return read_video(config, warn)
+    return read_video(config, judge)
 
 
-FORMATS: dict[str, Callable[[RecordingConfig, Warn], Source]] = {
+FORMATS: dict[str, Callable[[RecordingConfig, InputJudge], Source]] = {
     ".mcap": _open_mcap,
     ".npz": _open_npz,
     ".csv": _open_csv,
@@ -137,16 +136,18 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
     Raises:
         InputError: the file is missing, its format is unknown, or it has errors.
     """
-    return correct_odometry(_open(config, warn), config.odometry)
+    stretch = Stretch(getattr(config, "from"), config.to)
+    judge = InputJudge(config.limits, config.odometry, warn, stretch)
+    return correct_odometry(_open(config, judge), config.odometry)
 
 
-def _open(config: RecordingConfig, warn: Warn) -> Source:
+def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     """The recording as it is."""
     suffix = config.file.suffix.lower()
     if config.topics is not None or (config.file / "metadata.yaml").is_file():
-        return _open_bag(config, warn)
+        return _open_bag(config, judge)
     if suffix in FORMATS:
-        return FORMATS[suffix](config, warn)
+        return FORMATS[suffix](config, judge)
     registered, broken = _registered_formats()
     if suffix not in registered:
         require_file(config.file)
@@ -155,7 +156,7 @@ def _open(config: RecordingConfig, warn: Warn) -> Source:
         raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}", cure)
     entry = registered[suffix]
     settings = read_settings(entry.config_class, {"file": str(config.file)}, "recording")
-    return entry.open(settings, warn)
+    return entry.open(settings, judge.warn)
 
 
 def _registered_formats() -> tuple[dict[str, SourceEntry], list[InputError]]:

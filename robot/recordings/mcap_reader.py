@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
@@ -13,17 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.recordings.cdr_live import Event
+from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import McapScanner
 from robot.recordings.mcap_writer import McapWriter, existing_error
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
-from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, unit_errors
 from robot.sources.input_files import raise_errors, require_file, unreadable_error
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle, Observation, Report, Whisk
+from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 
 class Recording(ClosedSource):
@@ -32,7 +32,7 @@ class Recording(ClosedSource):
 
     Args:
         path: an `.mcap` file written by `Recorder`, complete or not.
-        warn: called with one sentence if the file is truncated or damaged.
+        judge: is told if the file is truncated or damaged.
 
     Attributes:
         truncated: whether the file ends early; its first `length` samples are readable.
@@ -48,9 +48,7 @@ class Recording(ClosedSource):
     whiskers: int
     view_shape: tuple[int, int, int]
 
-    def __init__(
-        self, path: Path, limits: UnitLimits = DEFAULT_LIMITS, warn: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, path: Path, judge: InputJudge = DEFAULT_JUDGE) -> None:
         require_file(path)
         self.path = path
         self.name = path.stem
@@ -77,12 +75,16 @@ class Recording(ClosedSource):
         self.warning = ""
         if self.truncated:
             self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
-        time = self._check_columns(np.frombuffer(columns).reshape(scanner.count, -1), limits)
+        rows = np.frombuffer(columns).reshape(scanner.count, -1)
+        inside = judge.stretch.rows(rows[:, 0], str(path))
+        self._first, self._last = int(inside.argmax()), len(inside) - int(inside[::-1].argmax())
+        self.length, self.digest = self._last - self._first, judge.stretch.digest(self.digest)
+        time = self._check_columns(rows[self._first : self._last], judge)
         self.rate_hz = rate_of(time) or description.rate_hz
-        if self.truncated and warn is not None:
-            warn(self.warning)
+        if self.truncated:
+            judge.say(self.warning)
 
-    def _check_columns(self, columns: np.ndarray, limits: UnitLimits) -> np.ndarray:
+    def _check_columns(self, columns: np.ndarray, judge: InputJudge) -> np.ndarray:
         """Times [N] s of the samples with odometry; raises the errors of all columns."""
         time, motion, truth = columns[:, 0], columns[:, 1:5], columns[:, 5:8]
         low, high, odd, has_truth = columns[:, 8:].T
@@ -90,7 +92,7 @@ class Recording(ClosedSource):
         moved[0] = True  # the first row sets the clock
 
         def place(row: int) -> str:
-            return f"{self.path}, row {row}"
+            return f"{self.path}, row {row + self._first}"
 
         errors = nonfinite_errors(time, "time", place) + clock_errors(time, "time", place, moved)
         errors += nonfinite_errors(motion, "odometry", place) + view_errors(low, high, "view", place)
@@ -101,16 +103,20 @@ class Recording(ClosedSource):
             row = int(back.argmax())
             errors.append(InputError(place(row), f"odometry has dt {motion[row, 3]} s", "at least 0 s"))
         track = MotionTrack(time, moved, motion, truth if has_truth.any() else None)
-        raise_errors(errors + unit_errors(track, str(self.path), limits))
+        raise_errors(errors + judge.errors(track, place, str(self.path), in_order=not errors))
         return time[moved]
 
     def __iter__(self) -> Iterator[Sample]:
         scanner = McapScanner(self.path)
         for sample in scanner:
-            yield sample
-            if scanner.count == self.length:
+            if scanner.count > self._first + 1 or (self._first == 0 and scanner.count == 1):
+                yield sample
+            elif scanner.count == self._first + 1:  # it begins here
+                still = Odometry(0.0, 0.0, 0.0, 0.0)
+                yield sample._replace(reading=sample.reading._replace(odometry=still))
+            if scanner.count == self._last:
                 return
-        found = f"had {self.length} samples and now has {scanner.count}"
+        found = f"had {self._last} samples and now has {scanner.count}"
         raise InputError(str(self.path), found, "a file that does not change while it is read")
 
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
-from robot.recordings.unit_check import DEFAULT_LIMITS, MotionTrack, UnitLimits, unit_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
@@ -38,7 +38,7 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OS
            RuntimeError, SyntaxError)  # fmt: skip
 
 
-def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySource:
+def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
     """Read a reference trace; `info.provenance["parameters"]` holds its parameters.
 
     Raises:
@@ -51,6 +51,8 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
     params = _params(path, arrays["params_json"])
     shape, given_ids = _view_shape(path, params, arrays["in_view"].shape[1])
 
+    inside = judge.stretch.rows(arrays["in_t"].astype(np.float64), str(path))
+    arrays |= {name: array[inside] for name, array in arrays.items() if name != "params_json"}
     time, speed, turn = (arrays[name].astype(np.float64) for name in COLUMNS[:3])
     flags = arrays["in_flags"]
     seen, moved = np.isin(flags, (VIEW, VIEW | ODOMETRY)), np.isin(flags, (ODOMETRY, VIEW | ODOMETRY))
@@ -60,9 +62,13 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
     with np.errstate(all="ignore"):  # faulty values are reported below
         motion[moved] = from_velocities(time[moved], speed[moved], 0.0, turn[moved], TURN_THEN_MOVE)
 
-    track = MotionTrack(time, moved, motion, truth)
-    errors = _value_errors(lambda row: f"{path}, row {row}", arrays, track, view, seen, given_ids)
-    raise_errors(errors + unit_errors(track, str(path), limits))
+    track, skipped = MotionTrack(time, moved, motion, truth, held=True), int(inside.argmax())
+
+    def place(row: int) -> str:
+        return f"{path}, row {row + skipped}"
+
+    errors = _value_errors(place, arrays, track, view, seen, given_ids)
+    raise_errors(errors + judge.errors(track, place, str(path), in_order=not errors))
 
     label = np.full(len(time), -1, np.int32)
     picture = np.zeros((len(time), *shape))
@@ -72,7 +78,7 @@ def read_trace(path: Path, limits: UnitLimits = DEFAULT_LIMITS) -> InMemorySourc
         picture[seen] = view[seen].reshape(-1, *shape)
     return InMemorySource(
         name=path.stem,
-        digest=digest_of([content]),
+        digest=judge.stretch.digest(digest_of([content])),
         time=time,
         motion=motion,
         moved=moved,

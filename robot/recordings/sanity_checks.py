@@ -2,7 +2,7 @@
 
 A whole recording is checked before it is used. Each check returns its errors instead of raising them, so
 that a reader can report all at once. Only `nonfinite_errors` reports non-finite values; the other checks
-ignore them. For units see `robot.recordings.unit_check`.
+ignore them. For units see `robot.recordings.input_judge`.
 """
 
 from __future__ import annotations

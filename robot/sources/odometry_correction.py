@@ -1,4 +1,4 @@
-"""Correction of an odometry whose systematic errors are known."""
+"""Correction of an odometry whose systematic errors are known, and of steps that cannot be true."""
 
 from __future__ import annotations
 
@@ -25,13 +25,34 @@ class OdometryCorrection(Settings):
     """True turn for each radian of the odometry."""
     heading_bias: float = 0.0
     """Turn to add for each metre of the odometry, rad/m, counter-clockwise."""
+    largest_step: PositiveFloat | None = None
+    """Longest step that can be true, m: a longer one (a wild pose, a reset, a velocity over a gap) is
+    replaced by the step before it. Null: none is."""
+    largest_turn: PositiveFloat | None = None
+    """Largest turn in a step that can be true, rad, likewise."""
 
 
 UNCORRECTED = OdometryCorrection()
 
 
+def replace_steps(
+    correction: OdometryCorrection, motion: np.ndarray, before: np.ndarray | None = None
+) -> np.ndarray:
+    """Motions [N, 3] (m, m, rad), those beyond the largest step and turn replaced by the last one within.
+
+    Args:
+        before: [3] the motion before the first; None: no motion.
+    """
+    if correction.largest_step is None and correction.largest_turn is None:
+        return motion
+    most = [np.inf if each is None else each for each in (correction.largest_step, correction.largest_turn)]
+    good = (np.hypot(motion[:, 0], motion[:, 1]) <= most[0]) & (np.abs(motion[:, 2]) <= most[1])
+    last = np.maximum.accumulate(np.where(good, np.arange(1, len(motion) + 1), 0))
+    return np.concatenate([np.zeros((1, 3)) if before is None else before[None], motion])[last]
+
+
 def correct_motions(correction: OdometryCorrection, motion: np.ndarray) -> np.ndarray:
-    """Motions [..., 3] (m, m, rad) of an odometry without its systematic errors."""
+    """Motions [..., 3] (m, m, rad) of an odometry without its systematic errors; none is replaced."""
     motion = np.asarray(motion, float)
     length = np.hypot(motion[..., 0], motion[..., 1])
     scaled = motion * np.array([correction.length_scale, correction.length_scale, 1.0])
@@ -43,11 +64,10 @@ def correct_observations(
 ) -> list[Observation]:
     """Observations with the odometry corrected."""
     motions = np.array([observation.odometry[:3] for observation in observations]).reshape(-1, 3)
+    corrected = correct_motions(correction, replace_steps(correction, motions))
     return [
         observation._replace(odometry=Odometry(dx, dy, dtheta, observation.odometry.dt))
-        for observation, (dx, dy, dtheta) in zip(
-            observations, correct_motions(correction, motions), strict=True
-        )
+        for observation, (dx, dy, dtheta) in zip(observations, corrected, strict=True)
     ]
 
 
@@ -55,9 +75,10 @@ def correct_odometry(source: Source, correction: OdometryCorrection) -> Source:
     """The source with corrected odometry; its digest tells the correction too."""
     if correction == UNCORRECTED:
         return source
-    digest = digest_of([source.digest.encode(), correction.model_dump_json().encode()])
+    digest = digest_of([source.digest.encode(), correction.model_dump_json(exclude_none=True).encode()])
     if isinstance(source, InMemorySource):
-        motion = np.column_stack([correct_motions(correction, source.motion[:, :3]), source.motion[:, 3]])
+        moved, motion = source.moved, source.motion.copy()
+        motion[moved, :3] = correct_motions(correction, replace_steps(correction, motion[moved, :3]))
         return replace(source, motion=motion, digest=digest)
     return _CorrectedSource(source, correction, digest)
 
@@ -79,8 +100,10 @@ class _CorrectedSource:
         self._source.__exit__(*error)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Sample]:
+        before = np.zeros(3)
         for sample in self._source:
             *motion, dt = sample.reading.odometry
-            dx, dy, dtheta = correct_motions(self._correction, np.array(motion, float))
+            before = replace_steps(self._correction, np.array([motion], float), before)[0]
+            dx, dy, dtheta = correct_motions(self._correction, before)
             moved = Odometry(dx, dy, dtheta, dt)
             yield sample._replace(reading=sample.reading._replace(odometry=moved))

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
+from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.input_files import missing_error, require_file, unreadable_error
 from tactile.base.errors import InputError
 
@@ -47,8 +48,8 @@ class Bag:
         InputError: the bag is missing, damaged or empty, or rosbags is not installed.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._stack = path, ExitStack()
+    def __init__(self, path: Path, stretch: Stretch = WHOLE) -> None:
+        self.path, self.stretch, self._stack = path, stretch, ExitStack()
         files = bag_files(path)
         try:
             from rosbags import rosbag1, rosbag2

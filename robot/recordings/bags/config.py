@@ -48,6 +48,10 @@ class PoseTopic(Topic):
     """Topic of Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped messages."""
     tf: Annotated[tuple[str, str] | None, FromList] = None
     """Or two frames of /tf and /tf_static: the pose of the second in the first, such as [map, base_link]."""
+    frames: Annotated[tuple[str, str] | None, FromList] = None
+    """Only messages with this frame and child frame, where several nodes publish on the topic."""
+    plane: Literal["xy", "xz"] = "xy"
+    """Plane of the motion: `xz` for poses of a camera (x to the right, y down, z ahead)."""
 
     @model_validator(mode="after")
     def _one_origin(self) -> PoseTopic:

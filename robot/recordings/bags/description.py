@@ -15,7 +15,7 @@ from robot.recordings.bags.scans import CLOUD, SCAN, cloud_points, is_ring, scan
 from robot.recordings.bags.stamps import nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
 from robot.recordings.bags.transforms import MOVING, STATIC, read_links
-from robot.recordings.unit_check import MotionTrack, typical_motion
+from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 

@@ -17,32 +17,50 @@ def yaw_of(x: float, y: float, z: float, w: float) -> float:
     return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
-def pose_in_plane(position: Any, orientation: Any, where: str) -> tuple[float, float, float]:
+def pose_in_plane(
+    position: Any, orientation: Any, where: str, plane: str = "xy"
+) -> tuple[float, float, float]:
     """(x m, y m, heading rad) of a position and a quaternion.
 
+    Args:
+        plane: `xy`; `xz` of a camera (x to the right, y down, z ahead): x = z, y = -x, heading of its z axis.
+
     Raises:
-        InputError: the quaternion is 0.
+        InputError: the quaternion is 0, or a number is not finite.
     """
     turn = tuple(float(getattr(orientation, axis)) for axis in "xyzw")
     if not any(turn):
         raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion")
-    return float(position.x), float(position.y), yaw_of(*turn)
+    place = tuple(float(getattr(position, axis)) for axis in plane)
+    for name, values in (("orientation", turn), ("position", place)):
+        if not np.isfinite(values).all():
+            raise InputError(where, f"the {name} is {', '.join(map(str, values))}", "finite numbers")
+    if plane == "xz":
+        x, y, z, w = turn
+        return place[1], -place[0], float(np.arctan2(-2 * (x * z + w * y), w * w + z * z - x * x - y * y))
+    return place[0], place[1], yaw_of(*turn)
 
 
-def _of_pose(pose: Any, where: str) -> tuple[float, float, float]:
-    return pose_in_plane(pose.position, pose.orientation, where)
-
-
-def _of_transform(transform: Any, where: str) -> tuple[float, float, float]:
-    return pose_in_plane(transform.translation, transform.rotation, where)
-
-
-POSES: dict[str, Callable[[Any, str], tuple[float, float, float]]] = {
-    ODOMETRY: lambda message, where: _of_pose(message.pose.pose, where),
-    "geometry_msgs/msg/PoseStamped": lambda message, where: _of_pose(message.pose, where),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message, where: _of_pose(message.pose.pose, where),
-    "geometry_msgs/msg/TransformStamped": lambda message, where: _of_transform(message.transform, where),
+PARTS: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+    ODOMETRY: lambda message: (message.pose.pose.position, message.pose.pose.orientation),
+    "geometry_msgs/msg/PoseStamped": lambda message: (message.pose.position, message.pose.orientation),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: (
+        message.pose.pose.position,
+        message.pose.pose.orientation,
+    ),
+    "geometry_msgs/msg/TransformStamped": lambda message: (
+        message.transform.translation,
+        message.transform.rotation,
+    ),
 }
+"""Message types with a pose: its position and orientation."""
+
+
+def _reader(kind: str) -> Callable[[Any, str], tuple[float, float, float]]:
+    return lambda message, where: pose_in_plane(*PARTS[kind](message), where)
+
+
+POSES: dict[str, Callable[[Any, str], tuple[float, float, float]]] = {kind: _reader(kind) for kind in PARTS}
 """Message types with a pose, and how it is read."""
 
 TWISTS: dict[str, Callable[[Any], Any]] = {

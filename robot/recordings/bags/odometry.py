@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
-from robot.recordings.bags.motions import ODOMETRY, POSES, TWISTS, twist_in_plane
-from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_messages
+from robot.recordings.bags.motions import PARTS, POSES, TWISTS, pose_in_plane, twist_in_plane
+from robot.recordings.bags.stamps import Clock, Report, Series, as_series, left_out, seconds, stamp_of
 from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors
-from robot.recordings.unit_check import UnitLimits
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
+
+FLAT = 10.0
+"""Extent in z above this many times that in y: the path does not lie in the plane."""
 
 
 class BagOdometry(NamedTuple):
@@ -23,7 +26,9 @@ class BagOdometry(NamedTuple):
 
     Attributes:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
-        where: file and topic. body: frame of the robot, '' if the bag does not say.
+        where: file and topic. body: frame of the robot, '' if the bag does not say. errors: found in it.
+        numbers: [N] message of each sample. held: whether these are velocities. poses: [N, 3] as recorded;
+        None if there are none. clock: the setting that takes the other clock, if that is better; else ''.
     """
 
     time: np.ndarray
@@ -31,12 +36,14 @@ class BagOdometry(NamedTuple):
     where: str
     body: str
     errors: list[InputError]
+    numbers: np.ndarray
+    held: bool = False
+    poses: np.ndarray | None = None
+    clock: str = ""
 
 
-def read_odometry(
-    bag: Bag, config: OdometryTopic, clock: Clock, limits: UnitLimits, report: Report
-) -> BagOdometry:
-    """The odometry; steps faster than the limits are reported.
+def read_odometry(bag: Bag, config: OdometryTopic, clock: Clock, report: Report) -> BagOdometry:
+    """The odometry.
 
     Raises:
         InputError: the topic does not exist or has no odometry.
@@ -49,19 +56,21 @@ def read_odometry(
         assert config.topic is not None
         kind = bag.topic(config.topic, "recording.topics.odometry").kind
         twist = kind in TWISTS and (config.use == "twist" or kind not in POSES)
-        series, body = _read_series(bag, config.topic, "odometry", clock, report, twist)
+        series, body = _read_series(bag, config, "odometry", clock, report, twist)
     errors = series.errors + nonfinite_errors(series.values, "odometry", series.place)
-    time, values = series.time, series.values
+    time, values, numbers = series.time, series.values, series.numbers
     if len(time) < 2 and not errors:
         errors.append(InputError(series.where, "one message with odometry", "at least two"))
     if errors:
-        return BagOdometry(time, np.zeros((len(time), 4)), series.where, body, errors)
+        return BagOdometry(time, np.zeros((len(time), 4)), series.where, body, errors, numbers)
     motion = from_velocities(time, *values.T) if twist else from_poses(time, values)
-    _report_jumps(motion, time, series.where, limits, report)
     if config.every > 1:
-        time, poses = time[:: config.every], integrate(motion[:, :3])[:: config.every]
-        motion = from_poses(time, poses)
-    return BagOdometry(time, motion, series.where, body, [])
+        chosen = slice(None, None, config.every)
+        path = integrate(motion[:, :3])[chosen]
+        time, numbers, values = time[chosen], numbers[chosen], values[chosen]
+        motion = from_poses(time, path)
+    given = None if twist else values
+    return BagOdometry(time, motion, series.where, body, [], numbers, twist, given, series.clock)
 
 
 def read_poses(bag: Bag, config: PoseTopic, clock: Clock, report: Report) -> Series:
@@ -73,8 +82,7 @@ def read_poses(bag: Bag, config: PoseTopic, clock: Clock, report: Report) -> Ser
     if config.tf is not None:
         series = poses_between(bag, config.tf, clock, report)
     else:
-        assert config.topic is not None
-        series, _ = _read_series(bag, config.topic, "truth", clock, report, twist=False)
+        series, _ = _read_series(bag, config, "truth", clock, report, twist=False)
     return series._replace(errors=series.errors + nonfinite_errors(series.values, "truth", series.place))
 
 
@@ -97,40 +105,103 @@ def motion_at(moments: np.ndarray, time: np.ndarray, motion: np.ndarray) -> tupl
 
 
 def _read_series(
-    bag: Bag, name: str, role: str, clock: Clock, report: Report, twist: bool
+    bag: Bag, config: PoseTopic, role: str, clock: Clock, report: Report, twist: bool
 ) -> tuple[Series, str]:
     """Poses or velocities [M, 3] of a topic, and the frame of the robot."""
-    topic = bag.topic(name, f"recording.topics.{role}")
+    assert config.topic is not None
+    topic = bag.topic(config.topic, f"recording.topics.{role}")
     where = f"{bag.path}, {topic.name}"
     if topic.kind not in POSES and not twist:
         known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
         raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
-    numbers, stamps, values, body = list[int](), list[int](), list[tuple[float, float, float]](), ""
-    for number, stamp, content in read_messages(bag, topic, clock):
-        if twist:
-            values.append(twist_in_plane(TWISTS[topic.kind](content)))
-        else:
-            values.append(POSES[topic.kind](content, f"{where}, message {number}"))
-        body = body or _body_of(content, topic.kind)
-        numbers.append(number)
-        stamps.append(stamp)
-    return as_series(where, numbers, stamps, np.array(values).reshape(-1, 3), clock, report), body
+    rows, kept, bad, faults = list[Any](), list[Any](), list[InputError](), _PoseFaults(config.plane)
+    for number, (received, content) in enumerate(bag.messages(topic)):
+        frames = _frames_of(content)
+        if config.frames is not None and frames != tuple(frame.lstrip("/") for frame in config.frames):
+            continue
+        place = f"{where}, message {number}"
+        try:
+            if twist:
+                value = twist_in_plane(TWISTS[topic.kind](content))
+            else:
+                parts = PARTS[topic.kind](content)
+                value = pose_in_plane(*parts, place, config.plane)
+                faults.add(content, parts, place)
+            if not np.isfinite(value).all():
+                raise InputError(place, f"velocities {', '.join(map(str, value))}", "finite numbers")
+        except InputError as error:
+            bad.append(InputError(f"{place}, {seconds(received)} s", error.found, error.expected))
+            continue
+        rows.append((number, stamp_of(content, received, clock), received, frames))
+        kept.append(value)
+    count = len(rows) + len(bad)
+    errors = left_out(where, len(bad), count, bad[0], report) if bad else []
+    numbers, stamps, receipts, pairs = ([row[k] for row in rows] for k in range(4))
+    errors += _frame_errors(where, numbers, pairs, role)
+    if not errors:
+        faults.tell(where, count, report)
+    values = np.array(kept).reshape(-1, 3)
+    series = as_series(where, numbers, stamps, values, clock, report, receipts)
+    body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
+    return series._replace(errors=errors + series.errors), body
 
 
-def _body_of(message: Any, kind: str) -> str:
-    """The frame of the robot; '' if the message does not name it."""
-    if kind == ODOMETRY:
-        return str(message.child_frame_id)
-    return "" if kind in POSES else str(message.header.frame_id)
+def _frames_of(message: Any) -> tuple[str, str]:
+    """Frame and child frame of a message, without leading slashes; '' where it names none."""
+    frame, child = str(message.header.frame_id), str(getattr(message, "child_frame_id", ""))
+    return frame.lstrip("/"), child.lstrip("/")
 
 
-def _report_jumps(
-    motion: np.ndarray, time: np.ndarray, where: str, limits: UnitLimits, report: Report
-) -> None:
-    length = np.hypot(motion[1:, 0], motion[1:, 1])
-    jumps = length > limits.speed * motion[1:, 3]
-    if jumps.any():
-        row = int((length * jumps).argmax()) + 1
-        step = f"jumps by {length[row - 1]:.3g} m in {motion[row, 3]:.3g} s at {time[row]:.3f} s"
-        count = f"the largest of {int(jumps.sum())} steps faster than limits.speed ({limits.speed:g} m/s)"
-        report(f"{where}: {step}, {count}")
+def _frame_errors(
+    where: str, numbers: list[int], frames: list[tuple[str, str]], role: str
+) -> list[InputError]:
+    """The error for messages of several frames: poses of different frames cannot be compared."""
+    counts = Counter(frames)
+    if len(counts) < 2:
+        return []
+    (usual, _), *others = counts.most_common()
+    parts = [
+        f"{' to '.join(filter(None, pair)) or 'no frame'} ({count})" for pair, count in counts.most_common()
+    ]
+    number = numbers[next(k for k, pair in enumerate(frames) if pair == others[0][0])]
+    found = (
+        f"messages of several frames: {', '.join(parts)}; several nodes publish here, or the frame changes"
+    )
+    cure = f"set recording.topics.{role}.frames to [{', '.join(map(repr, usual))}]"
+    return [InputError(f"{where}, message {number}", found, "one frame and child frame", cure)]
+
+
+class _PoseFaults:
+    """Counts poses that can be read, but whose publisher or plane is doubtful."""
+
+    def __init__(self, plane: str) -> None:
+        self._plane, self._places = plane, list[Any]()
+        self._count, self._first = Counter[str](), dict[str, str]()
+
+    def add(self, message: Any, parts: tuple[Any, Any], place: str) -> None:
+        position, turn = parts
+        self._places.append((position.x, position.y, position.z))
+        if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
+            self._note("orientations are not unit quaternions (only their direction is used)", place)
+        covariance = getattr(getattr(message, "pose", None), "covariance", None)
+        if covariance is not None:
+            matrix = np.asarray(covariance, float)
+            if not np.isfinite(matrix).all() or (matrix[::7] < 0).any():
+                self._note(
+                    "covariances are not numbers or negative: the publisher did not know the pose", place
+                )
+
+    def _note(self, fault: str, place: str) -> None:
+        self._count[fault] += 1
+        self._first.setdefault(fault, place)
+
+    def tell(self, where: str, total: int, report: Report) -> None:
+        """Tells each fault once, with its first place."""
+        for fault, count in self._count.items():
+            report(f"{self._first[fault]}: {count} of {total} {fault}; look at the publisher")
+        if self._plane == "xy" and len(self._places) > 1:
+            x, y, z = np.ptp(np.array(self._places), axis=0)
+            if z > 0.1 * x and z > FLAT * y:
+                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z"
+                cure = "poses of a camera (z ahead)? set recording.topics.odometry.plane to xz"
+                report(f"{where}: {found}: it lies in another plane; {cure}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,14 @@ from robot.recordings.bags.bag import Bag, bag_digest
 from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
 from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
-from robot.recordings.bags.stamps import Report, Series
+from robot.recordings.bags.stamps import LEFT_OUT, Report, Series, other_clock
 from robot.recordings.bags.touch import read_touch
 from robot.recordings.bags.views import KEY, read_image_views, read_range_views
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
-from robot.recordings.unit_check import DEFAULT_LIMITS, UnitLimits
+from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
-from robot.sources.registry import Warn
 from tactile.base.errors import InputError
 
 NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
@@ -34,8 +34,7 @@ NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
 def read_bag(
     path: Path,
     config: TopicsConfig,
-    limits: UnitLimits = DEFAULT_LIMITS,
-    warn: Warn = None,
+    judge: InputJudge = DEFAULT_JUDGE,
     *,
     image: ImageViewConfig | None = None,
     visual_odometry: VisualOdometryConfig | None = None,
@@ -43,21 +42,22 @@ def read_bag(
     """A bag as a `Source`: one sample for each odometry message, or for each view.
 
     Args:
-        warn: called with one sentence for every message that is left out, gap and jump.
+        judge: is told of every message that is left out, and judges the odometry.
         image: how images become views. visual_odometry: for a bag of images without odometry.
 
     Raises:
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
-    report = warn or (lambda sentence: None)
-    with Bag(path) as bag:
+    report = judge.say
+    with Bag(path, judge.stretch) as bag:
         config = with_preset(bag, config)
         _check_roles(bag, config, visual_odometry)
         images = image or ImageViewConfig()
-        odometry, views = _read_steps(bag, config, limits, images, visual_odometry, report)
+        odometry, views = _read_steps(bag, config, images, visual_odometry, report)
         truth = None if config.truth is None else read_poses(bag, config.truth, config.clock, report)
     found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
     raise_errors(list(dict.fromkeys(found)))
+    raise_errors(_judge(odometry, judge))
     if views is not None and config.samples == "views":
         odometry, views = _sample_views(odometry, views, report)
     shape, whiskers = NO_VIEWS, 0
@@ -72,7 +72,22 @@ def read_bag(
         given = truth.time, truth.values, "time", truth.where
         recording.truth, faults = interpolated_poses(odometry.time, *given)
         recording.errors += faults
-    return recording.source(path.stem, bag_digest(path), str(path), limits)
+    judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
+    return recording.source(path.stem, bag_digest(path), str(path), judge)
+
+
+def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
+    """Judges the odometry as recorded, each step by the number of its message."""
+    everywhere = np.ones(len(odometry.time), bool)
+    track = MotionTrack(odometry.time, everywhere, odometry.motion, None, odometry.held, odometry.poses)
+
+    def place(row: int) -> str:
+        return f"{odometry.where}, message {odometry.numbers[row]}"
+
+    def cures(quantity: str, unit: str) -> str:
+        return odometry.clock or other_clock("header") if quantity == "time" else unit_cure(quantity, unit)
+
+    return judge.errors(track, place, odometry.where, odometry.clock, cures)
 
 
 def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
@@ -109,7 +124,6 @@ def _check_roles(bag: Bag, config: TopicsConfig, visual_odometry: VisualOdometry
 def _read_steps(
     bag: Bag,
     config: TopicsConfig,
-    limits: UnitLimits,
     image: ImageViewConfig,
     visual_odometry: VisualOdometryConfig | None,
     report: Report,
@@ -117,14 +131,14 @@ def _read_steps(
     """The odometry, and the views or touch readings if there are any."""
     clock, odometry = config.clock, None
     if config.odometry is not None:
-        odometry = read_odometry(bag, config.odometry, clock, limits, report)
+        odometry = read_odometry(bag, config.odometry, clock, report)
     if config.views is not None and (topic := bag.topic(config.views.topic, KEY)).kind in IMAGES:
         wanted = None if odometry is not None else visual_odometry
         views, motion = read_image_views(bag, topic, image, wanted, clock, report)
         if odometry is not None:
             return odometry, views
         assert motion is not None
-        return BagOdometry(views.time, motion, views.where, "", views.errors), views
+        return BagOdometry(views.time, motion, views.where, "", views.errors, views.numbers), views
     if odometry is None:
         raise InputError("recording.visual_odometry", "views without images", "images, or topics.odometry")
     if config.views is not None:
@@ -173,4 +187,5 @@ def _report_unused(views: Series, unused: np.ndarray, why: str, report: Report) 
     if unused.any():
         first = float(views.time[int(unused.argmax())])
         count = f"{int(unused.sum())} of {len(unused)} views, the first at {first:.3f} s"
-        report(f"{views.where}: {count}, are {why}; they are left out")
+        few = "note: " if unused.mean() <= LEFT_OUT else ""
+        report(f"{few}{views.where}: {count}, are {why}; they are left out")

@@ -1,4 +1,4 @@
-"""Times of the messages of a topic, and what can be wrong with them."""
+"""Times of the messages of a topic, and messages that cannot be used."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from robot.recordings.bags.bag import Bag, Topic
+from robot.recordings.input_judge import GAP, LEAST_GAP
 from tactile.base.errors import InputError
 
 Clock = Literal["header", "bag"]
-GAP = 10.0  # median steps: a longer pause of at least `LEAST_GAP` s is reported
-LEAST_GAP = 1.0
-BAG_TIME = "set recording.topics.clock to bag"
+OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
+LEFT_OUT = 0.05
+"""Largest share of a topic's messages that are left out with a warning; one always is."""
 
 Report = Callable[[str], None]
 
@@ -33,8 +34,13 @@ class Message(NamedTuple):
 def read_messages(bag: Bag, topic: Topic, clock: Clock) -> Iterator[Message]:
     """The messages of a topic with their times."""
     for number, (received, content) in enumerate(bag.messages(topic)):
-        stamped = clock == "header" and hasattr(content, "header")
-        yield Message(number, nanoseconds(content.header.stamp) if stamped else received, content)
+        yield Message(number, stamp_of(content, received, clock), content)
+
+
+def stamp_of(content: Any, received: int, clock: Clock) -> int:
+    """The time of a message received at this time, ns, by a clock."""
+    stamped = clock == "header" and hasattr(content, "header")
+    return nanoseconds(content.header.stamp) if stamped else received
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -52,42 +58,82 @@ def in_seconds(stamps: list[int]) -> np.ndarray:
     return np.array([stamp / 10**9 for stamp in stamps])
 
 
-def usable_stamps(
-    stamps: list[int], where: str, clock: Clock, report: Report
-) -> tuple[np.ndarray, list[InputError]]:
-    """The messages to use: [M] bool; those that repeat a stamp are left out and reported, as are gaps.
+def left_out(
+    where: str, count: int, total: int, first: InputError, report: Report, at: str = ""
+) -> list[InputError]:
+    """Leaves out some messages of a topic: told as a warning, or an error if they are more than `LEFT_OUT`.
 
-    Errors: a stamp is 0 or earlier than the one before.
+    Args:
+        count: of the messages left out, of `total`. first: why the first cannot be used. at: its time.
+    """
+    if not count:
+        return []
+    if count > max(1, LEFT_OUT * total):
+        found = f"{first.found} (so in {count} of {total} messages)"
+        return [InputError(first.where, found, first.expected, first.cure)]
+    at = f" at {at}" if at else ""
+    report(f"{first.where}{at}: {first.found}; {count} of {total} messages are left out")
+    return []
+
+
+def usable_stamps(
+    stamps: list[int], where: str, clock: Clock, report: Report, received: list[int] | None = None
+) -> tuple[np.ndarray, list[InputError]]:
+    """The messages to use: [M] bool. Those that repeat a stamp, a few with stamp 0 and a few out of order are
+    left out and reported.
+
+    Args:
+        received: times of receipt, ns; None if they are not known.
+
+    Errors: more stamps than `LEFT_OUT` are 0 or out of order.
     """
     times = np.array(stamps, np.int64)
-    cure = BAG_TIME if clock == "header" else ""
-    errors = []
-    if (times == 0).any():
-        number, count = int((times == 0).argmax()), int((times == 0).sum())
-        found = f"the stamp is 0 (in {count} of {len(times)} messages)"
-        errors.append(InputError(f"{where}, message {number}", found, "the time of the measurement", cure))
-        return times > 0, errors
-    steps = np.diff(times)
-    if (steps < 0).any():
-        number = int((steps < 0).argmax()) + 1
-        found = f"the stamp goes back from {seconds(stamps[number - 1])} to {seconds(stamps[number])} s"
-        found += f" (so in {int((steps < 0).sum())} of {len(times)} messages)"
-        errors.append(InputError(f"{where}, message {number}", found, "times that increase", cure))
-        return np.ones(len(times), bool), errors
-    fresh = np.concatenate([[True], steps > 0])
+    cure = other_clock(clock) if received is None or clock == "header" else ""
+    if received is not None and (np.diff(received) < 0).any():
+        cure = ""
+    errors, use = list[InputError](), times != 0
+    if not use.all():
+        number = int((~use).argmax())
+        first = InputError(
+            f"{where}, message {number}", "the stamp is 0", "the time of the measurement", cure
+        )
+        errors += left_out(where, int((~use).sum()), len(times), first, report)
+    kept = times[use]
+    if len(kept) and (np.diff(kept) < 0).any():
+        late, early = kept < np.maximum.accumulate(kept), kept > np.minimum.accumulate(kept[::-1])[::-1]
+        wrong = early if early.sum() < late.sum() else late
+        row = int(late.argmax())
+        number = int(np.flatnonzero(use)[row])
+        found = f"the stamp goes back from {seconds(int(kept[row - 1]))} to {seconds(int(kept[row]))} s"
+        first = InputError(f"{where}, message {number}", found, "times that increase", cure)
+        faults = left_out(where, int(wrong.sum()), len(times), first, report)
+        errors += faults
+        if not faults:
+            use[np.flatnonzero(use)[wrong]] = False
+    if errors:
+        return use, errors
+    fresh = np.concatenate([[True], np.diff(times[use]) > 0])
     if not fresh.all():
-        number, count = int((~fresh).argmax()), int((~fresh).sum())
+        number, count = int(np.flatnonzero(use)[~fresh][0]), int((~fresh).sum())
         repeated = f"{count} of {len(times)} messages repeat the stamp of the message before"
-        report(f"{where}: {repeated}, the first at {seconds(stamps[number])} s; they are left out")
-    steps = steps[steps > 0]
-    if len(steps):
-        gaps = (steps > GAP * np.median(steps)) & (steps >= LEAST_GAP * 1e9)
-        if gaps.any():
-            longest = int(steps.argmax())
-            start = int(times[fresh][longest])
-            others = f", the longest of {int(gaps.sum())} gaps" if gaps.sum() > 1 else ""
-            report(f"{where}: nothing for {steps[longest] / 1e9:.3g} s from {seconds(start)} s on{others}")
-    return fresh, errors
+        tail = "; they are left out" + (f"; {cure}" if cure and count > len(times) / 2 else "")
+        report(f"{where}: {repeated}, the first at {seconds(stamps[number])} s{tail}")
+        use[np.flatnonzero(use)[~fresh]] = False
+    return use, errors
+
+
+def other_clock(clock: Clock) -> str:
+    """The setting that takes the other times of the messages."""
+    return f"set recording.topics.clock to {OTHER_CLOCK[clock]}"
+
+
+def leaps(times: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[M - 1] bool, steps of these times [M] that leap ahead or go back, where another clock does not."""
+    step, same = np.diff(times), np.diff(other)
+    if not len(step):
+        return np.zeros(0, bool)
+    long = max(GAP * float(np.median(step)), LEAST_GAP * 1e9)
+    return ((step > long) & (same < long) & (same >= 0)) | ((step < 0) & (same >= 0))
 
 
 class Series(NamedTuple):
@@ -96,6 +142,7 @@ class Series(NamedTuple):
     Attributes:
         where: file and topic, for errors. time: [M] s, increasing. values: [M, ...].
         numbers: [M] message of each value. errors: found in it; without any, M is at least 1.
+        clock: the setting that takes the other times, where these leap and the others do not; else ''.
     """
 
     where: str
@@ -103,13 +150,20 @@ class Series(NamedTuple):
     values: np.ndarray
     numbers: np.ndarray
     errors: list[InputError]
+    clock: str = ""
 
     def place(self, row: int) -> str:
         return f"{self.where}, message {self.numbers[row]}"
 
 
 def as_series(
-    where: str, numbers: list[int], stamps: list[int], values: np.ndarray, clock: Clock, report: Report
+    where: str,
+    numbers: list[int],
+    stamps: list[int],
+    values: np.ndarray,
+    clock: Clock,
+    report: Report,
+    received: list[int] | None = None,
 ) -> Series:
     """The values [M, ...] of messages with usable stamps.
 
@@ -118,5 +172,7 @@ def as_series(
     """
     if not stamps:
         raise InputError(where, "no message that can be used", "at least one")
-    use, errors = usable_stamps(stamps, where, clock, report)
-    return Series(where, in_seconds(stamps)[use], values[use], np.array(numbers)[use], errors)
+    use, errors = usable_stamps(stamps, where, clock, report, received)
+    leap = received is not None and leaps(np.array(stamps)[use], np.array(received)[use]).any()
+    cure = other_clock(clock) if leap else ""
+    return Series(where, in_seconds(stamps)[use], values[use], np.array(numbers)[use], errors, cure)

@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robot.recordings.camera.rows import camera_rows
+from robot.recordings.camera.rows import CameraRows, camera_rows
 from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
 from robot.recordings.csv_alignment import align_truth, each_nearest
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import CsvFile, read_csv
 from robot.recordings.csv_reader import ODOMETRY, read_csv_recording
-from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
+from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, raise_errors, require_file
-from robot.sources.registry import Warn
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 BLOCK = 1 << 20  # bytes of a video read at once for its hash
 
 
-def read_video(config: RecordingConfig, warn: Warn = None) -> InMemorySource:
+def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
     """A video as a `Source`: one sample per frame, or per odometry row where there is odometry.
 
     Raises:
@@ -40,24 +39,28 @@ def read_video(config: RecordingConfig, warn: Warn = None) -> InMemorySource:
     raise_errors(_contradictions(config))
     wheels = None
     if video.odometry is not None:
-        wheels = read_csv_recording(video.odometry, config.table, config.limits)
+        wheels = read_csv_recording(video.odometry, config.table, judge)
     stamps = read_csv(video.stamps) if video.stamps is not None else None
     if stamps is not None:
         raise_errors(stamp_errors(stamps, video.time))
     visual = config.visual_odometry if wheels is None else None
-    rows = camera_rows(video_frames(path, video, stamps, warn), config.image, visual, str(path))
+    rows = camera_rows(video_frames(path, video, stamps, judge.warn), config.image, visual, str(path))
     digest = _digest(path, stamps)
+    inside = judge.stretch.rows(rows.time, str(path))
+    rows = CameraRows(*(None if part is None else part[inside] for part in rows))  # type: ignore[arg-type]
     if wheels is not None:
         source = replace(wheels, name=path.stem, digest=digest_of([digest.encode(), wheels.digest.encode()]))
         return _with_views(source, rows.time, rows.view, video, str(path))
     assert rows.motion is not None  # `_contradictions` requires visual odometry
+    rows.motion[:1] = 0.0
     truth = _truth(config.table, rows.time, config.limits)
     everywhere = np.ones(len(rows.time), bool)
     # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
-    raise_errors(unit_errors(MotionTrack(rows.time, everywhere, rows.motion, None), str(path), config.limits))
+    track = MotionTrack(rows.time, everywhere, rows.motion)
+    raise_errors(judge.errors(track, lambda row: f"{path}, frame {row * video.every}", str(path)))
     return InMemorySource(
         name=path.stem,
-        digest=digest,
+        digest=judge.stretch.digest(digest),
         time=rows.time,
         motion=rows.motion,
         moved=everywhere,

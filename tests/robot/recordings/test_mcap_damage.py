@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robot.recordings.input_judge import InputJudge
 from robot.recordings.mcap_reader import Recording
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
@@ -31,7 +32,7 @@ def check_prefix(path: Path, samples: list[Sample]) -> int:
     warnings: list[str] = []
     source: Recording | None
     try:
-        source = Recording(path, warn=warnings.append)
+        source = Recording(path, InputJudge(warn=warnings.append))
     except InputError as error:
         message = str(error)
         source = None

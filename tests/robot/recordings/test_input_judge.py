@@ -1,7 +1,8 @@
-"""Unit check: known recordings pass with a margin; the same data in wrong units are refused."""
+"""Known recordings pass with a margin; the same data in wrong units, or with wrong steps, are found."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,19 +13,26 @@ from robot.recordings.csv_config import CsvConfig, PoseColumns, TruthColumns, Ve
 from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.recordings.npz_trace import read_trace
-from robot.recordings.unit_check import (
+from robot.recordings.input_judge import (
     DEFAULT_LIMITS,
     RATIO,
+    InputJudge,
     MotionTrack,
     UnitLimits,
     heading_errors,
+    judge_motion,
     typical_motion,
     unit_errors,
 )
+from robot.recordings.stretch import Stretch
 from robot.sources.in_memory import InMemorySource
+from robot.sources.odometry import from_poses, from_velocities
+from robot.sources.odometry_correction import OdometryCorrection, replace_steps
 from tactile.base.errors import InputError
+from tactile.base.se2 import between, integrate
 
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
+Refused = Callable[..., InputError]
 DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0
 
 
@@ -181,7 +189,104 @@ def test_a_wrong_unit_of_a_table_is_refused(
     refused(lambda: read_csv_recording(planted, without_truth), expected)
 
 
-def test_two_outliers_do_not_change_the_verdict(trace: Path, tmp_path: Path) -> None:
+def _drive(rows: int = 400, interval: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, velocities [N, 2] (m/s, rad/s) and poses of a robot that drives, stands and turns."""
+    time = np.arange(rows) * interval
+    phase = np.arange(rows) // 40 % 4
+    speeds = np.array([(0.4, 0.01), (0.4, 0.01), (0.0, 0.6), (0.0, 0.0)])[phase]
+    return time, speeds, integrate(from_velocities(time, speeds[:, 0], 0.0, speeds[:, 1])[:, :3])
+
+
+def _wild(poses: np.ndarray) -> np.ndarray:
+    poses[150, 0] += 3.0
+    return poses
+
+
+def _reset(poses: np.ndarray) -> np.ndarray:
+    return np.concatenate([poses[:230], integrate(between(poses[229:-1], poses[230:]))])
+
+
+def _two_nodes(poses: np.ndarray) -> np.ndarray:
+    poses[1::2, :2] += np.linspace(0, 0.8, len(poses) // 2)[:, None]
+    return poses
+
+
+def _faulty(kind: str) -> MotionTrack:
+    """A drive with this fault: `A, B` where A is the fault and B what was recorded."""
+    time, speeds, poses = _drive()
+    everywhere = np.ones(len(time), bool)
+    if kind.endswith("velocities"):
+        time = time + np.where(np.arange(len(time)) >= (290 if "standing" in kind else 220), 60.0, 0.0)
+        time = time * {"milliseconds": 1e3, "kiloseconds": 1e-4}.get(kind.split(",")[0], 1.0)
+        if "gap" not in kind:
+            time = np.arange(len(time)) * 0.1 * (time[1] / 0.1)
+        motion = from_velocities(time, speeds[:, 0], 0.0, speeds[:, 1])
+        return MotionTrack(time, everywhere, motion, held=True)
+    change: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "wild": _wild,
+        "reset": _reset,
+        "two nodes": _two_nodes,
+        "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
+        "centimetres": lambda poses: poses * [100, 100, 1],
+    }
+    poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
+    if "gap" in kind:
+        time = time + np.where(np.arange(len(time)) >= 120, 60.0, 0.0)
+    return MotionTrack(time, everywhere, from_poses(time, poses), poses=poses)
+
+
+JUDGED = {
+    "wild, poses": (True, "row 150: the odometry jumps by 3", "largest_step to 0.2"),
+    "reset, poses": (False, "row 230: the odometry jumps by", "recording.odometry.largest_step"),
+    "two nodes, poses": (True, "two nodes publish", "recording.topics.odometry.every to 2"),
+    "single precision, poses": (False, "precision was lost far from the origin", "double precision"),
+    "centimetres, poses": (True, "over 40 m/s", "these are centimetres: set recording.odometry.length_scale"),
+    "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
+    "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
+    "gap, velocities": (True, "row 220: nothing for 60.1 s", "recording.odometry.largest_step"),
+    "gap standing, velocities": (False, "row 290: nothing for 60.1 s", "is not known"),
+    "gap, poses": (False, "row 120: nothing for 60.1 s", "poses and motions bridge it"),
+}
+"""By fault: whether it is refused, what is found where, and the cure."""
+
+
+@pytest.mark.parametrize("kind", JUDGED)
+def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
+    refused, *pieces = JUDGED[kind]
+    told: list[str] = []
+    errors = InputJudge(warn=told.append).errors(_faulty(kind), lambda row: f"row {row}", "file")
+    assert len(errors) == refused
+    assert len(told) == (not refused)
+    (said,) = [*map(str, errors), *told]
+    for piece in pieces:
+        assert piece in said
+    alone = judge_motion(*_faulty(kind)[:3:2], "session")
+    assert bool(alone) == (not kind.startswith("two"))
+
+
+def test_a_clean_drive_has_no_finding() -> None:
+    told: list[str] = []
+    judge = InputJudge(warn=told.append)
+    for kind in ("clean, poses", "clean, velocities"):
+        assert judge.errors(_faulty(kind), str, "file") == []
+    assert told == []
+
+
+@pytest.mark.parametrize("kind", ["wild, poses", "reset, poses", "gap, velocities"])
+def test_the_printed_cure_repeats_the_step_before(kind: str) -> None:
+    """The path that results is off by less than two steps."""
+    track = _faulty(kind)
+    told: list[str] = []
+    errors = InputJudge(warn=told.append).errors(track, str, "file")
+    (said,) = [*map(str, errors), *told]
+    settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+) to ([\d.]+)", said)}
+    correction = OdometryCorrection.model_validate(settings)
+    assert InputJudge(correction=correction).errors(track, str, "file") == []
+    mended = integrate(replace_steps(correction, track.motion[:, :3]))
+    assert np.hypot(*(mended - _drive()[2])[:, :2].T).max() < 0.09
+
+
+def test_two_wild_rows_are_a_jump_and_no_unit(trace: Path, tmp_path: Path, refused: Refused) -> None:
     """Two outlier rows in a recording with little turning."""
     with np.load(trace) as arrays:
         changed = {
@@ -192,7 +297,9 @@ def test_two_outliers_do_not_change_the_verdict(trace: Path, tmp_path: Path) -> 
         changed[name] = changed[name].copy()
         changed[name][[40, 41]] = value, -value
     np.savez(tmp_path / "wild.npz", **changed)
-    assert read_trace(tmp_path / "wild.npz").length == len(changed["in_t"])
+    refused(lambda: read_trace(tmp_path / "wild.npz"), "row 40: the odometry jumps by 5e+05 m", "largest_step")
+    for stretch in (Stretch(25.0), Stretch(None, 15.0)):
+        assert 0 < read_trace(tmp_path / "wild.npz", InputJudge(stretch=stretch)).length < len(changed["in_t"])
 
 
 def test_a_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:

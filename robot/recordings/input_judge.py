@@ -1,0 +1,540 @@
+"""Judges the odometry of a recording or session before it is believed.
+
+All rules compare a recording with itself. The typical step is the one above which half of the path was
+covered, and so are the typical speed, turn and turn rate; standing still and sensor noise do not affect them,
+and the fastest 1 % are ignored. A finding is an error where the map must be wrong, else a warning; each names
+its place and a setting that cures it. The judge changes no pose: it only refuses or warns.
+
+| finding | rule | severity |
+|---|---|---|
+| unit | typical interval, speed or turn beyond `UnitLimits`; the units that explain it are named | error |
+| jump | one of the few largest steps, over `JUMP` typical ones | error if faster than `UnitLimits.speed` |
+| gap | a velocity held over `GAP` median intervals (1 s at least), over `JUMP` typical steps | error |
+| gap | the same while the robot stands; `LONG_GAP` intervals between poses or motions | warning |
+| publishers | over a tenth of the steps lead back to where the robot was before | error |
+| precision | numbers at these coordinates lie apart by over a tenth of a typical step | warning |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from robot.recordings.sanity_checks import RowName, count_others
+from robot.recordings.stretch import WHOLE, Stretch
+from robot.sources.odometry_correction import (
+    UNCORRECTED,
+    OdometryCorrection,
+    correct_motions,
+    replace_steps,
+)
+from robot.sources.registry import Warn
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+
+GLITCHES, GLITCH_SHARE = 2, 0.01  # number of fastest steps that are ignored, or share of all if that is more
+PAUSE = 1000.0  # median steps: a longer step is an error of the clock and is ignored
+RATIO = 30.0  # of odometry and truth; correct data are near 1, a wrong unit gives 57 or 1000
+LEAST, MOST = 0.3, 5.0  # m or rad: smaller and larger total below which the ratio is not judged
+RULER = 0.05  # m: smallest step in measuring the true path, so that noise does not add up
+STRETCHES = 50  # net turning is compared over this many, so that noise does not add up
+JUMP = 10.0
+"""Typical steps above which a step is a jump; clean recordings stay below 5.1."""
+JUMPS = 0.01
+"""Largest share of the steps that can be jumps (always four): more are how this robot moves."""
+LEAST_TURN = 1.0
+"""Smallest turn that is a jump, rad: a robot that hardly turns may turn sharply a few times."""
+GAP, LONG_GAP, LEAST_GAP = 10.0, 100.0, 1.0
+"""Median intervals above which a velocity does not hold, and above which poses have a gap; at least 1 s."""
+SHORTEST, HELD = 4e-4, 5.0
+"""Shortest median interval of any odometry, s, and longest over which a velocity holds."""
+RETURNS, RETURNING = 0.25, 0.1
+"""Share of a step within which the next one leads back, and share of the steps of two publishers that do."""
+COARSE = 0.1
+"""Share of the typical step above which the spacing of numbers spoils it."""
+
+TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "ks": 1e3}
+LENGTHS = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}
+ANGLES = {"deg": np.pi / 180}
+UNIT_NAMES = {
+    **{
+        "ms": "milliseconds",
+        "us": "microseconds",
+        "ns": "nanoseconds",
+        "min": "minutes",
+        "ks": "kiloseconds",
+    },
+    **{"mm": "millimetres", "cm": "centimetres", "km": "kilometres", "deg": "degrees"},
+}
+USUAL = np.array([0.1, 0.4, 0.5])
+"""Interval (s), speed (m/s) and turn rate (rad/s) of a usual robot, for the choice among units."""
+
+
+class UnitLimits(Settings):
+    """Limits of the unit check. Raise a limit for a robot that exceeds it."""
+
+    speed: float = Field(default=25.0, gt=0)
+    """Largest typical speed, m/s: a car in town drives 15; an arm of 30 mm/s, read as m/s, 30."""
+    turn_rate: float = Field(default=6.0, gt=0)
+    """Largest typical turn rate, rad/s: robots turn at 0.2 to 1, which in degrees is 11 to 57."""
+    interval: float = Field(default=60.0, gt=0)
+    """Longest median step, s: 100 ms taken for seconds is 100."""
+
+
+DEFAULT_LIMITS = UnitLimits()
+
+
+class MotionTrack(NamedTuple):
+    """The data of a recording that are judged.
+
+    Attributes:
+        time: [N] s. moved: [N] rows with odometry. motion: [N, 4] (dx m, dy m, dtheta rad, dt s).
+        truth: [N, 3] (x m, y m, heading rad), NaN where unknown; or None.
+        held: whether velocities were recorded, which hold since the row before.
+        poses: [N, 3] as recorded (x m, y m, heading rad), where poses were; else None.
+    """
+
+    time: np.ndarray
+    moved: np.ndarray
+    motion: np.ndarray
+    truth: np.ndarray | None = None
+    held: bool = False
+    poses: np.ndarray | None = None
+
+
+class TypicalMotion(NamedTuple):
+    """Typical motion of a robot.
+
+    Attributes:
+        interval: median time between rows, s. speed: m/s. turn_rate: rad/s. turn: rad in one step.
+        true_speed: of the truth, m/s. path, turning: totals (odometry, truth), m and net rad. NaN without
+            truth.
+    """
+
+    interval: float
+    speed: float
+    turn_rate: float
+    turn: float
+    true_speed: float
+    path: tuple[float, float]
+    turning: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class InputJudge:
+    """How a recording is judged, and whom the judge tells.
+
+    Attributes:
+        limits: of the unit check. correction: of the odometry, which comes before the judgement.
+        warn: called with one sentence for each warning; None: nobody is told.
+        stretch: that is read and judged.
+    """
+
+    limits: UnitLimits = DEFAULT_LIMITS
+    correction: OdometryCorrection = UNCORRECTED
+    warn: Warn = None
+    stretch: Stretch = WHOLE
+
+    def say(self, sentence: str) -> None:
+        """Tells a warning; a sentence that begins with `note: ` tells a fact that is no fault."""
+        if self.warn is not None:
+            self.warn(sentence)
+
+    def errors(
+        self,
+        track: MotionTrack,
+        place: RowName,
+        where: str,
+        clock: str = "",
+        cures: Cures | None = None,
+        in_order: bool = True,
+    ) -> list[InputError]:
+        """Judges a whole recording: tells the warnings and returns the errors.
+
+        Args:
+            place: names a row. where: names the recording. clock: what to do if its clock is at fault.
+            cures: what to set for a unit; None: the odometry's scales. in_order: whether the rows have no
+                errors; of others only the units are judged.
+        """
+        with np.errstate(all="ignore"):  # what is no number is reported by the reader
+            if self.correction != UNCORRECTED:
+                corrected, moved = track.motion.copy(), track.moved
+                kept = replace_steps(self.correction, corrected[moved, :3])
+                corrected[moved, :3] = correct_motions(self.correction, kept)
+                track = track._replace(motion=corrected)
+            if in_order and track.poses is not None and (finding := _two_publishers(track.poses)):
+                return [InputError(place(finding.row or 0), *finding[2:])]
+            if (found := unit_errors(track, where, self.limits, cures or unit_cure)) or not in_order:
+                return found
+            errors = []
+            for finding in judge_steps(track, self.limits, clock):
+                at = where if finding.row is None else place(finding.row)
+                if finding.refused:
+                    errors.append(InputError(at, finding.found, finding.expected, finding.cure))
+                else:
+                    self.say(f"{at}: {finding.found}; {finding.cure}")
+        return errors
+
+
+DEFAULT_JUDGE = InputJudge()
+
+
+def judge_motion(time: np.ndarray, motion: np.ndarray, where: str) -> list[str]:
+    """Warnings about the odometry of a session that no recording was read for: live, simulated, a plug-in.
+
+    Args:
+        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s). where: names the session.
+    """
+    track = MotionTrack(time, np.ones(len(time), bool), motion)
+    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in judge_steps(track)]
+    return [*map(str, unit_errors(track, where)), *found]
+
+
+class Finding(NamedTuple):
+    """A finding. Attributes: refused: whether it is an error. row: its first row, None for all of them."""
+
+    refused: bool
+    row: int | None
+    found: str
+    expected: str
+    cure: str
+
+
+@np.errstate(all="ignore")
+def judge_steps(
+    track: MotionTrack, limits: UnitLimits = DEFAULT_LIMITS, clock: str = ""
+) -> Iterator[Finding]:
+    """Findings in single steps of a track whose units are right, errors first.
+
+    Args:
+        clock: what to do if the clock is at fault; '' if there is no other clock.
+    """
+    rows = np.flatnonzero(track.moved & np.isfinite(track.motion).all(axis=1) & np.isfinite(track.time))
+    if len(rows) < 4:
+        return
+    steps = _Steps(track.time[rows], track.motion[rows])
+    gaps = steps.gaps(GAP if track.held else LONG_GAP)
+    if gaps.any():
+        yield _gap(steps, gaps, rows, track.held, clock)
+    jumps = steps.jumps() & ~gaps
+    if track.poses is not None and (finding := _coarse_numbers(track.poses[rows], steps)):
+        yield finding
+    elif jumps.any():
+        yield _jump(steps, jumps, rows, limits)
+
+
+class _Steps:
+    """Lengths [N] m, turns [N] rad and durations [N] s of the steps of a track, and the typical ones."""
+
+    def __init__(self, time: np.ndarray, motion: np.ndarray) -> None:
+        self.time = time
+        self.length, self.turn = np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])
+        self.duration = np.concatenate([[0.0], np.diff(time)])
+        ahead = self.duration[self.duration > 0]
+        self.interval = float(np.median(ahead)) if len(ahead) else 0.0
+        # A step that took several intervals may be longer in proportion; one that took less may not.
+        self._share = np.maximum(self.duration / (self.interval or 1.0), 1.0)
+        self.typical_length = _typical(self.length / self._share, np.ones(len(time)))
+        self.typical_turn = _typical(self.turn / self._share, np.ones(len(time)))
+
+    def gaps(self, intervals: float) -> np.ndarray:
+        """[N] bool, steps that took more than so many median intervals, and `LEAST_GAP`."""
+        return self.duration > max(intervals * self.interval, LEAST_GAP)
+
+    def jumps(self) -> np.ndarray:
+        """[N] bool, the few steps that are far longer, or turn far more, than all others."""
+        return _outliers(self.length / self._share, 0.0) | _outliers(self.turn / self._share, LEAST_TURN)
+
+    def longest(self, without: np.ndarray) -> tuple[float, float]:
+        """The longest step, m, and the largest turn, rad, of the others."""
+        return float(self.length[~without].max(initial=0)), float(self.turn[~without].max(initial=0))
+
+
+def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
+    """[N] bool, amounts over `JUMP` times the typical one of all smaller ones; none if they are many."""
+    order = np.argsort(amounts)
+    ordered = amounts[order]
+    first = len(ordered) - max(4, int(JUMPS * len(ordered)))
+    done = np.cumsum(ordered)
+    for place in range(max(first, 1), len(ordered)):
+        typical = ordered[np.searchsorted(done, done[place - 1] / 2)]
+        if typical > 0 and ordered[place] > max(JUMP * typical, least):
+            found = np.zeros(len(amounts), bool)
+            found[order[place:]] = True
+            return found
+    return np.zeros(len(amounts), bool)
+
+
+def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: str) -> Finding:
+    moved = (steps.length > JUMP * steps.typical_length) | (steps.turn > JUMP * steps.typical_turn)
+    wrong = gaps & moved if held else np.zeros(len(gaps), bool)
+    first = int((wrong if wrong.any() else gaps).argmax())
+    found = f"nothing for {steps.duration[first]:.4g} s before t = {steps.time[first]:.3f} s"
+    found += f", a step every {steps.interval:.3g} s elsewhere{count_others(wrong if wrong.any() else gaps)}"
+    stretch = "else choose a stretch with recording.from and recording.to"
+    if wrong.any():
+        found += f": the velocity that holds over it moves the robot by {steps.length[first]:.4g} m"
+        found += f" and {steps.turn[first]:.3g} rad, and nobody knows how it moved"
+        cure = f"if the clock jumped or the robot stood, {clock or _largest(steps, wrong)}; {stretch}"
+        return Finding(True, int(rows[first]), found, "no gap in velocities", cure)
+    what = "how the robot moved is not known" if held else "poses and motions bridge it, views do not"
+    cure = f"if the clock jumped, {clock}" if clock else f"look at it: {what}"
+    return Finding(False, int(rows[first]), f"{found} ({what})" if clock else found, "", cure)
+
+
+def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits) -> Finding:
+    first = int(jumps.argmax())
+    speed = steps.length / np.maximum(steps.duration, 1e-9)
+    found = f"the odometry jumps by {steps.length[first]:.4g} m and {steps.turn[first]:.3g} rad in "
+    found += f"{steps.duration[first]:.3g} s at t = {steps.time[first]:.3f} s, typically by "
+    found += f"{steps.typical_length:.3g} m and {steps.typical_turn:.3g} rad a step{count_others(jumps)}"
+    back = first + 1 < len(jumps) and jumps[first + 1]
+    cause = "a wild pose" if back else "a reset of the odometry, or a robot that was carried"
+    cure = f"{cause}: {_largest(steps, jumps)}; or choose a stretch with recording.from and recording.to"
+    refused = bool((speed[jumps] > limits.speed).any())
+    return Finding(refused, int(rows[first]), found, "steps that this robot can make", cure)
+
+
+def _largest(steps: _Steps, wrong: np.ndarray) -> str:
+    """The setting that repeats the step before each of these steps [N] bool, and of no other."""
+    words = []
+    for name, amounts, most in zip(
+        ("largest_step", "largest_turn"), (steps.length, steps.turn), steps.longest(wrong), strict=True
+    ):
+        beyond = amounts[wrong & (amounts > 2 * most)]
+        if len(beyond) and most > 0:
+            words.append(f"recording.odometry.{name} to {min(np.sqrt(most * beyond.min()), 5 * most):.2g}")
+    return f"set {' and '.join(words)}, which repeats the step before instead" if words else "drop these rows"
+
+
+def _two_publishers(poses: np.ndarray) -> Finding | None:
+    """Positions that jump between two paths: each leads back to where the robot was two messages before."""
+    once = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    twice = np.hypot(*(poses[2:, :2] - poses[:-2, :2]).T)
+    moved = (once[:-1] > 0) & (once[1:] > 0)
+    back = moved & (twice < RETURNS * np.minimum(once[:-1], once[1:]))
+    if not back.sum() > max(RETURNING * len(poses), GLITCHES):
+        return None
+    path, alone = float(once.sum()), float(np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum())
+    found = f"{int(back.sum())} of {len(poses)} poses lead back to where the robot was before: the path is "
+    found += f"{path:.4g} m, that of every second message {alone:.4g} m, so two nodes publish here"
+    cure = "set recording.topics.odometry.every to 2, or record each node under a topic of its own"
+    return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
+
+
+def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
+    """Coordinates so far from the origin that numbers lie apart by much of a step."""
+    places = poses[:, :2]
+    single = places.astype(np.float32)
+    far = float(np.abs(places).max())
+    spacing = float(np.spacing(np.float32(far)) if (single == places).all() else np.spacing(far))
+    if not spacing > COARSE * steps.typical_length > 0:
+        return None
+    found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
+    found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
+    cure = "record them in double precision, or set recording.topics.odometry.use to twist for velocities"
+    return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
+
+
+def typical_motion(track: MotionTrack) -> TypicalMotion:
+    """The typical motion in a track; rows with errors are ignored."""
+    steps = np.diff(track.time[track.moved & np.isfinite(track.time)])
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    dt = track.motion[:, 3]
+    good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
+    length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
+    true_speed, path, turning = _compare_with_truth(track, good)
+    speed, turn_rate = _typical(length, dt[good]), _typical(turn, dt[good])
+    in_step = _typical(turn, np.ones_like(turn))
+    return TypicalMotion(interval, speed, turn_rate, in_step, true_speed, path, turning)
+
+
+Cures = Callable[[str, str], str]
+"""The cure for a quantity (time, length, angle) in a unit: what to set."""
+
+
+def unit_cure(quantity: str, unit: str) -> str:
+    """The setting that corrects an odometry in this unit, of any format; times have none."""
+    if quantity == "time":
+        factor = TIMES[unit]
+        return f"divide the times by {1 / factor:g}" if factor < 1 else f"multiply the times by {factor:g}"
+    name, factors = ("length", LENGTHS) if quantity == "length" else ("turn", ANGLES)
+    return f"set recording.odometry.{name}_scale to {factors[unit]:.6g}"
+
+
+def unit_errors(
+    track: MotionTrack, where: str, limits: UnitLimits = DEFAULT_LIMITS, cures: Cures = unit_cure
+) -> list[InputError]:
+    """Errors of a whole recording: times not in s, motion not in m or rad, odometry that disagrees with
+    truth.
+
+    Each cause is reported once: the truth is compared only where no other check has found an error.
+    """
+    errors = []
+    if track.truth is not None:
+        errors = heading_errors(track.truth[:, 2], track.time, "the truth's heading", where, limits)
+        if errors:
+            track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
+    robot = typical_motion(track)
+    found = list(_absurd(robot, track.held, limits, cures))
+    found += [each for each in _unlike_truth(robot, limits) if not found or "truth's" in each[0]]
+    return errors + [InputError(where, *words) for words in found]
+
+
+def _absurd(
+    robot: TypicalMotion, held: bool, limits: UnitLimits, cures: Cures
+) -> Iterator[tuple[str, str, str]]:
+    """What no robot does: finding, expectation, cure; the cure names the units that explain all of it."""
+    if not _faults(robot, held, limits):
+        return
+    units = _explanation(robot, held, limits)
+    named = {"time": "times in seconds", "length": "odometry in metres", "angle": "odometry in radians"}
+    limit = {"time": "interval", "length": "speed", "angle": "turn_rate"}
+    if units:
+        parts = [f"these are {UNIT_NAMES[unit]}: {cures(key, unit)}" for key, unit in units.items()]
+        for key in units:
+            words = _faults(robot, held, limits).get(key) or _in_words(robot)
+            yield words, named[key], "; ".join([*parts, _else(limit[key], limits)])
+        return
+    for key, words in _faults(robot, held, limits).items():
+        yield words, named[key], f"no unit explains it; {_else(limit[key], limits)}"
+
+
+def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, str]:
+    """By quantity (time, length, angle) what is absurd, in words."""
+    found = {}
+    half = f"half of the steps take over {robot.interval:.4g} s"
+    if robot.interval > (min(limits.interval, HELD) if held else limits.interval):
+        found["time"] = f"{half}{', and velocities do not hold so long' * held}"
+    elif 0 < robot.interval < SHORTEST:
+        found["time"] = f"half of the steps take less than {robot.interval:.2g} s"
+    if robot.speed > limits.speed:
+        found["length"] = f"half of the path is driven at over {robot.speed:.4g} m/s"
+    if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
+        found["angle"] = (
+            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
+        )
+    return found
+
+
+def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, str]:
+    """The fewest units, of time, length and angle, with which nothing is absurd; of as many, those that make
+    the robot most like a usual one. {} if there are none."""
+    best: tuple[float, dict[str, str]] = (np.inf, {})
+    for time, length, angle in product(
+        ("", *TIMES), ("", *(LENGTHS if robot.speed > 0 else ())), ("", *(ANGLES if robot.turn > 0 else ()))
+    ):
+        seconds, metres, radians = TIMES.get(time, 1.0), LENGTHS.get(length, 1.0), ANGLES.get(angle, 1.0)
+        rate = 1.0 if held else seconds  # velocities have their own unit of time
+        turn = robot.turn * radians * (seconds if held else 1.0)
+        changed = robot._replace(
+            interval=robot.interval * seconds,
+            speed=robot.speed * metres / rate,
+            turn_rate=robot.turn_rate * radians / rate,
+            turn=turn,
+        )
+        if _faults(changed, held, limits):
+            continue
+        values = np.array([changed.interval, changed.speed, changed.turn_rate])
+        unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
+        named = {"time": time, "length": length, "angle": angle}
+        units = {key: unit for key, unit in named.items() if unit}
+        best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
+    return best[1]
+
+
+def _in_words(robot: TypicalMotion) -> str:
+    return f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
+
+
+def _unlike_truth(robot: TypicalMotion, limits: UnitLimits) -> Iterator[tuple[str, str, str]]:
+    """Units of the truth, and of an odometry that disagrees with it."""
+    truth_rushes, fast = robot.true_speed > limits.speed, _else("speed", limits)
+    if truth_rushes:
+        found = f"half of the truth's path is driven at over {robot.true_speed:.4g} m/s"
+        yield found, "truth in metres", f"{_MILLIMETRES}; {fast}"
+    if not truth_rushes and _differ_by_unit(*robot.path):
+        found = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
+        yield found, "both in metres", _MILLIMETRES
+    if _differ_by_unit(*robot.turning):
+        found = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
+        yield found, "both in radians", _DEGREES
+
+
+def heading_errors(
+    heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: UnitLimits = DEFAULT_LIMITS
+) -> list[InputError]:
+    """Errors of a heading column [N] that must be in degrees: wider than a turn and too fast for radians."""
+    good = np.isfinite(heading) & np.isfinite(time)
+    heading, dt = heading[good], np.diff(time[good])
+    if not len(heading) or np.abs(heading).max() <= 2 * np.pi + 0.1:
+        return []  # wrapped radians, or too few degrees to decide
+    turn = np.abs(np.diff(heading))
+    turn = np.minimum(turn, np.abs(360 - turn))[dt > 0]
+    rate = _typical(turn, dt[dt > 0])
+    if rate <= limits.turn_rate and _typical(turn, np.ones_like(turn)) <= np.pi:
+        return []
+    found = f"{what} runs from {heading.min():.4g} to {heading.max():.4g}, mostly at {rate:.3g} a second"
+    return [InputError(where, found, "a heading in radians", f"{_DEGREES}; {_else('turn_rate', limits)}")]
+
+
+def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
+    """The rate above which half of the total amount [N] falls."""
+    rate = amount / duration
+    ignored = max(GLITCHES, int(GLITCH_SHARE * len(rate)))
+    order = np.argsort(rate)[: max(len(rate) - ignored, 0)]
+    done = np.cumsum(amount[order])
+    return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
+
+
+def _compare_with_truth(
+    track: MotionTrack, good: np.ndarray
+) -> tuple[float, tuple[float, float], tuple[float, float]]:
+    """Speed of the truth; path and net turning of odometry and truth. NaN without truth."""
+    nothing = np.nan, (np.nan, np.nan), (np.nan, np.nan)
+    if track.truth is None:
+        return nothing
+    rows = np.flatnonzero(np.isfinite(track.truth).all(axis=1))
+    if len(rows) <= GLITCHES + 1:
+        return nothing
+    motion, truth = np.where(good[:, None], track.motion, 0.0), track.truth[rows]
+    driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
+    length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
+    speed = _typical(length[dt > 0], dt[dt > 0])
+    path = _most_of(driven), _most_of(_ruler_steps(truth[:, :2]))
+    ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
+    turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
+    return speed, path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
+
+
+def _ruler_steps(points: np.ndarray) -> np.ndarray:
+    """Lengths of steps of at least `RULER` along the points [N, 2]."""
+    steps, last = [0.0], complex(*points[0])
+    for point in (points[:, 0] + 1j * points[:, 1]).tolist():
+        if (step := abs(point - last)) >= RULER:
+            steps.append(step)
+            last = point
+    return np.array(steps)
+
+
+def _most_of(amounts: np.ndarray) -> float:
+    return float(np.sort(amounts)[:-GLITCHES].sum())
+
+
+def _differ_by_unit(a: float, b: float) -> bool:
+    """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
+    least, most = min(a, b), max(a, b)
+    return least > LEAST and most > MOST and most > RATIO * least
+
+
+def _else(name: str, limits: UnitLimits) -> str:
+    return f"if it really is so, raise limits.{name} ({getattr(limits, name):g})"
+
+
+_DEGREES = "multiply by pi/180 if it is degrees"
+_MILLIMETRES = "divide by 1000 if it is millimetres"
