@@ -8,14 +8,56 @@ from pathlib import Path
 import numpy as np
 
 from robot.recordings.alignment import interpolated_poses, nearest_rows, range_errors, range_pixels
-from robot.recordings.csv_config import ContactColumns, LabelColumns, PairColumns, TruthColumns, ViewColumns
-from robot.recordings.csv_file import CsvFile
-from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
+from robot.recordings.csv_config import (
+    ContactColumns,
+    LabelColumns,
+    PairColumns,
+    PoseColumns,
+    TableUnits,
+    TruthColumns,
+    ViewColumns,
+)
+from robot.recordings.csv_file import EMPTY, CsvFile
+from robot.recordings.csv_units import split_unit
+from robot.recordings.sanity_checks import RowName, clock_errors, view_errors
 from robot.recordings.unit_check import UnitLimits, heading_errors
+from robot.sources.registry import Warn
 from robot.sources.source_info import PlanarWhiskersInfo
 from tactile.base.errors import InputError
 
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
+LEAVE_OUT = 0.05
+"""Share of the rows, but at least one row, that may be left out because a number is missing."""
+SHARED = 0.2
+"""Share of the steps without time that makes times rounded."""
+UPRIGHT, LEVEL = 10.0, 0.2
+"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
+
+
+def leave_out(bad: np.ndarray, errors: list[InputError], what: str, warn: Warn) -> bool:
+    """Whether the bad ones of the rows [N] bool can be left out, with a warning; else `errors` hold."""
+    count = int(bad.sum())
+    if count > max(1, LEAVE_OUT * len(bad)) or count == len(bad):
+        return False
+    if count and warn is not None:
+        warn(f"{errors[0].where}: {errors[0].found}; {count} of {len(bad)} {what} left out")
+    return True
+
+
+def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
+    """Rows per second if rows share times because those are rounded, else None.
+
+    Args:
+        time: [N] s. rows: [N, C] what the rows hold; rows that only repeat the one before are no sign.
+    """
+    steps = np.diff(time)
+    change, same = np.flatnonzero(steps > 0) + 1, steps == 0
+    if len(change) < 2 or (steps < 0).any() or same.mean() < SHARED:
+        return None
+    repeated = (np.nan_to_num(np.diff(rows, axis=0)[same]) == 0).all(axis=1)
+    if repeated.mean() > 0.5:
+        return None
+    return float((change[-1] - change[0]) / (time[change[-1]] - time[change[0]]))
 
 
 def align_views(
@@ -24,28 +66,32 @@ def align_views(
     part: ViewColumns,
     time: np.ndarray,
     shape: tuple[int, int, int],
+    warn: Warn = None,
 ) -> AlignedRows:
     """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
     file = files[part.file or base.path]
-    values, empty = file.block(part.prefix)
-    there = np.flatnonzero(~empty.all(axis=1))
-    place = _place(file, there)
-    values = values[there]
-    what, pixels, width = f"{part.prefix}*", int(np.prod(shape)), values.shape[1]
+    there = np.flatnonzero(~(file.block(part.prefix)[1] == EMPTY).all(axis=1))
+    beams = [file.header.full[place] for place in file.numbered(part.prefix).values()]
+    what, pixels, width = f"{part.prefix}*", int(np.prod(shape)), len(beams)
     if width % pixels or (part.max_range is None and width != pixels):
         expected = f"{pixels} (table.rows {shape[0]} x table.columns {shape[1]})"
         expected += "" if part.max_range is None else " or a multiple"
-        error = InputError(f"{file.path}:1", f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
-        return there, values, [error]
+        error = InputError(file.top, f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
+        return there, file.values, [error]
+    seen = file.rows(there)
+    names = beams if file is base else [part.time, *beams]
+    bad, errors = seen.judge(names, far=part.max_range is not None)
+    if not leave_out(bad, errors, "views are", warn):
+        return there, file.values, errors
+    there, seen = there[~bad], seen.rows(~bad)
+    values, errors = seen.block(part.prefix, part.unit)[0], []
     if part.max_range is None:
-        errors = nonfinite_errors(values, what, place)
-        errors += view_errors(values.min(axis=1), values.max(axis=1), what, place)
+        errors += view_errors(values.min(axis=1), values.max(axis=1), what, seen.place)
     else:
         values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
-        errors = nonfinite_errors(values, what, place)
-        typical = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+        typical = float(np.median(values)) if len(values) else 0.0
         lowest, key = values.min(axis=1), "table.views.max_range"
-        errors += range_errors(lowest, typical, part.max_range, what, place, str(file.path), key)
+        errors += range_errors(lowest, typical, part.max_range, what, seen.place, str(file.path), key)
         values = range_pixels(values, pixels, part.max_range)
     rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
     return rows, values.reshape(-1, *shape), errors + faults
@@ -85,8 +131,8 @@ def align_labels(
         return _labels_of_file(base, files[pairs.file], pairs, time)
     assert labels is not None
     file = files[labels.file or base.path]
-    ids, empty = file.column(labels.column), file.empty[:, file.names.index(labels.column)]
-    there = np.flatnonzero(~empty & (ids != -1))
+    ids, fault = file.column(labels.column), file.fault[:, file.at(labels.column)]
+    there = np.flatnonzero((fault != EMPTY) & (ids != -1))
     ids = ids[there]
     rows, errors = _match_rows(file, base, there, labels.time, labels.tolerance, time)
     bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
@@ -98,7 +144,8 @@ def align_labels(
 
 
 def _labels_of_file(base: CsvFile, file: CsvFile, part: PairColumns, time: np.ndarray) -> AlignedRows:
-    later, earlier, score = (file.column(name) for name in (part.later, part.earlier, part.score))
+    later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
+    score = file.column(part.score)
     errors = file.faults(part.later, part.earlier, part.score)
     crossed = later <= earlier
     if crossed.any():
@@ -143,27 +190,92 @@ def labels_from_pairs(
 
 
 def align_truth(
-    file: CsvFile, part: TruthColumns, time: np.ndarray, limits: UnitLimits, same_rows: bool
+    file: CsvFile,
+    part: TruthColumns,
+    time: np.ndarray,
+    limits: UnitLimits,
+    same_rows: bool,
+    warn: Warn = None,
 ) -> tuple[np.ndarray, list[InputError]]:
     """True poses [N, 3] at times [N] s, NaN outside the time span of the truth.
 
     Args:
         file: that of the truth. same_rows: its rows are those of `time`.
     """
-    names = (part.x, part.y, part.heading)
-    errors = file.faults(*names)
-    truth = np.column_stack([file.column(name) for name in names])
-    moments = time if same_rows else file.column(part.time)
-    if faults := heading_errors(truth[:, 2], moments, part.heading, str(file.path), limits):
-        errors += faults
-        truth[:, 2] = np.deg2rad(truth[:, 2])  # or every other check would report it again
+    names, turn = position_columns(part)
+    bad, errors = file.judge(names if same_rows else [part.time, *names], turn)
+    if not leave_out(bad, errors, "true poses are", warn):
+        return np.full((len(time), 3), np.nan), errors
     if same_rows:
+        truth, errors = read_poses(file, part, part.units, time, limits, "table.truth")
+        truth[bad] = np.nan
         return truth, errors
-    errors += file.faults(part.time) + clock_errors(moments, part.time, file.place)
+    file = file.rows(~bad)
+    moments = file.column(part.time, "time", part.units.time)
+    truth, errors = read_poses(file, part, part.units, moments, limits, "table.truth")
+    errors += clock_errors(moments, part.time, file.place)
     if errors:
         return np.full((len(time), 3), np.nan), errors
-    truth, faults = interpolated_poses(time, moments, truth, part.time, str(file.path))
-    return truth, errors + faults
+    return interpolated_poses(time, moments, truth, part.time, str(file.path))
+
+
+def position_columns(part: PoseColumns) -> tuple[list[str], list[str]]:
+    """The columns that poses are read from, and of those the ones of a quaternion apart."""
+    turn = part.quaternion or []
+    return [part.x, part.y, *([] if turn else [part.heading])], turn
+
+
+def read_poses(
+    file: CsvFile, part: PoseColumns, units: TableUnits, time: np.ndarray, limits: UnitLimits, key: str
+) -> tuple[np.ndarray, list[InputError]]:
+    """Poses [N, 3] (x m, y m, heading rad) of rows at times [N] s; `key`: their setting."""
+    x, y = (file.column(name, "length", units.length) for name in (part.x, part.y))
+    errors = plane_errors(file, part, key)
+    if part.quaternion is not None:
+        return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
+    heading = file.column(part.heading, "angle", units.angle)
+    if faults := heading_errors(heading, time, part.heading, str(file.path), limits):
+        errors += faults
+        heading = np.deg2rad(heading)  # or every other check would report it again
+    return np.column_stack([x, y, heading]), errors
+
+
+def _headings(file: CsvFile, part: PoseColumns, quaternion: Sequence[str]) -> np.ndarray:
+    """Headings [N], rad, of an axis of the body in the plane of x and y, as `PoseColumns.quaternion` says."""
+    values = np.column_stack([file.column(name) for name in quaternion])
+    with np.errstate(all="ignore"):  # faulty rows are left out, or reported
+        x, y, z, w = (values / np.linalg.norm(values, axis=1, keepdims=True)).T
+    along = ["xyz".find(split_unit(name)[0][-1:].lower()) for name in (part.x, part.y)]
+    ahead = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    if 2 in along:
+        ahead = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+    first, second = along if min(along) >= 0 and along[0] != along[1] else (0, 1)
+    return np.arctan2(ahead[second], ahead[first])
+
+
+def other_plane(file: CsvFile, x: str, y: str) -> tuple[str, str] | None:
+    """'x' or 'y' and the column z beside them, if a path hardly moves along that one but does along z."""
+    stem, end = file.names[file.at(y)][:-1], file.names[file.at(y)][-1:]
+    z = stem + ("z" if end == "y" else "Z")
+    if end.lower() != "y" or z not in file.names:
+        return None
+    values = file.values[:, [file.at(name) for name in (x, y, z)]]
+    values = values[np.isfinite(values).all(axis=1)]
+    span = np.ptp(values, axis=0) if len(values) else np.zeros(3)
+    if span[2] <= UPRIGHT * span[:2].min() or span[2] <= LEVEL * span[:2].max() or span[2] == 0:
+        return None
+    return ("x", "y")[int(span[:2].argmin())], z
+
+
+def plane_errors(file: CsvFile, part: PoseColumns, key: str) -> list[InputError]:
+    """The error for a path that lies in another plane than that of x and y; `key`: their setting."""
+    found = other_plane(file, part.x, part.y)
+    if found is None:
+        return []
+    plane = "x-z" if found[0] == "y" else "y-z"
+    said = f"the path lies in {plane}: {getattr(part, found[0])} hardly changes, {found[1]} does"
+    cure = f"name {found[1]} as {key}.{found[0]}"
+    return [InputError(file.top, said, "columns of the plane of the path", cure)]
 
 
 def _match_rows(
@@ -172,15 +284,10 @@ def _match_rows(
     """Odometry rows of the rows [M] of a file: the same, or the nearest in time."""
     if file is base:
         return there, []
-    moments = file.column(name)[there]
-    place = _place(file, there)
-    errors = nonfinite_errors(moments, name, place) + clock_errors(moments, name, place)
-    return (there, errors) if errors else each_nearest(moments, time, tolerance, place)
-
-
-def _place(file: CsvFile, there: np.ndarray) -> RowName:
-    """Positions of rows [M] of a file, for errors."""
-    return lambda row: file.place(int(there[row]))
+    file = file.rows(there)
+    moments = file.column(name, "time")
+    errors = file.faults(name) or clock_errors(moments, name, file.place)
+    return (there, errors) if errors else each_nearest(moments, time, tolerance, file.place)
 
 
 def each_nearest(

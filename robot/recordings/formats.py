@@ -108,7 +108,7 @@ def _open_npz(config: RecordingConfig, warn: Warn) -> Source:
 def _open_csv(config: RecordingConfig, warn: Warn) -> Source:
     from robot.recordings.csv_reader import read_csv_recording
 
-    return read_csv_recording(config.file, config.table, config.limits)
+    return read_csv_recording(config.file, config.table, config.limits, warn)
 
 
 def _open_video(config: RecordingConfig, warn: Warn) -> Source:
