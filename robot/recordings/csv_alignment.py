@@ -23,6 +23,7 @@ from robot.recordings.sanity_checks import RowName, clock_errors, view_errors
 from robot.recordings.unit_check import UnitLimits, heading_errors
 from robot.sources.registry import Warn
 from robot.sources.source_info import PlanarWhiskersInfo
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
@@ -40,7 +41,8 @@ def leave_out(bad: np.ndarray, errors: list[InputError], what: str, warn: Warn) 
     if count > max(1, LEAVE_OUT * len(bad)) or count == len(bad):
         return False
     if count and warn is not None:
-        warn(f"{errors[0].where}: {errors[0].found}; {count} of {len(bad)} {what} left out")
+        said = f"{errors[0].found}; expected {errors[0].expected}"
+        warn(f"{errors[0].where}: {said}; {count} of {len(bad)} {what} left out")
     return True
 
 
@@ -217,6 +219,19 @@ def align_truth(
     if errors:
         return np.full((len(time), 3), np.nan), errors
     return interpolated_poses(time, moments, truth, part.time, str(file.path))
+
+
+def column_keys(part: Settings, key: str) -> list[tuple[str, str]]:
+    """The columns that a part of the table names, the time first, and their settings below `key`."""
+    fields = part.model_dump(exclude={"prefix", "unit"})
+    named = {field: name for field, name in fields.items() if isinstance(name, str)}
+    if time := named.pop("time", None):
+        named = {"time": time} | named
+    for field in ("quaternion", "directions"):
+        named |= {f"{field}.{place}": name for place, name in enumerate(fields.get(field) or ())}
+    if fields.get("quaternion"):
+        del named["heading"]  # which is not read
+    return [(name, f"{key}.{field}") for field, name in named.items()]
 
 
 def position_columns(part: PoseColumns) -> tuple[list[str], list[str]]:

@@ -90,7 +90,8 @@ def describe_csv(path: Path) -> CsvDescription:
     time = time_column(file)
     parts, table, missing = dict[str, str](), dict[str, Any](), list[str]()
     if time is None or not np.isfinite(file.column(time)).any():
-        missing.append("a column of times (t, time, stamp)")
+        faults = file.faults(time) if time is not None else []
+        missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
         return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
     units = _units(file, time, odometry or {})
@@ -300,9 +301,9 @@ def _file(file: CsvFile, other: CsvFile) -> dict[str, Any]:
 
 def _columns(file: CsvFile) -> tuple[Column, ...]:
     found, joined, stems = list[Column](), set[str](), _stems(file)
-    for name in file.names:
+    for place, name in enumerate(file.names):
         prefix = name.rstrip("0123456789")
-        values = file.column(name)
+        values = file.values[:, place]
         if prefix in joined and prefix != name:
             continue
         if prefix != name and stems[prefix] >= FEWEST_PIXELS:

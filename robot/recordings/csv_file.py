@@ -144,19 +144,18 @@ class CsvFile:
     def _fault(self, row: int, place: int) -> tuple[str, str, str]:
         """What is wrong with a cell, what is expected, and the cure."""
         cells = _split(_lines_of(self.content, self.path)[self.lines[row] - 1], self.header.separator)
-        name = self.names[place]
-        match int(self.fault[row, place]):
-            case 0:
-                return f"{name} is {self.values[row, place]}", "a finite number", "correct or drop the row"
-            case fault if fault == EMPTY:
-                return f"{name} is empty", "a number", "correct or drop the row"
-            case fault if fault == CUT:
-                few = len(cells) < len(self.names)
-                cure = "the row may be cut off" if few else f"quote text that holds {self.header.separator!r}"
-                return f"{len(cells)} cells", f"{len(self.names)}, as in the header", cure
-        comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", cells[place])
-        cure = "write decimal points, not decimal commas" if comma else "correct or drop the row"
-        return f"{name} is {cells[place][:40]!r}", "a number", cure
+        name, fault, drop = self.names[place], int(self.fault[row, place]), "correct or drop the row"
+        if fault == CUT:
+            few = len(cells) < len(self.names)
+            cure = "the row may be cut off" if few else f"quote text that holds {self.header.separator!r}"
+            return f"{len(cells)} cells", f"{len(self.names)}, as in the header", cure
+        if fault == WORD:
+            comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", cells[place])
+            cure = "write decimal points, not decimal commas" if comma else drop
+            return f"{name} is {cells[place][:40]!r}", "a number", cure
+        if fault == EMPTY:
+            return f"{name} is empty", "a number", drop
+        return f"{name} is {self.values[row, place]}", "a finite number", drop
 
     def rows(self, kept: np.ndarray) -> CsvFile:
         """The file with these rows only."""
@@ -250,8 +249,8 @@ def _lines_of(content: bytes, path: Path) -> list[str]:
 
 
 def _is_skipped(line: str) -> bool:
-    """Whether a line is empty or a comment."""
-    begin = line.lstrip()[:1]
+    """Whether all cells of a line are empty, or it is a comment."""
+    begin = line.lstrip(' ,;\t"\v\f')[:1]
     return not begin or begin in COMMENT
 
 

@@ -13,6 +13,7 @@ from robot.recordings.csv_alignment import (
     align_labels,
     align_truth,
     align_views,
+    column_keys,
     leave_out,
     position_columns,
     read_poses,
@@ -20,7 +21,6 @@ from robot.recordings.csv_alignment import (
     sensors_of,
 )
 from robot.recordings.csv_config import (
-    ContactColumns,
     CsvConfig,
     MotionColumns,
     PoseColumns,
@@ -152,17 +152,8 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
         if part is None:
             continue
         file = files[getattr(part, "file", None) or base.path]
-        fields = part.model_dump(exclude={"prefix", "unit"})
-        named = {field: name for field, name in fields.items() if isinstance(name, str)}
-        if quaternion := getattr(part, "quaternion", None):
-            del named["heading"]  # which is not read
-            named |= {f"quaternion.{axis}": name for axis, name in enumerate(quaternion)}
-        if file is base:
-            named.pop("time", None)  # the time of the odometry is used there
-        errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
-        if isinstance(part, ContactColumns):
-            key = "contacts.directions"
-            errors += file.absences([(column, f"table.{key}") for column in part.directions])
+        own_time = file is base and hasattr(part, "time")  # then that of the odometry is used
+        errors += file.absences(column_keys(part, f"table.{key}")[own_time:])
         if isinstance(part, ViewColumns):
             errors += _gap_errors(file, part.prefix)
     return errors

@@ -66,7 +66,6 @@ def split_unit(name: str) -> tuple[str, str]:
             return split_unit(before)[0] if before.endswith("]") else before, plain_unit(text)
     words = name.split("_")
     for count in (3, 2, 1):
-        unit = plain_unit("_".join(words[-count:]))
-        if len(words) > count and unit not in VAGUE and is_unit(unit):
+        if len(words) > count and is_unit(unit := plain_unit("_".join(words[-count:]))) and unit not in VAGUE:
             return "_".join(words[:-count]), unit
     return name, ""

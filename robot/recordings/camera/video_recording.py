@@ -12,7 +12,7 @@ import numpy as np
 
 from robot.recordings.camera.rows import camera_rows
 from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
-from robot.recordings.csv_alignment import align_truth, each_nearest
+from robot.recordings.csv_alignment import align_truth, column_keys, each_nearest
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import CsvFile, read_csv
 from robot.recordings.csv_reader import ODOMETRY, read_csv_recording
@@ -40,7 +40,7 @@ def read_video(config: RecordingConfig, warn: Warn = None) -> InMemorySource:
     raise_errors(_contradictions(config))
     wheels = None
     if video.odometry is not None:
-        wheels = read_csv_recording(video.odometry, config.table, config.limits)
+        wheels = read_csv_recording(video.odometry, config.table, config.limits, warn)
     stamps = read_csv(video.stamps) if video.stamps is not None else None
     if stamps is not None:
         raise_errors(stamp_errors(stamps, video.time))
@@ -51,7 +51,7 @@ def read_video(config: RecordingConfig, warn: Warn = None) -> InMemorySource:
         source = replace(wheels, name=path.stem, digest=digest_of([digest.encode(), wheels.digest.encode()]))
         return _with_views(source, rows.time, rows.view, video, str(path))
     assert rows.motion is not None  # `_contradictions` requires visual odometry
-    truth = _truth(config.table, rows.time, config.limits)
+    truth = _truth(config.table, rows.time, config.limits, warn)
     everywhere = np.ones(len(rows.time), bool)
     # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
     raise_errors(unit_errors(MotionTrack(rows.time, everywhere, rows.motion, None), str(path), config.limits))
@@ -108,14 +108,12 @@ def _with_views(
     return replace(source, views=views, seen=seen)
 
 
-def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits) -> np.ndarray | None:
+def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits, warn: Warn) -> np.ndarray | None:
     if table.truth is None or table.truth.file is None:
         return None
-    file = read_csv(table.truth.file)
-    part = table.truth
-    named = {key: getattr(part, key) for key in ("time", "x", "y", "heading")}
-    raise_errors(file.absences([(column, f"table.truth.{key}") for key, column in named.items()]))
-    truth, errors = align_truth(file, part, time, limits, same_rows=False)
+    file = read_csv(table.truth.file, table.units.time)
+    raise_errors(file.absences(column_keys(table.truth, "table.truth")))
+    truth, errors = align_truth(file, table.truth, time, limits, same_rows=False, warn=warn)
     raise_errors(errors)
     return truth
 
