@@ -237,8 +237,8 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "wide": (f"t,vx,w{',r' * 20000}\n0,1,0\n", {}, [":1: 20003 columns", "at most 4096"]),
     "long line": (f"t,vx,w,s\n0,1,0,{'x' * (1 << 20)}\n", {},
                   [":2: 1048582 characters in a line", "at most"]),
-    "large views": (ODOMETRY, {"rows": 4096, "columns": 4096},
-                    ["4 rows of 4096 x 4096 pixels", "table.rows"]),
+    "large views": (ODOMETRY + "2,1,0\n", {"rows": 4096, "columns": 4096},
+                    ["5 rows of 4096 x 4096 pixels", "table.rows"]),
     "unit": ("t,vx [furlong/s],w\n0,1,0\n", {},
              ["'vx [furlong/s]' states the unit 'furlong/s'", "units.length"]),
     "unit of another": ("t [mm],vx,w\n0,1,0\n", {},
@@ -402,7 +402,7 @@ AS_USERS_HAVE_THEM: dict[str, tuple[str, list[Any]]] = {
                          [np.char.add(np.char.replace(DAYS, "T", " "), "+02:00"), X, Y, H]),
     "TUM": ("# timestamp tx ty tz qx qy qz qw", [TIME, X, Y, HEIGHT, *TURNS.T]),
 
-    "EuRoC": ("#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+    "EuRoC": ("#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z",
               [(1.4e9 + TIME) * 1e9, X, Y, HEIGHT, TURNS[:, 3], *TURNS.T[:3]]),
     "rostopic": ("%time,field.header.frame_id,field.pose.pose.position.x,field.pose.pose.position.y,"
                  + ",".join(f"field.pose.pose.orientation.{axis}" for axis in "xyzw")
