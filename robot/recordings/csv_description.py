@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.csv_alignment import other_plane, rounded_rate
 from robot.recordings.csv_file import CsvFile, read_csv
+from robot.recordings.csv_reader import other_plane, rounded_rate
 from robot.recordings.csv_units import PER_UNIT
 from tactile.base.errors import InputError
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -82,7 +83,13 @@ class CsvFile:
 
     def at(self, name: str) -> int:
         """The position of a column, named with or without its unit, which must exist (see `absences`)."""
-        return (self.header.full if name in self.header.full else self.names).index(name)
+        return self._places[name]
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        """The first position of each name, in full or without its unit."""
+        named = (*enumerate(self.header.full), *enumerate(self.names))
+        return {name: place for place, name in reversed(named)}
 
     def column(self, name: str, quantity: str = "", unit: str | None = None) -> np.ndarray:
         """[N] the named column, which must exist; in s, m and rad if its quantity is given.
@@ -163,11 +170,10 @@ class CsvFile:
 
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
         """Errors for (column, configuration key) pairs whose column is missing, or there more than once."""
-        there = (*self.names, *self.header.full)
         errors = [
             missing_error(self.top, "column", name, self.header.full, key)
             for name, key in wanted
-            if name not in there
+            if name not in self._places
         ]
         for name in dict.fromkeys(name for name, _ in wanted):
             if max(self.names.count(name), self.header.full.count(name)) > 1:

@@ -12,10 +12,9 @@ import numpy as np
 
 from robot.recordings.camera.rows import camera_rows
 from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
-from robot.recordings.csv_alignment import align_truth, column_keys, each_nearest
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import CsvFile, read_csv
-from robot.recordings.csv_reader import ODOMETRY, read_csv_recording
+from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
 from robot.recordings.unit_check import MotionTrack, UnitLimits, unit_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, raise_errors, require_file

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.recordings.csv_alignment import labels_from_pairs
 from robot.recordings.csv_config import (
     ContactColumns,
     CsvConfig,
@@ -26,7 +25,7 @@ from robot.recordings.csv_config import (
 )
 from robot.recordings.csv_description import describe_csv
 from robot.recordings.csv_file import read_csv
-from robot.recordings.csv_reader import read_csv_recording
+from robot.recordings.csv_reader import labels_from_pairs, read_csv_recording
 from robot.recordings.npz_trace import read_trace
 from robot.sources.in_memory import truncate_log
 from robot.sources.odometry import from_poses
@@ -446,6 +445,19 @@ def test_settings_name_units_and_the_header_those_of_other_files(write: Write) -
     assert source.views[1].ravel().tolist() == [0.5, 1.0, 1.0]
     assert source.truth is not None
     assert source.truth[1] == pytest.approx([0.1, 0, np.pi / 2])
+
+
+def test_views_of_rows_that_are_left_out_are_lost_with_them(write: Write) -> None:
+    odometry = write(
+        "t,vx,w,label\n0,1,0,0\n1,x,0,1\n2,1,0,2\n" + "".join(f"{k},1,0,3\n" for k in range(3, 41)) + "41"
+    )
+    views = write("t,r0,r1,r2\n" + "".join(f"{k},0,0,{k % 2}\n" for k in range(42)), "views.csv")
+    config = with_parts(views=ViewColumns(file=views), labels=LabelColumns())
+    source = read_csv_recording(odometry, config)
+    assert source.time.tolist() == [0, *range(2, 41)]
+    assert source.seen.all()
+    np.testing.assert_array_equal(source.views[:, 0, 2, 0], source.time % 2)
+    assert source.label.tolist()[:3] == [0, 2, 3]
 
 
 def test_rows_are_counted_where_a_rate_is_given(write: Write) -> None:
