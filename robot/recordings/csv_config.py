@@ -7,8 +7,23 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat
 
+from robot.recordings.csv_units import AngleUnit, LengthUnit, TimeUnit
 from tactile.base.config import Settings
 from tactile.whiskers.head_geometry import Degrees
+
+MAX_SIDE = 4096  # rows or columns of a view
+Quaternion = Annotated[list[str], Field(min_length=4, max_length=4)]
+
+
+class TableUnits(Settings):
+    """Units of columns; null: that of the header (`t [ms]`, `x_mm`), else s, m, rad."""
+
+    time: TimeUnit | None = None
+    """Of times. Speeds and turn rates are per second whatever it is, unless the header says otherwise."""
+    length: LengthUnit | None = None
+    """Of positions, distances, and speeds (per second)."""
+    angle: AngleUnit | None = None
+    """Of headings, turns, and turn rates (per second)."""
 
 
 class PoseColumns(Settings):
@@ -20,6 +35,9 @@ class PoseColumns(Settings):
     """Column of the position, m."""
     heading: str = "heading"
     """Column of the heading, rad, counter-clockwise; wrapped or not."""
+    quaternion: Quaternion | None = None
+    """Columns x, y, z, w of a quaternion, read instead of `heading`: where the body's x axis points, or in a
+    plane with the column z, as of a camera, its z axis."""
 
 
 class VelocityColumns(Settings):
@@ -59,6 +77,8 @@ class ViewColumns(Settings):
     of consecutive beams, so their number must be a multiple of the pixels. Null: pixel values in 0..1."""
     tolerance: float | None = Field(default=None, ge=0)
     """Largest time between a view and its nearest odometry row, s; null: the median step."""
+    unit: LengthUnit | None = None
+    """Unit of the ranges; null: that of the header, else m."""
 
 
 class ContactColumns(Settings):
@@ -110,35 +130,35 @@ class PairColumns(Settings):
     """As for views."""
 
 
-class TruthColumns(Settings):
+class TruthColumns(PoseColumns):
     """True poses, interpolated to the odometry rows; none outside their time span."""
 
     file: Path | None = None
     """File of the true poses; null: the odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
-    x: str = "x"
-    """Column of the position, m."""
-    y: str = "y"
-    """Column of the position, m."""
-    heading: str = "heading"
-    """Column of the heading, rad; wrapped or not."""
+    units: TableUnits = TableUnits()
+    """Units of the true poses, and of the time in their file."""
 
 
 class CsvConfig(Settings):
     """Columns of a CSV recording."""
 
     time: str = "t"
-    """Column of the time, s."""
+    """Column of the time, s, or a date with a time of day (2024-05-01T10:00:00.123Z; UTC without a zone)."""
+    rate: PositiveFloat | None = None
+    """Rows per second, counted from the first time: for times that are rounded so that rows share them."""
+    units: TableUnits = TableUnits()
+    """Units of the odometry, and of times in other files whose header states none."""
     pose: PoseColumns | None = None
     """Odometry as poses; give one of poses, velocities and motions."""
     velocity: VelocityColumns | None = None
     """Odometry as velocities."""
     motion: MotionColumns | None = None
     """Odometry as motions."""
-    rows: int = Field(default=3, gt=0)
+    rows: int = Field(default=3, gt=0, le=MAX_SIDE)
     """R, rows of a view, also of the masked view of a recording with labels only."""
-    columns: int = Field(default=6, gt=0)
+    columns: int = Field(default=6, gt=0, le=MAX_SIDE)
     """C, columns of a view."""
     views: ViewColumns | None = None
     """Views, if any."""

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings.csv_file import CsvFile, read_csv
+from robot.recordings.csv_reader import other_plane, rounded_rate
+from robot.recordings.csv_units import PER_UNIT
 from tactile.base.errors import InputError
 
-TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "time_s", "t_s")
+TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "header_stamp", "datetime")
 FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
 LEFT_SPEEDS = ("vy", "v_y", "linear_y")
 TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
@@ -20,7 +24,14 @@ DISTANCES = ("distance", "dist", "ds", "forward")
 TURNS = ("turn", "dtheta", "dth", "rotation")
 HEADINGS = ("heading", "theta", "th", "yaw")
 LABELS = ("label", "place", "place_id")
-"""Names of columns, in lower case."""
+"""Names of columns, in lower case; those with `_` may also be the end of a name, as in rostopic's."""
+PLACE = re.compile(r"(^|_)(p|t|pos|position|pose|translation|location)_?$")
+QUATERNION = re.compile(r"(^|_)(q|quat|orient|rot)")
+MOVING = re.compile(r"(^|_)(v|w|a|b|vel|acc|lin|ang|gyro|imu|twist)")
+"""Names before x, y, z and w: of positions, of quaternions, and of what is neither."""
+NO_VIEWS = re.compile(r"covariance|intensit", re.IGNORECASE)
+EPOCH = 1e9, 4e9
+"""Times of day of 2001 to 2096 in s, which tells the unit of such times."""
 TRUE = re.compile(r"gt|true|truth|ground|mocap|vicon|reference")
 """Names of columns and files with true poses."""
 FEWEST_PIXELS = 4
@@ -78,16 +89,23 @@ def describe_csv(path: Path) -> CsvDescription:
     file = read_csv(path)
     time = time_column(file)
     parts, table, missing = dict[str, str](), dict[str, Any](), list[str]()
-    if time is None:
-        missing.append("a column of times (t, time, stamp)")
+    if time is None or not np.isfinite(file.column(time)).any():
+        faults = file.faults(time) if time is not None else []
+        missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
         return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
+    units = _units(file, time, odometry or {})
+    file = replace(file, clock=units.get("time"))
     files = [file, *companions(file, time)]
     if odometry is None:
         missing.append("odometry: columns x, y, heading, or v, w, or distance, turn")
     else:
-        table = {"time": time} | odometry
+        table = {"time": time} | ({"units": units} if units else {}) | odometry
         parts["odometry"] = _words(odometry)
+        parts |= {kind: f"unit of {kind}: {unit}" for kind, unit in units.items()}
+        pose = odometry.get("pose", {})
+        if (pose and pose["y"][-1:].lower() == "z") or pose.get("x", "")[-1:].lower() == "z":
+            parts["plane"] = f"the path lies in the plane of {pose['x']} and {pose['y']}"
     max_range = np.nan
     for other in files:
         views, ranges = _views(file, other)
@@ -106,7 +124,12 @@ def describe_csv(path: Path) -> CsvDescription:
         missing.append("views: numbered columns (r0, r1, ...), here or in a file whose name begins alike")
     if "truth" not in table:
         missing.append("true poses (a run then has no score, but a health)")
-    clock = _clock(file.column(time))
+    moments = file.column(time, "time")
+    if table and (rate := rounded_rate(moments, file.values)) is not None:
+        table["rate"] = float(f"{rate:.6g}")
+        parts["rate"] = f"rounded times: rows share each, so they are counted instead, {rate:.6g} a second"
+        moments = moments[0] + np.arange(len(moments)) / rate
+    clock = _clock(moments[np.isfinite(moments)])
     return CsvDescription(
         path,
         len(file.values),
@@ -127,39 +150,86 @@ def time_column(file: CsvFile) -> str | None:
 def companions(file: CsvFile, time: str) -> list[CsvFile]:
     """CSV files beside it whose names share its first word, with times that overlap."""
     word = re.split(r"[_\-. ]", file.path.stem)[0]
-    first, last = file.column(time)[[0, -1]]
+    own = file.column(time, "time")
+    first, last = np.nanmin(own), np.nanmax(own)
     found = []
     for path in sorted(file.path.parent.glob(f"{word}*.csv")):
         if path == file.path:
             continue
         try:
-            other = read_csv(path)
+            other = read_csv(path, file.clock)
         except InputError:
             continue
         column = time_column(other) or (other.names[0] if "t2" in other.names else None)
-        times = other.column(column) if column else np.zeros(0)
+        times = other.column(column, "time") if column else np.zeros(0)
+        times = times[np.isfinite(times)]
         if len(times) and times.min() <= last and times.max() >= first:
             found.append(other)
     return found
 
 
 def _named(file: CsvFile, names: Sequence[str]) -> str | None:
-    """The column with one of these names, in any case."""
-    lower = {name.lower(): name for name in file.names}
-    return next((lower[name] for name in names if name in lower), None)
+    """The column with one of these names, in any case and with any signs between words."""
+    lower = _lower(file)
+    ends = (lower[long] for name in names if "_" in name for long in lower if long.endswith(f"_{name}"))
+    return next((lower[name] for name in names if name in lower), next(ends, None))
 
 
-def _poses(file: CsvFile) -> dict[str, dict[str, str]]:
-    """Columns x, y, heading by their common prefix."""
-    lower = {name.lower(): name for name in file.names}
-    found = {}
+def _lower(file: CsvFile) -> dict[str, str]:
+    """The names by their lower case with `_` for other signs: `pose.position.x` by `pose_position_x`."""
+    found = dict[str, str]()
+    for name in file.names:
+        found.setdefault(re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_"), name)
+    return found
+
+
+def _units(file: CsvFile, time: str, odometry: dict[str, Any]) -> dict[str, str]:
+    """Units other than s, m, rad that the header states, the same for all columns, or that dates tell."""
+    part: dict[str, Any] = next(iter(odometry.values()), {})
+    columns = {
+        "time": [time],
+        "length": [part[key] for key in ("x", "y", "forward", "left") if key in part],
+        "angle": [part[key] for key in ("heading", "turn") if key in part],
+    }
+    units = {}
+    for kind, names in columns.items():
+        stated = {file.header.units[file.at(name)].removesuffix("/s") for name in names}
+        unit = next(iter(stated)) if len(stated) == 1 else ""
+        if kind == "time" and not unit and file.at(time) not in file.dates:
+            first = float(np.nanmin(file.column(time)))
+            scales = PER_UNIT[kind].items()
+            unit = next((unit for unit, factor in scales if EPOCH[0] <= first / factor < EPOCH[1]), "")
+        if PER_UNIT[kind].get(unit, 1) != 1:
+            units[kind] = unit
+    return units
+
+
+def _poses(file: CsvFile) -> dict[str, dict[str, Any]]:
+    """Columns x, y, and heading or quaternion, by the common prefix of x and y."""
+    lower, found = _lower(file), dict[str, dict[str, Any]]()
+    stems = [name[:-1] for name in lower if name.endswith("w") and QUATERNION.search(name[:-1])]
+    stems = [stem for stem in stems if all(stem + axis in lower for axis in "xyz")]
+    turns = {stem: [lower[stem + axis] for axis in "xyzw"] for stem in stems}
     for name in lower:
         prefix, end = name[:-1], name[-1:]
         if end != "x" or f"{prefix}y" not in lower:
             continue
         heading = next((prefix + word for word in HEADINGS if prefix + word in lower), None)
+        true, known = bool(TRUE.search(prefix)), prefix not in turns and not MOVING.search(prefix)
+        if heading is None and known and not true and PLACE.search(prefix):
+            heading = next((word for word in HEADINGS if word in lower), None)
+        columns: dict[str, Any] = {"x": lower[name], "y": lower[f"{prefix}y"]}
+        like = [stem for stem in turns if bool(TRUE.search(stem)) == true]
         if heading is not None:
-            found[prefix] = {"x": lower[name], "y": lower[f"{prefix}y"], "heading": lower[heading]}
+            columns["heading"] = lower[heading]
+        elif known and like:
+            closest = max(like, key=lambda stem: sum(map(str.__eq__, stem, prefix)))
+            columns["quaternion"] = turns[closest]
+        else:
+            continue
+        if plane := other_plane(file, columns["x"], columns["y"]):
+            columns[plane[0]] = plane[1]
+        found[prefix] = columns
     return found
 
 
@@ -190,9 +260,8 @@ def _truth(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
 
 def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]:
     """The settings of views from this file, and their largest range, NaN without ranges."""
-    prefixes = {name.rstrip("0123456789") for name in other.names if name[-1:].isdecimal()}
-    found = [(len(other.numbered(prefix)), prefix) for prefix in prefixes]
-    count, prefix = max(found, default=(0, ""))
+    found = [("range" in stem.lower(), count, stem) for stem, count in _stems(other).items()]
+    _, count, prefix = max((entry for entry in found if not NO_VIEWS.search(entry[2])), default=(0, 0, ""))
     if count < FEWEST_PIXELS:
         return None, np.nan
     values = other.block(prefix)[0]
@@ -204,6 +273,11 @@ def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]
         return {"rows": 1, "columns": count, "views": views}, np.nan
     reach = _round(RANGE_MARGIN * float(np.quantile(known, RANGE_QUANTILE)))
     return shape | {"views": views | {"max_range": reach}}, reach
+
+
+def _stems(file: CsvFile) -> Counter[str]:
+    """Names of numbered columns before their number, and how many there are of each."""
+    return Counter(name.rstrip("0123456789") for name in file.names if name[-1:] in set("0123456789"))
 
 
 def _labels(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
@@ -226,14 +300,15 @@ def _file(file: CsvFile, other: CsvFile) -> dict[str, Any]:
 
 
 def _columns(file: CsvFile) -> tuple[Column, ...]:
-    found, joined = list[Column](), set[str]()
-    for name in file.names:
+    found, joined, stems = list[Column](), set[str](), _stems(file)
+    for place, name in enumerate(file.names):
         prefix = name.rstrip("0123456789")
-        values = file.column(name)
-        if prefix != name and len(numbers := list(file.numbered(prefix))) >= FEWEST_PIXELS:
-            if prefix in joined:
-                continue
+        values = file.values[:, place]
+        if prefix in joined and prefix != name:
+            continue
+        if prefix != name and stems[prefix] >= FEWEST_PIXELS:
             joined.add(prefix)
+            numbers = list(file.numbered(prefix))
             name, values = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}", file.block(prefix)[0]
         known = values[np.isfinite(values)]
         found.append(

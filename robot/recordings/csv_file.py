@@ -3,17 +3,51 @@
 from __future__ import annotations
 
 import csv
+import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from robot.recordings.sanity_checks import count_others, nonfinite_errors
-from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
+from robot.recordings.csv_units import PER_UNIT, is_unit, per_unit, plain_unit, split_unit
+from robot.recordings.sanity_checks import count_others
+from robot.sources.input_files import digest_of, missing_error, read_bytes, require_file
 from tactile.base.errors import InputError
 
-MAX_LISTED = 8  # errors listed one by one; the others are counted
+MAX_BYTES, MAX_LINES, MAX_COLUMNS, MAX_CELLS = 1 << 28, 1 << 22, 1 << 12, 1 << 25
+MAX_LINE, MAX_NAME = 1 << 20, 200
+"""Limits of a file: bytes, lines, columns, rows x columns; characters of a line and of a column's name."""
+EMPTY, WORD, CUT = 1, 2, 3
+"""Why a cell has no number: nothing in it, text in it, or its row has another number of cells."""
+COMMENT = "#%"  # a line that begins so is a comment, or the header
+QUATERNION_TOLERANCE = 0.05  # of the length 1; three decimals leave 0.002
+DATE = re.compile(
+    r"\s*(\d{4})[-/](\d\d?)[-/](\d\d?)[T ]+(\d\d?):(\d\d):(\d\d)(?:[.,](\d*))?"
+    r"\s*(?:Z|UTC|([+-]\d\d):?(\d\d)?)?\s*",
+    re.IGNORECASE,
+)
+
+
+class Header(NamedTuple):
+    """The header row.
+
+    Attributes:
+        line: its number, from 1. separator: of cells; a space stands for any white space.
+        full: names of the C columns as written. names: without their units where that is unambiguous.
+        units: of the columns, '' where the header states none.
+    """
+
+    line: int
+    separator: str
+    full: tuple[str, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,40 +55,130 @@ class CsvFile:
     """The numbers of one file.
 
     Attributes:
-        names: its C columns. values: [N, C]; NaN in empty cells. empty: [N, C] bool, empty cells.
-        lines: [N] line numbers, from 1. content: the file's bytes.
+        values: [N, C]; NaN where there is no number. fault: [N, C] uint8, why: `EMPTY`, `WORD`, `CUT` or 0.
+        dates: columns of dates, which are s since 1970 (UTC). lines: [N] line numbers, from 1.
+        content: the file's bytes. clock: unit of times whose header states none.
     """
 
     path: Path
-    names: tuple[str, ...]
+    header: Header
     values: np.ndarray
-    empty: np.ndarray
+    fault: np.ndarray
+    dates: frozenset[int]
     lines: np.ndarray
     content: bytes
+    clock: str | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.header.names
+
+    @property
+    def top(self) -> str:
+        """The place of the header."""
+        return f"{self.path}:{self.header.line}"
 
     def place(self, row: int) -> str:
         return f"{self.path}:{self.lines[row]}"
 
-    def column(self, name: str) -> np.ndarray:
-        """[N] the named column, which must exist (see `absences`)."""
-        return self.values[:, self.names.index(name)]
+    def at(self, name: str) -> int:
+        """The position of a column, named with or without its unit, which must exist (see `absences`)."""
+        return self._places[name]
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        """The first position of each name, in full or without its unit."""
+        named = (*enumerate(self.header.full), *enumerate(self.names))
+        return {name: place for place, name in reversed(named)}
+
+    def column(self, name: str, quantity: str = "", unit: str | None = None) -> np.ndarray:
+        """[N] the named column, which must exist; in s, m and rad if its quantity is given.
+
+        Args:
+            quantity: as for `per_unit`. unit: None for that in the header.
+
+        Raises:
+            InputError: the header states no unit of this quantity.
+        """
+        place = self.at(name)
+        values, found = self.values[:, place], unit or self.header.units[place]
+        if quantity == "time" and place in self.dates:
+            return values
+        if not found and quantity == "time":
+            found = self.clock or ""
+        factor = per_unit(found, quantity) if found and quantity else 1.0
+        if factor is None:
+            if name == self.header.full[place] and name[-1] not in ")]":
+                return values  # the end of a name that the user gave in full
+            kind = quantity.split("/")[0]
+            cure = f"correct the header, or set recording.table.units.{kind}"
+            said = f"{self.header.full[place]!r} states the unit {found!r}"
+            raise InputError(self.top, said, f"a unit of {quantity} ({', '.join(PER_UNIT[kind])})", cure)
+        return values if factor == 1 else values / factor
+
+    def judge(
+        self, names: Sequence[str], quaternion: Sequence[str] = (), far: bool = False
+    ) -> tuple[np.ndarray, list[InputError]]:
+        """[N] bool, rows in which a named column has no finite number, and an error for each kind of fault.
+
+        Args:
+            quaternion: columns of one, whose length must be 1. far: inf is a value, nothing in range.
+        """
+        places = [self.at(name) for name in (*names, *quaternion)]
+        fault, values = self.fault[:, places], self.values[:, places]
+        endless = ~np.isfinite(values) & ~(far & (values == np.inf))
+        kinds = [fault == CUT, fault == WORD, fault == EMPTY, (fault == 0) & endless]
+        bad = np.any(kinds, axis=(0, 2)) if places else np.zeros(len(values), bool)
+        turn = self.values[:, places[len(names) :]]
+        away = np.abs(np.linalg.norm(turn, axis=1) - 1)
+        crooked = bool(quaternion) & ~bad & ~(away <= QUATERNION_TOLERANCE)
+        errors, drop = [], "correct or drop the row"
+        for hit in kinds:
+            if hit.any():
+                row, column = np.argwhere(hit)[0].tolist()
+                found, *wanted = self._fault(row, places[column])
+                errors.append(InputError(self.place(row), found + count_others(hit.any(axis=1)), *wanted))
+        if crooked.any():
+            row = int(crooked.argmax())
+            found = f"({', '.join(quaternion)}) is {turn[row].tolist()}{count_others(crooked)}"
+            errors.append(InputError(self.place(row), found, "a quaternion of length 1", drop))
+        return bad | crooked, errors
 
     def faults(self, *names: str) -> list[InputError]:
-        """Errors for empty, NaN or infinite cells of the named columns."""
-        errors = []
-        for name in names:
-            empty = self.empty[:, self.names.index(name)]
-            if empty.any():
-                found = f"{name} is empty{count_others(empty)}"
-                errors.append(InputError(self.place(int(empty.argmax())), found, "a number"))
-            errors += nonfinite_errors(self.column(name), name, self.place, ~empty)
-        return errors
+        """An error for each kind of fault of the named columns: a cut row, text, nothing, NaN or infinite."""
+        return self.judge(names)[1]
+
+    def _fault(self, row: int, place: int) -> tuple[str, str, str]:
+        """What is wrong with a cell, what is expected, and the cure."""
+        cells = _split(_lines_of(self.content, self.path)[self.lines[row] - 1], self.header.separator)
+        name, fault, drop = self.names[place], int(self.fault[row, place]), "correct or drop the row"
+        if fault == CUT:
+            few = len(cells) < len(self.names)
+            cure = "the row may be cut off" if few else f"quote text that holds {self.header.separator!r}"
+            return f"{len(cells)} cells", f"{len(self.names)}, as in the header", cure
+        if fault == WORD:
+            comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", cells[place])
+            cure = "write decimal points, not decimal commas" if comma else drop
+            return f"{name} is {cells[place][:40]!r}", "a number", cure
+        if fault == EMPTY:
+            return f"{name} is empty", "a number", drop
+        return f"{name} is {self.values[row, place]}", "a finite number", drop
+
+    def rows(self, kept: np.ndarray) -> CsvFile:
+        """The file with these rows only."""
+        return replace(self, values=self.values[kept], fault=self.fault[kept], lines=self.lines[kept])
 
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
-        """Errors for (column, configuration key) pairs whose column is missing."""
-        where = f"{self.path}:1"
-        absent = [(name, key) for name, key in wanted if name not in self.names]
-        return [missing_error(where, "column", name, self.names, key) for name, key in absent]
+        """Errors for (column, configuration key) pairs whose column is missing, or there more than once."""
+        errors = [
+            missing_error(self.top, "column", name, self.header.full, key)
+            for name, key in wanted
+            if name not in self._places
+        ]
+        for name in dict.fromkeys(name for name, _ in wanted):
+            if max(self.names.count(name), self.header.full.count(name)) > 1:
+                errors.append(InputError(self.top, f"several columns are called {name!r}", "every name once"))
+        return errors
 
     def numbered(self, prefix: str) -> dict[int, int]:
         """Columns prefix0, prefix1, ...: their numbers in increasing order, and their positions."""
@@ -65,33 +189,41 @@ class CsvFile:
         }
         return dict(sorted(numbers.items()))
 
-    def block(self, prefix: str) -> tuple[np.ndarray, np.ndarray]:
-        """The numbered columns in order: values [N, B], empty [N, B]."""
-        columns = list(self.numbered(prefix).values())
-        return self.values[:, columns], self.empty[:, columns]
+    def block(self, prefix: str, unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The numbered columns in order: values [N, B], in m if they have a unit; fault [N, B]."""
+        places = list(self.numbered(prefix).values())
+        values = self.values[:, places]
+        unit = unit or (self.header.units[places[0]] if places else "")
+        factor = per_unit(unit, "length") or 1.0
+        return values if factor == 1 else values / factor, self.fault[:, places]
 
 
-def read_csv(path: Path) -> CsvFile:
-    """Reads a CSV file of numbers.
+def read_csv(path: Path, clock: str | None = None) -> CsvFile:
+    """Reads a CSV file of numbers; dates become s since 1970 (UTC).
+
+    Lines that begin with # or % are comments, but such a line right above numbers may be the header.
+
+    Args:
+        clock: unit of times whose header states none.
 
     Raises:
-        InputError: the file, its header or rows are missing, or a row has another length or an invalid cell.
+        InputError: the file, its header or rows are missing, it is not text, or it exceeds a limit.
     """
+    require_file(path)
+    _limit(str(path), path.stat().st_size, MAX_BYTES, "bytes")
     content = read_bytes(path)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(str(path), f"is not text (byte {error.start})", "a CSV file in UTF-8") from error
-    lines = text.splitlines()
-    names = _header(path, lines[0] if lines else "")
-    full = [(number, line) for number, line in enumerate(lines[1:], start=2) if line.strip()]
-    if not full:
+    lines = _lines_of(content, path)
+    header = _header(path, lines)
+    rows = [number for number in range(header.line, len(lines)) if not _is_skipped(lines[number])]
+    if not rows:
         raise InputError(str(path), "has no rows under its header", "at least one row")
-    values = _numbers([line for _, line in full], len(names))
-    empty = np.zeros((len(full), len(names)), bool)
+    _limit(str(path), len(rows) * len(header.full), MAX_CELLS, "cells (rows x columns)")
+    full = [lines[number] for number in rows]
+    fault, dates = np.zeros((len(full), len(header.full)), np.uint8), frozenset[int]()
+    values = _numbers(full, header)
     if values is None:
-        values, empty = _cells(path, names, full)
-    return CsvFile(path, names, values, empty, np.array([number for number, _ in full]), content)
+        values, dates = _cells(full, header, fault)
+    return CsvFile(path, header, values, fault, dates, np.array(rows) + 1, content, clock)
 
 
 def digest_of_files(files: Sequence[CsvFile]) -> str:
@@ -99,64 +231,147 @@ def digest_of_files(files: Sequence[CsvFile]) -> str:
     return digest_of({file.path: file.content for file in files}.values())
 
 
-def _header(path: Path, line: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in _split(line))
-    where = f"{path}:1"
-    if len(names) < 2:
-        for mark, word in ((";", "semicolons"), ("\t", "tabs")):
-            if mark in line:
-                raise InputError(where, f"the columns are separated by {word}", "commas")
-    if any(_is_number(name) for name in names):
+def _limit(where: str, count: int, most: int, what: str) -> None:
+    if count > most:
+        raise InputError(where, f"{count} {what}", f"at most {most}", "leave out columns, or split the file")
+
+
+def _lines_of(content: bytes, path: Path) -> list[str]:
+    """The lines of a file, whatever ends them."""
+    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+    try:
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            str(path), f"is not text (byte {error.start})", "a CSV file in UTF-8", "save it as CSV in UTF-8"
+        ) from error
+    if "\r" in text:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
+    _limit(str(path), text.count("\n"), MAX_LINES, "lines")
+    lines = text.split("\n")
+    longest = max(range(len(lines)), key=lambda number: len(lines[number]))
+    _limit(f"{path}:{longest + 1}", len(lines[longest]), MAX_LINE, "characters in a line")
+    return lines
+
+
+def _is_skipped(line: str) -> bool:
+    """Whether all cells of a line are empty, or it is a comment."""
+    begin = line.lstrip(' ,;\t"\v\f')[:1]
+    return not begin or begin in COMMENT
+
+
+def _header(path: Path, lines: list[str]) -> Header:
+    """The header: the first line that is no comment, or the comment above the numbers that names as many."""
+    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 2))
+    first = rows[0] if rows else len(lines)
+    above = [number for number in range(first) if lines[number].strip()]
+    number, row = first, lines[rows[1]] if len(rows) > 1 else ""
+    if not rows or any(map(_is_number, _split(lines[first], _separator(lines[first], lines[first])))):
+        row = lines[first] if rows else ""
+        found = (comment for comment in reversed(above) if not rows or _names_columns(lines[comment], row))
+        number = next(found, min(first, len(lines) - 1))
+    where, line = f"{path}:{number + 1}", _uncommented(lines[number])
+    mark = _separator(line, row)
+    _limit(where, line.count(mark) + 1, MAX_COLUMNS, "columns")
+    full = [name.strip() for name in _split(line, mark)]
+    if any(map(_is_number, full)):
         raise InputError(where, f"the first line is {line[:60]!r}", "a header row that names the columns")
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise InputError(where, f"several columns are called {doubled[0]!r}", "every name once")
-    return names
+    strange = next((name for name in full if not name.isprintable() or len(name) > MAX_NAME), None)
+    if strange is not None:
+        found_there = f"the header names a column {strange[:40]!r}, {len(strange)} characters"
+        raise InputError(where, found_there, f"text without control characters, at most {MAX_NAME} a name")
+    units = [plain_unit(cell.strip(" []()")) for cell in _split(row, mark)]
+    if any(units) and all(map(is_unit, filter(None, units))) and len(units) == len(full):
+        number = lines.index(row, number + 1)  # a second row of the header states the units
+        full = [f"{name} [{unit}]" for name, unit in zip(full, units, strict=True)]
+    short = [split_unit(name) for name in full]
+    count = Counter(name for name, _ in short) + Counter(full)
+    alone = [count[bare] == 1 + (bare == name) for name, (bare, _) in zip(full, short, strict=True)]
+    names = [bare if one else name for one, name, (bare, _) in zip(alone, full, short, strict=True)]
+    return Header(number + 1, mark, tuple(full), tuple(names), tuple(unit for _, unit in short))
 
 
-def _numbers(lines: list[str], width: int) -> np.ndarray | None:
+def _uncommented(line: str) -> str:
+    return line.lstrip().lstrip(COMMENT).replace("\xa0", " ").strip(" ")
+
+
+def _names_columns(comment: str, row: str) -> bool:
+    """Whether a comment names as many columns as a row has."""
+    line = _uncommented(comment)
+    mark = _separator(line, row)
+    names = _split(line, mark)
+    widths = len(_split(row, mark)), len(_split(row.rstrip().rstrip(mark), mark))
+    return len(names) in widths and not any(map(_is_number, names))
+
+
+def _separator(line: str, row: str) -> str:
+    """What separates the cells of a line: commas, semicolons, tabs, or spaces if a row has as many."""
+    spaced = 1 < len(line.split()) == len(row.split())
+    return next((mark for mark in ",;\t" if mark in line), " " if spaced else ",")
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' in line:
+        try:
+            return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+        except csv.Error:  # a cell beyond the size limit of the csv module is not a number
+            pass
+    return line.split(separator)
+
+
+def _numbers(full: list[str], header: Header) -> np.ndarray | None:
     """[N, C] parsed at once, or None if a cell needs separate treatment."""
     try:
-        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+        mark = None if header.separator == " " else header.separator
+        values = np.loadtxt(full, delimiter=mark, comments=None, ndmin=2)
     except ValueError:
         return None
-    return values if values.shape == (len(lines), width) else None
+    return values if values.shape == (len(full), len(header.full)) else None
 
 
-def _cells(path: Path, names: tuple[str, ...], full: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, C] values and empty flags, parsed cell by cell; raises the errors of cells that are not numbers."""
-    values = np.full((len(full), len(names)), np.nan)
-    empty = np.zeros(values.shape, bool)
-    errors = []
-    for row, (number, line) in enumerate(full):
-        cells = _split(line)
-        if len(cells) != len(names):
-            found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"
-            errors.append(InputError(f"{path}:{number}", found, expected, "the row may be cut off"))
+def _cells(full: list[str], header: Header, fault: np.ndarray) -> tuple[np.ndarray, frozenset[int]]:
+    """[N, C] values, parsed cell by cell, and the columns of dates; writes into `fault`, as in `CsvFile`."""
+    width, dates = len(header.full), set[int]()
+    values = np.full(fault.shape, np.nan)
+    for row, line in enumerate(full):
+        cells = _split(line, header.separator)
+        while len(cells) > width and not cells[-1].strip():
+            cells.pop()  # commas after the last cell
+        if len(cells) != width:
+            fault[row] = CUT
             continue
         for column, cell in enumerate(cells):
-            if not cell.strip():
-                empty[row, column] = True
-            elif _is_number(cell):
+            try:
                 values[row, column] = float(cell)
-            else:
-                errors.append(InputError(f"{path}:{number}", f"{names[column]} is {cell[:40]!r}", "a number"))
-    if len(errors) > MAX_LISTED:
-        errors[MAX_LISTED:] = [InputError(str(path), f"{len(errors) - MAX_LISTED} more faults like these")]
-    raise_errors(errors)
-    return values, empty
-
-
-def _split(line: str) -> list[str]:
-    try:
-        return next(csv.reader([line]), [])
-    except csv.Error:  # a cell beyond the size limit of the csv module is not a number
-        return line.split(",")
+            except ValueError:
+                seconds = _seconds(cell)
+                if seconds is None:
+                    fault[row, column] = WORD if cell.strip() else EMPTY
+                else:
+                    values[row, column] = seconds
+                    dates.add(column)
+    return values, frozenset(dates)
 
 
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
-        return False
+        return _seconds(cell) is not None
     return True
+
+
+def _seconds(cell: str) -> float | None:
+    """s since 1970 (UTC) of a date with a time of day, without a zone that of UTC; None if it is none."""
+    found = DATE.fullmatch(cell)
+    if found is None:
+        return None
+    try:
+        year, month, day, hour, minute, second = map(int, found.groups()[:6])
+        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+    east = int(found[8] or 0) * 60 + int(f"{(found[8] or '+')[0]}{found[9] or 0}")
+    return whole - 60 * east + float(f"0.{found[7] or 0}")

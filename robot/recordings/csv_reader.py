@@ -2,74 +2,194 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from robot.recordings.alignment import RecordingRows
-from robot.recordings.csv_alignment import align_contacts, align_labels, align_truth, align_views, sensors_of
-from robot.recordings.csv_config import ContactColumns, CsvConfig, PoseColumns, VelocityColumns, ViewColumns
-from robot.recordings.csv_file import CsvFile, digest_of_files, read_csv
+from robot.recordings import csv_config as columns
+from robot.recordings.alignment import (
+    RecordingRows,
+    interpolated_poses,
+    nearest_rows,
+    range_errors,
+    range_pixels,
+)
+from robot.recordings.csv_file import EMPTY, CsvFile, digest_of_files, read_csv
+from robot.recordings.csv_units import split_unit
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
-from robot.recordings.sanity_checks import clock_errors
+from robot.recordings.sanity_checks import RowName, clock_errors, view_errors
+from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
+from robot.sources.registry import Warn
+from robot.sources.source_info import PlanarWhiskersInfo
+from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
+RATE = "set recording.table.rate={:.6g}, the rows per second"
+HOLE = 3
+"""Rows one after another that may be left out of velocities and motions; the next row stands for them."""
+MAX_PIXELS = 1 << 26
+"""Of all views of a recording."""
+Odometry = columns.PoseColumns | columns.VelocityColumns | columns.MotionColumns
+AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
+LEAVE_OUT = 0.05
+"""Share of the rows, but at least one row, that may be left out because a number is missing."""
+SHARED = 0.2
+"""Share of the steps without time that makes times rounded."""
+UPRIGHT, LEVEL = 10.0, 0.2
+"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
 
 
-def read_csv_recording(path: Path, config: CsvConfig, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
+def read_csv_recording(
+    path: Path, config: columns.CsvConfig, judge: InputJudge = DEFAULT_JUDGE
+) -> InMemorySource:
     """A CSV recording as a `Source`: one sample per row of the odometry file.
 
+    Args:
+        judge: of the odometry; is told, `PATH:LINE: ...`, where rows, views or true poses are left out.
+
     Raises:
-        InputError: files or columns are missing, cells are not numbers, or values are impossible.
+        InputError: files or columns are missing, too many cells are not numbers, or values are impossible.
     """
     parts = (config.views, config.contacts, config.labels, config.pairs, config.truth)
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
-    files = {name: read_csv(name) for name in dict.fromkeys(paths)}
-    base = files[path]
-    raise_errors(_absences(base, files, config))
+    files = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
+    raise_errors(_absences(files[path], files, config))
+    digest, limits, warn = digest_of_files(list(files.values())), judge.limits, judge.warn
+    if judge.stretch != WHOLE:
+        files = _within(files, path, config, judge.stretch)
 
-    time, limits = base.column(config.time), judge.limits
-    errors = base.faults(config.time) + clock_errors(time, config.time, base.place)
-    motion, faults = _motion(base, time, config, limits)
-    recording = RecordingRows(time, motion, (config.rows, config.columns, 1), errors=errors + faults)
-    recording.held, recording.place = config.velocity is not None, base.place
-    if config.pose is not None:
-        recording.poses = np.column_stack([base.column(name) for name in config.pose.model_dump().values()])
+    whole, part = files[path], config.pose or config.velocity or config.motion
+    assert part is not None  # checked by `_absences`
+    kept, errors = _odometry_rows(whole, config, part, warn)
+    base = files[path] = whole.rows(kept)
+    time, faults = _times(base, config, kept)
+    motion, poses, others = _motion(base, time, part, config.units, kept, limits)
+    size = len(time) * config.rows * config.columns
+    if size > MAX_PIXELS:
+        found = f"{len(time)} rows of {config.rows} x {config.columns} pixels"
+        raise InputError(str(path), found, f"at most {MAX_PIXELS}", "lower table.rows or table.columns")
+    recording = RecordingRows(time, motion, (config.rows, config.columns, 1), errors=errors + faults + others)
+    recording.held, recording.poses = isinstance(part, columns.VelocityColumns), poses
+    recording.place, recording.cures = base.place, _unit_cure
+    clock = _whole_clock(time, kept, len(whole.lines))  # what belongs to a row that is left out, is too
+    row_of = np.full(len(clock), -1)
+    row_of[kept] = np.arange(len(kept))
+
+    def placed(file: Path | None, aligned: AlignedRows) -> tuple[np.ndarray, np.ndarray]:
+        """The values without errors whose row is kept, and its number."""
+        rows, values, faults = aligned
+        recording.errors += faults
+        if faults:
+            return np.zeros(0, int), values[:0]
+        rows = rows if files[file or path] is base else row_of[rows]
+        return rows[rows >= 0], values[rows >= 0]
+
     if config.views is not None:
-        rows, values, faults = align_views(base, files, config.views, time, recording.shape)
-        recording.errors += faults
-        if not faults:
-            recording.views[rows], recording.seen[rows] = values, True
+        views = align_views(base, files, config.views, clock, recording.shape, warn)
+        rows, values = placed(config.views.file, views)
+        recording.views[rows], recording.seen[rows] = values.reshape(-1, *recording.shape), True
     if config.contacts is not None:
-        rows, values, faults = align_contacts(base, files, config.contacts, time)
-        recording.errors += faults
-        if not faults:
-            recording.set_contacts(rows, values, sensors_of(config.contacts))
-    if config.labels is not None or config.pairs is not None:
-        rows, values, faults = align_labels(base, files, config.labels, config.pairs, time)
-        recording.errors += faults
-        if not faults:
-            recording.label[rows] = values
+        rows, values = placed(config.contacts.file, align_contacts(base, files, config.contacts, clock, warn))
+        recording.set_contacts(rows, values, sensors_of(config.contacts))
+    if labels := config.pairs or config.labels:
+        rows, values = placed(labels.file, align_labels(base, files, config.labels, config.pairs, clock))
+        recording.label[rows] = values
     if config.truth is not None:
-        file = files[config.truth.file or path]
-        recording.truth, faults = align_truth(file, config.truth, time, limits, file is base)
+        same = files[config.truth.file or path] is base
+        file, clock = (base, time) if same else (files[config.truth.file or path], clock)
+        truth, faults = align_truth(file, config.truth, clock, limits, same, warn)
+        recording.truth = truth if same else truth[kept]
         recording.errors += faults
-    return recording.source(path.stem, digest_of_files(list(files.values())), str(path), judge)
+    return recording.source(path.stem, digest, str(path), judge)
 
 
-def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -> list[InputError]:
+def _unit_cure(quantity: str, unit: str) -> str:
+    return f"set recording.table.units.{quantity} to {unit}"
+
+
+def _within(
+    files: Mapping[Path, CsvFile], path: Path, config: columns.CsvConfig, stretch: Stretch
+) -> dict[Path, CsvFile]:
+    """The files, each with its rows within a stretch of the odometry."""
+    base, found = files[path], dict(files)
+    if config.rate is None:
+        time = base.column(config.time, "time", config.units.time)
+    else:
+        time = np.arange(len(base.lines)) / config.rate
+    inside = stretch.rows(time, str(path))
+    found[path] = base.rows(inside)
+    first, last = time[inside][0], time[inside][-1]
+    for part in (config.views, config.contacts, config.labels, config.pairs, config.truth):
+        if part is None or part.file is None or part.file == path:
+            continue
+        names = (part.later, part.earlier) if isinstance(part, columns.PairColumns) else (part.time,)
+        file = files[part.file]
+        times = np.column_stack([file.column(name, "time") for name in names])
+        found[part.file] = file.rows(((first <= times) & (times <= last)).all(axis=1))
+    return found
+
+
+def _odometry_rows(
+    base: CsvFile, config: columns.CsvConfig, part: Odometry, warn: Warn
+) -> tuple[np.ndarray, list[InputError]]:
+    """The rows to keep, those with all numbers of the odometry, and errors."""
+    names, turn = position_columns(part) if isinstance(part, columns.PoseColumns) else ([], [])
+    names = names or [name for name in part.model_dump().values() if name is not None]
+    bad, errors = base.judge([config.time, *names] if config.rate is None else names, turn)
+    if not leave_out(bad, errors, "rows are", warn):
+        return np.arange(len(bad)), errors
+    kept = np.flatnonzero(~bad)
+    steps = np.diff(kept)
+    if steps.max(initial=0) > HOLE + 1 and not isinstance(part, columns.PoseColumns):
+        found = f"{steps.max() - 1} rows one after another lack odometry ({errors[0].found})"
+        error = InputError(base.place(kept[steps.argmax()] + 1), found, f"at most {HOLE}")
+        return np.arange(len(bad)), [error]
+    return kept, []
+
+
+def _times(base: CsvFile, config: columns.CsvConfig, kept: np.ndarray) -> tuple[np.ndarray, list[InputError]]:
+    """Times [N] s of the rows at positions [N], and their errors."""
+    if config.rate is not None:
+        there = config.time in (*base.names, *base.header.full)
+        time = base.column(config.time, "time", config.units.time) if there else np.zeros(1)
+        return np.nan_to_num(time[0]) + kept / config.rate, []
+    time = base.column(config.time, "time", config.units.time)
+    return time, _clock_errors(base, config.time, time, RATE)
+
+
+def _clock_errors(file: CsvFile, name: str, time: np.ndarray, cure: str) -> list[InputError]:
+    """Errors of times [N] s that do not increase; `cure`: for rounded ones, with their rate."""
+    rate = rounded_rate(time, file.values)
+    if rate is None:
+        return clock_errors(time, name, file.place)
+    found = f"{name} is rounded: {len(time) / len(np.unique(time)):.3g} rows share each time"
+    row = int((np.diff(time) == 0).argmax()) + 1
+    return [InputError(file.place(row), found, "times that increase", cure.format(rate))]
+
+
+def _whole_clock(time: np.ndarray, kept: np.ndarray, count: int) -> np.ndarray:
+    """Times [count] of all rows, those left out between their neighbours; kept: the rows of the times [N]."""
+    if len(kept) == count:
+        return time
+    rows = np.arange(count)
+    step = float(np.median(np.diff(time) / np.diff(kept))) if len(kept) > 1 else 1.0
+    beyond = np.minimum(rows - kept[0], 0) + np.maximum(rows - kept[-1], 0)
+    return np.interp(rows, kept, time) + beyond * step
+
+
+def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvConfig) -> list[InputError]:
     """Errors for missing columns and for settings that contradict each other."""
-    errors = base.absences([(config.time, "table.time")])
+    errors = base.absences([(config.time, "table.time")] if config.rate is None else [])
     given = sum(getattr(config, key) is not None for key in ODOMETRY)
     if given != 1:
         found = f"{'more than one' if given else 'none'} of {', '.join(f'table.{key}' for key in ODOMETRY)}"
-        expected = f"one of them, naming the odometry among {', '.join(base.names)}"
+        expected = f"one of them, naming the odometry among {', '.join(base.names[:12])}"
         errors.append(InputError(str(base.path), found, expected))
     if config.labels is not None and config.pairs is not None:
         found = "both table.labels and table.pairs are given"
@@ -79,45 +199,346 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: CsvConfig) -
         if part is None:
             continue
         file = files[getattr(part, "file", None) or base.path]
-        numbers = {"file", "tolerance", "threshold", "prefix", "max_range", "directions", "distance"}
-        named = part.model_dump(exclude=numbers, exclude_none=True)
-        if file is base:
-            named.pop("time", None)  # the time of the odometry is used there
-        errors += file.absences([(column, f"table.{key}.{field}") for field, column in named.items()])
-        if isinstance(part, ContactColumns):
-            key = "contacts.directions"
-            errors += file.absences([(column, f"table.{key}") for column in part.directions])
-        if isinstance(part, ViewColumns):
+        own_time = file is base and hasattr(part, "time")  # then that of the odometry is used
+        errors += file.absences(column_keys(part, f"table.{key}")[own_time:])
+        if isinstance(part, columns.ViewColumns):
             errors += _gap_errors(file, part.prefix)
     return errors
 
 
 def _gap_errors(file: CsvFile, prefix: str) -> list[InputError]:
     """The error for view columns whose numbers have a gap."""
-    there = list(file.numbered(prefix))
-    wanted = range(there[0], there[-1]) if there else [0]
+    there = file.numbered(prefix)
+    wanted = range(min(there), max(there)) if there else [0]
     absent = next((number for number in wanted if number not in there), None)
     if absent is None:
         return []
-    return [missing_error(f"{file.path}:1", "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
+    return [missing_error(file.top, "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
 
 
 def _motion(
-    base: CsvFile, time: np.ndarray, config: CsvConfig, limits: UnitLimits
-) -> tuple[np.ndarray, list[InputError]]:
-    """Motions [N, 4] and the errors of their columns."""
-    part = config.pose or config.velocity or config.motion
-    assert part is not None  # checked by `_absences`
-    names = [name for name in part.model_dump().values() if name is not None]
-    columns = {name: base.column(name) for name in names}
-    errors = base.faults(*names)
+    base: CsvFile,
+    time: np.ndarray,
+    part: Odometry,
+    units: columns.TableUnits,
+    kept: np.ndarray,
+    limits: UnitLimits,
+) -> tuple[np.ndarray, np.ndarray | None, list[InputError]]:
+    """Motions [N, 4] of the rows at positions [N], poses [N, 3] where these are given, and errors."""
     with np.errstate(all="ignore"):  # faulty values are already reported
-        if isinstance(part, PoseColumns):
-            poses = np.column_stack([columns[name] for name in names])
-            if faults := heading_errors(poses[:, 2], time, part.heading, str(base.path), limits):
-                errors += faults
-                poses[:, 2] = np.deg2rad(poses[:, 2])  # or every other check would report it again
-            return from_poses(time, poses), errors
-        left = columns[part.left] if part.left is not None else 0.0
-        convert = from_velocities if isinstance(part, VelocityColumns) else from_motions
-        return convert(time, columns[part.forward], left, columns[part.turn]), errors
+        if isinstance(part, columns.PoseColumns):
+            poses, errors = read_poses(base, part, units, time, limits, "table.pose")
+            return from_poses(time, poses), poses, errors
+        rate, per = ("/time", "/s") if isinstance(part, columns.VelocityColumns) else ("", "")
+        length, angle = (unit and unit + per for unit in (units.length, units.angle))
+        forward = base.column(part.forward, f"length{rate}", length)
+        left = base.column(part.left, f"length{rate}", length) if part.left is not None else 0.0
+        turn = base.column(part.turn, f"angle{rate}", angle)
+        spans = np.diff(kept, prepend=kept[:1] - 1)
+        if not rate and (spans > 1).any():  # a row stands for those left out before it, as a velocity does
+            forward, left, turn = forward * spans, left * spans, turn * spans
+        return (from_velocities if rate else from_motions)(time, forward, left, turn), None, []
+
+
+def leave_out(bad: np.ndarray, errors: list[InputError], what: str, warn: Warn) -> bool:
+    """Whether the bad ones of the rows [N] bool can be left out, with a warning; else `errors` hold."""
+    count = int(bad.sum())
+    if count and (count > max(1, LEAVE_OUT * len(bad)) or count == len(bad)):
+        return False
+    if count and warn is not None:
+        said = f"{errors[0].found}; expected {errors[0].expected}"
+        warn(f"{errors[0].where}: {said}; {count} of {len(bad)} {what} left out")
+    return True
+
+
+def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
+    """Rows per second if rows share times because those are rounded, else None.
+
+    Args:
+        time: [N] s. rows: [N, C] what the rows hold; rows that only repeat the one before are no sign.
+    """
+    steps = np.diff(time)
+    change, same = np.flatnonzero(steps > 0) + 1, steps == 0
+    if len(change) < 2 or (steps < 0).any() or same.mean() < SHARED:
+        return None
+    repeated = (np.nan_to_num(np.diff(rows, axis=0)[same]) == 0).all(axis=1)
+    if repeated.mean() > 0.5:
+        return None
+    return float((change[-1] - change[0]) / (time[change[-1]] - time[change[0]]))
+
+
+def align_views(
+    base: CsvFile,
+    files: Mapping[Path, CsvFile],
+    part: columns.ViewColumns,
+    time: np.ndarray,
+    shape: tuple[int, int, int],
+    warn: Warn = None,
+) -> AlignedRows:
+    """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
+    file = files[part.file or base.path]
+    there = np.flatnonzero(~(file.block(part.prefix)[1] == EMPTY).all(axis=1))
+    beams = [file.header.full[place] for place in file.numbered(part.prefix).values()]
+    what, pixels, width = f"{part.prefix}*", int(np.prod(shape)), len(beams)
+    if width % pixels or (part.max_range is None and width != pixels):
+        expected = f"{pixels} (table.rows {shape[0]} x table.columns {shape[1]})"
+        expected += "" if part.max_range is None else " or a multiple"
+        error = InputError(file.top, f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
+        return there, file.values, [error]
+    seen = file.rows(there)
+    names = beams if file is base else [part.time, *beams]
+    bad, errors = seen.judge(names, far=part.max_range is not None)
+    if not leave_out(bad, errors, "views are", warn):
+        return there, file.values, errors
+    there, seen = there[~bad], seen.rows(~bad)
+    values, errors = seen.block(part.prefix, part.unit)[0], []
+    if part.max_range is None:
+        errors += view_errors(values.min(axis=1), values.max(axis=1), what, seen.place)
+    else:
+        values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
+        typical = float(np.median(values)) if len(values) else 0.0
+        lowest, key = values.min(axis=1), "table.views.max_range"
+        errors += range_errors(lowest, typical, part.max_range, what, seen.place, str(file.path), key)
+        values = range_pixels(values, pixels, part.max_range)
+    rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
+    return rows, values.reshape(-1, *shape), errors + faults
+
+
+def align_contacts(
+    base: CsvFile,
+    files: Mapping[Path, CsvFile],
+    part: columns.ContactColumns,
+    time: np.ndarray,
+    warn: Warn = None,
+) -> AlignedRows:
+    """Contacts [M, W] bool, in the order of the sensors in the settings."""
+    file, names = files[part.file or base.path], tuple(part.directions)
+    unknown, errors = file.judge(names)
+    there = np.flatnonzero(~unknown)
+    values = np.column_stack([file.column(name)[there] for name in names])
+    if leave_out(unknown, errors, "contacts are", warn):
+        errors = []
+    bad = ~np.isin(values, (0, 1))
+    if bad.any():
+        row, sensor = np.argwhere(bad)[0].tolist()
+        found = f"{names[sensor]} is {values[row, sensor]:g}"
+        errors.append(InputError(file.place(there[row]), found, "1 in contact, 0 without"))
+    rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
+    return rows, values == 1, errors + faults
+
+
+def sensors_of(part: columns.ContactColumns) -> PlanarWhiskersInfo:
+    """The touch sensors as whiskers from the origin of base_link to what they touch."""
+    mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
+    return PlanarWhiskersInfo(mounts=mounts, length=part.distance)
+
+
+def align_labels(
+    base: CsvFile,
+    files: Mapping[Path, CsvFile],
+    labels: columns.LabelColumns | None,
+    pairs: columns.PairColumns | None,
+    time: np.ndarray,
+) -> AlignedRows:
+    """Place labels [M] int32, given or derived from pairs."""
+    if pairs is not None:
+        return _labels_of_file(base, files[pairs.file], pairs, time)
+    assert labels is not None
+    file = files[labels.file or base.path]
+    ids, fault = file.column(labels.column), file.fault[:, file.at(labels.column)]
+    there = np.flatnonzero((fault != EMPTY) & (ids != -1))
+    ids = ids[there]
+    rows, errors = _match_rows(file, base, there, labels.time, labels.tolerance, time)
+    bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
+    if bad.any():
+        row = int(bad.argmax())
+        found, expected = f"{labels.column} is {ids[row]}", "an integer from 0; -1 or an empty cell for none"
+        return rows, ids, [InputError(file.place(int(there[row])), found, expected), *errors]
+    return rows, ids.astype(np.int32), errors
+
+
+def _labels_of_file(base: CsvFile, file: CsvFile, part: columns.PairColumns, time: np.ndarray) -> AlignedRows:
+    later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
+    score = file.column(part.score)
+    errors = file.faults(part.later, part.earlier, part.score)
+    crossed = later <= earlier
+    if crossed.any():
+        row = int(crossed.argmax())
+        found = f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"
+        cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
+        errors.append(InputError(file.place(row), found, "the later time of a pair first", cure))
+    if errors:
+        return later, later, errors
+    moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
+    rows, errors = each_nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    return rows, ids, errors
+
+
+def labels_from_pairs(
+    later: Sequence[float], earlier: Sequence[float], score: Sequence[float], threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place labels from pairs of times that a place recogniser matched.
+
+    Every time is a view; its best earlier match passes on its label, without one the view is a new place.
+
+    Args:
+        later, earlier: s, the two times of each pair. score: similarity of each pair.
+        threshold: smallest score of a match. Of equal scores the first pair is used.
+
+    Returns:
+        time: [V] s, increasing. label: [V] int32, places numbered in order of appearance.
+    """
+    best: dict[float, tuple[float, float]] = {}
+    for time, match, value in zip(later, earlier, score, strict=True):
+        if value >= threshold and (time not in best or value > best[time][0]):
+            best[time] = value, match
+    moments = np.unique(np.concatenate([later, earlier]))
+    ids: dict[float, int] = {}
+    places = 0
+    for moment in moments.tolist():
+        if moment in best:
+            ids[moment] = ids[best[moment][1]]
+        else:
+            ids[moment], places = places, places + 1
+    return moments, np.fromiter(ids.values(), np.int32, len(ids))
+
+
+def align_truth(
+    file: CsvFile,
+    part: columns.TruthColumns,
+    time: np.ndarray,
+    limits: UnitLimits,
+    same_rows: bool,
+    warn: Warn = None,
+) -> tuple[np.ndarray, list[InputError]]:
+    """True poses [N, 3] at times [N] s, NaN outside the time span of the truth.
+
+    Args:
+        file: that of the truth. same_rows: its rows are those of `time`.
+    """
+    names, turn = position_columns(part)
+    bad, errors = file.judge(names if same_rows else [part.time, *names], turn)
+    if not leave_out(bad, errors, "true poses are", warn):
+        return np.full((len(time), 3), np.nan), errors
+    if same_rows:
+        truth, errors = read_poses(file, part, part.units, time, limits, "table.truth")
+        truth[bad] = np.nan
+        return truth, errors
+    file = file.rows(~bad)
+    moments = file.column(part.time, "time", part.units.time)
+    truth, errors = read_poses(file, part, part.units, moments, limits, "table.truth")
+    errors += clock_errors(moments, part.time, file.place)
+    if errors:
+        return np.full((len(time), 3), np.nan), errors
+    return interpolated_poses(time, moments, truth, part.time, str(file.path))
+
+
+def column_keys(part: Settings, key: str) -> list[tuple[str, str]]:
+    """The columns that a part of the table names, the time first, and their settings below `key`."""
+    fields = part.model_dump(exclude={"prefix", "unit"})
+    named = {field: name for field, name in fields.items() if isinstance(name, str)}
+    if time := named.pop("time", None):
+        named = {"time": time} | named
+    for field in ("quaternion", "directions"):
+        named |= {f"{field}.{place}": name for place, name in enumerate(fields.get(field) or ())}
+    if fields.get("quaternion"):
+        del named["heading"]  # which is not read
+    return [(name, f"{key}.{field}") for field, name in named.items()]
+
+
+def position_columns(part: columns.PoseColumns) -> tuple[list[str], list[str]]:
+    """The columns that poses are read from, and of those the ones of a quaternion apart."""
+    turn = part.quaternion or []
+    return [part.x, part.y, *([] if turn else [part.heading])], turn
+
+
+def read_poses(
+    file: CsvFile,
+    part: columns.PoseColumns,
+    units: columns.TableUnits,
+    time: np.ndarray,
+    limits: UnitLimits,
+    key: str,
+) -> tuple[np.ndarray, list[InputError]]:
+    """Poses [N, 3] (x m, y m, heading rad) of rows at times [N] s; `key`: their setting."""
+    x, y = (file.column(name, "length", units.length) for name in (part.x, part.y))
+    errors = []
+    if plane := other_plane(file, part.x, part.y):
+        still, z = plane
+        lies = f"the path lies in {'x-z' if still == 'y' else 'y-z'}"
+        said = f"{lies}: {getattr(part, still)} hardly changes, {z} does"
+        errors = [InputError(file.top, said, "columns of that plane", f"name {z} as {key}.{still}")]
+    if part.quaternion is not None:
+        return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
+    heading = file.column(part.heading, "angle", units.angle)
+    if faults := heading_errors(heading, time, part.heading, str(file.path), limits):
+        errors += faults
+        heading = np.deg2rad(heading)  # or every other check would report it again
+    return np.column_stack([x, y, heading]), errors
+
+
+def _headings(file: CsvFile, part: columns.PoseColumns, quaternion: Sequence[str]) -> np.ndarray:
+    """Headings [N], rad, of an axis of the body in the plane of x and y, as `PoseColumns.quaternion` says."""
+    values = np.column_stack([file.column(name) for name in quaternion])
+    with np.errstate(all="ignore"):  # faulty rows are left out, or reported
+        x, y, z, w = (values / np.linalg.norm(values, axis=1, keepdims=True)).T
+    along = ["xyz".find(split_unit(name)[0][-1:].lower()) for name in (part.x, part.y)]
+    ahead = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    if 2 in along:
+        ahead = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+    first, second = along if min(along) >= 0 and along[0] != along[1] else (0, 1)
+    return np.arctan2(ahead[second], ahead[first])
+
+
+def other_plane(file: CsvFile, x: str, y: str) -> tuple[str, str] | None:
+    """'x' or 'y' and the column z beside them, if a path hardly moves along that one but does along z."""
+    name = file.names[file.at(y)]
+    z = name[:-1] + {"y": "z", "Y": "Z"}.get(name[-1:], name[-1:])
+    if z == name or z not in file.names:
+        return None
+    values = file.values[:, [file.at(name) for name in (x, y, z)]]
+    values = values[np.isfinite(values).all(axis=1)]
+    span = np.ptp(values, axis=0) if len(values) else np.zeros(3)
+    if span[2] <= UPRIGHT * span[:2].min() or span[2] <= LEVEL * span[:2].max() or span[2] == 0:
+        return None
+    return ("x", "y")[int(span[:2].argmin())], z
+
+
+def _match_rows(
+    file: CsvFile, base: CsvFile, there: np.ndarray, name: str, tolerance: float | None, time: np.ndarray
+) -> tuple[np.ndarray, list[InputError]]:
+    """Odometry rows of the rows [M] of a file: the same, or the nearest in time."""
+    if file is base:
+        return there, []
+    file = file.rows(there)
+    moments = file.column(name, "time")
+    errors = file.faults(name) or _clock_errors(file, name, moments, "write them with more digits")
+    return (there, errors) if errors else each_nearest(moments, time, tolerance, file.place)
+
+
+def each_nearest(
+    moments: np.ndarray, time: np.ndarray, tolerance: float | None, place: RowName
+) -> tuple[np.ndarray, list[InputError]]:
+    """The odometry row nearest in time to each of the times [M], at most the tolerance away; each once.
+
+    Args:
+        moments: [M] s, increasing. time: [N] s, of the odometry rows. tolerance: s; None: the median step.
+        place: names a row of `moments` in errors.
+    """
+    found = nearest_rows(moments, time, tolerance)
+    if found is None:
+        return np.zeros(len(moments), int), []  # the error of the clock is already reported
+    rows, away, reach = found
+    errors = []
+    far = away > reach
+    if far.any():
+        i = int(far.argmax())
+        text = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
+        cure = "raise tolerance, or bring both to one clock"
+        errors.append(InputError(place(i), text, f"at most {reach:.4g} s", cure))
+    twice = np.flatnonzero(np.diff(rows) == 0)
+    if len(twice) and not errors:
+        i = int(twice[0]) + 1
+        text = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
+        errors.append(InputError(place(i), text, "one for each odometry row", "thin them out"))
+    return rows, errors

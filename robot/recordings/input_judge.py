@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from robot.recordings.csv_units import PER_UNIT
 from robot.recordings.sanity_checks import RowName, count_others
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.odometry_correction import (
@@ -58,9 +59,8 @@ RETURNS, RETURNING = 0.25, 0.1
 COARSE = 0.1
 """Share of the typical step above which the spacing of numbers spoils it."""
 
-TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "ks": 1e3}
-LENGTHS = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}
-ANGLES = {"deg": np.pi / 180}
+TIMES, LENGTHS, ANGLES = ("ms", "us", "ns", "min", "ks"), ("mm", "cm", "km"), ("deg",)
+"""Units that recordings are found in, besides s, m and rad."""
 UNIT_NAMES = {
     **{
         "ms": "milliseconds",
@@ -360,11 +360,10 @@ Cures = Callable[[str, str], str]
 
 def unit_cure(quantity: str, unit: str) -> str:
     """The setting that corrects an odometry in this unit, of any format; times have none."""
+    per = PER_UNIT[quantity][unit]
     if quantity == "time":
-        factor = TIMES[unit]
-        return f"divide the times by {1 / factor:g}" if factor < 1 else f"multiply the times by {factor:g}"
-    name, factors = ("length", LENGTHS) if quantity == "length" else ("turn", ANGLES)
-    return f"set recording.odometry.{name}_scale to {factors[unit]:.6g}"
+        return f"divide the times by {per:g}" if per > 1 else f"multiply the times by {1 / per:g}"
+    return f"set recording.odometry.{'length' if quantity == 'length' else 'turn'}_scale to {1 / per:.6g}"
 
 
 def unit_errors(
@@ -429,7 +428,8 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
     for time, length, angle in product(
         ("", *TIMES), ("", *(LENGTHS if robot.speed > 0 else ())), ("", *(ANGLES if robot.turn > 0 else ()))
     ):
-        seconds, metres, radians = TIMES.get(time, 1.0), LENGTHS.get(length, 1.0), ANGLES.get(angle, 1.0)
+        named = {"time": time, "length": length, "angle": angle}
+        seconds, metres, radians = (1 / PER_UNIT[key].get(unit, 1.0) for key, unit in named.items())
         rate = 1.0 if held else seconds  # velocities have their own unit of time
         turn = robot.turn * radians * (seconds if held else 1.0)
         changed = robot._replace(
@@ -442,7 +442,6 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
             continue
         values = np.array([changed.interval, changed.speed, changed.turn_rate])
         unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
-        named = {"time": time, "length": length, "angle": angle}
         units = {key: unit for key, unit in named.items() if unit}
         best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
     return best[1]

@@ -75,7 +75,7 @@ def describe_video(path: Path) -> VideoDescription:
 def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
     """Errors of a file of stamps: no such column, numbers that are not finite, times that do not increase."""
     errors = file.absences([(column, "video.time")])
-    return errors or file.faults(column) + clock_errors(file.column(column), column, file.place)
+    return errors or file.faults(column) + clock_errors(file.column(column, "time"), column, file.place)
 
 
 def video_frames(
@@ -124,7 +124,7 @@ def _opened(path: Path) -> Iterator[tuple[ModuleType, Any]]:
 def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: float) -> Iterator[float]:
     """The time of each frame, s; `announced` is the rate that the file states."""
     if stamps is not None:
-        return iter(stamps.column(config.time).tolist())
+        return iter(stamps.column(config.time, "time").tolist())
     if config.rate is None:
         hint = f", rate: {announced:g} if the file is right" if announced > 0 else ""
         cure = f"set recording.video.rate or stamps{hint}"

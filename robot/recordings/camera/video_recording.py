@@ -12,13 +12,13 @@ import numpy as np
 
 from robot.recordings.camera.rows import CameraRows, camera_rows
 from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
-from robot.recordings.csv_alignment import align_truth, each_nearest
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import CsvFile, read_csv
-from robot.recordings.csv_reader import ODOMETRY, read_csv_recording
+from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
 from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, raise_errors, require_file
+from robot.sources.registry import Warn
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         return _with_views(source, rows.time, rows.view, video, str(path))
     assert rows.motion is not None  # `_contradictions` requires visual odometry
     rows.motion[:1] = 0.0
-    truth = _truth(config.table, rows.time, config.limits)
+    truth = _truth(config.table, rows.time, config.limits, judge.warn)
     everywhere = np.ones(len(rows.time), bool)
     # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
     track = MotionTrack(rows.time, everywhere, rows.motion)
@@ -111,14 +111,12 @@ def _with_views(
     return replace(source, views=views, seen=seen)
 
 
-def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits) -> np.ndarray | None:
+def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits, warn: Warn) -> np.ndarray | None:
     if table.truth is None or table.truth.file is None:
         return None
-    file = read_csv(table.truth.file)
-    part = table.truth
-    named = {key: getattr(part, key) for key in ("time", "x", "y", "heading")}
-    raise_errors(file.absences([(column, f"table.truth.{key}") for key, column in named.items()]))
-    truth, errors = align_truth(file, part, time, limits, same_rows=False)
+    file = read_csv(table.truth.file, table.units.time)
+    raise_errors(file.absences(column_keys(table.truth, "table.truth")))
+    truth, errors = align_truth(file, table.truth, time, limits, same_rows=False, warn=warn)
     raise_errors(errors)
     return truth
 

@@ -62,8 +62,8 @@ def _read_csv_path(file: Path) -> tuple[RatPath, RowName]:
     table = read_csv(file)
     raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
     raise_errors(table.faults("t", "x", "y"))
-    position = np.column_stack([table.column("x"), table.column("y")])
-    return RatPath(table.column("t"), position), table.place
+    position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
+    return RatPath(table.column("t", "time"), position), table.place
 
 
 def _read_npz_path(file: Path) -> tuple[RatPath, RowName]:

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.recordings.csv_alignment import labels_from_pairs
 from robot.recordings.csv_config import (
     ContactColumns,
     CsvConfig,
@@ -19,14 +18,18 @@ from robot.recordings.csv_config import (
     MotionColumns,
     PairColumns,
     PoseColumns,
+    TableUnits,
     TruthColumns,
     VelocityColumns,
     ViewColumns,
 )
+from robot.recordings.csv_description import describe_csv
 from robot.recordings.csv_file import read_csv
-from robot.recordings.csv_reader import read_csv_recording
+from robot.recordings.csv_reader import labels_from_pairs, read_csv_recording
+from robot.recordings.input_judge import InputJudge
 from robot.recordings.npz_trace import read_trace
 from robot.sources.in_memory import truncate_log
+from robot.sources.odometry import from_poses
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import integrate
@@ -210,22 +213,49 @@ def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) ->
 
 RANGES = ViewColumns(max_range=8)
 LEFT = ContactColumns(directions={"left": 45.0})
+POSE = {"velocity": None, "pose": PoseColumns()}
+TURNED = {"velocity": None, "pose": PoseColumns(quaternion=["a", "b", "c", "d"])}
 FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "column": ("t,vxs,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vxs', 'w'", "mean 'vxs'?"]),
     "key": ("stamp,vx,w\n0,1,0\n", {}, [":1: no column 't'", "name the column with table.time"]),
-    "word": ("t,vx,w\n0,1,0\n1,fast,0\n", {}, [":3: vx is 'fast'", "expected a number"]),
-    "empty": ("t,vx,w\n0,1,0\n\n1,,0\n", {}, [":4: vx is empty", "a number"]),
-    "nan": ("t,vx,w\n0,1,0\n1,nan,0\n", {}, [":3: vx is nan", "a finite number"]),
-    "inf": ("t,vx,w\n0,1,0\n1,1,-inf\n", {}, [":3: w is -inf"]),
-    "time": ("t,vx,w\n0,1,0\nnan,1,0\n", {}, [":3: t is nan"]),
-    "cut row": ("t,vx,w\n0,1,0\n1,1", {}, [":3: 2 cells", "3, as in the header", "cut off"]),
+    "word": ("t,vx,w\n0,1,0\n1,fast,0\n2,f\x1b[1m,0\n", {},
+             [":3: vx is 'fast' (and so in 1 more row)", "expected a number"]),
+    "control character": ("t,vx,w\n0,1,0\n1,f\x1b[1m,0\n2,,0\n", {},
+                          [r":3: vx is 'f\x1b[1m'", ":4: vx is empty"]),
+    "empty": ("t,vx,w\n0,1,0\n\n1,,0\n2,,0\n", {}, [":4: vx is empty", "a number"]),
+    "nan": ("t,vx,w\n0,1,0\n1,nan,0\n2,nan,0\n", {}, [":3: vx is nan", "a finite number"]),
+    "inf": ("t,vx,w\n0,1,0\n1,1,-inf\n2,1,-inf\n", {}, [":3: w is -inf"]),
+    "time": ("t,vx,w\n0,1,0\nnan,1,0\nx,1,0\n", {}, [":3: t is nan", ":4: t is 'x'"]),
+    "cut row": ("t,vx,w\n0,1,0\n1,1\n# off\n2", {},
+                [":3: 2 cells (and so in 1 more row)", "3, as in the header", "cut off"]),
+    "unquoted": ("t,vx,w,f\n0,1,0,a,b\n1,1,0,a,b\n", {},
+                 [":2: 5 cells", "4, as in the header", "quote text that holds ','"]),
+    "no date": ("t,vx,w\n2024-13-01 10:00:00,1,0\n", {}, ["t is '2024-13-01 10:00:00'"]),
+    "decimal commas": ("t;vx;w\n0,5;1;0\n1,5;1;0\n", {}, [":2: t is '0,5'", "decimal points"]),
+    "name": ("t,vx,w\x1b[2J\n0,1,0\n", {}, [r":1: the header names a column 'w\x1b[2J'", "without control"]),
+    "long name": (f"t,vx,w,{'x' * 201}\n0,1,0,1\n", {}, ["201 characters", "at most 200 a name"]),
+    "wide": (f"t,vx,w{',r' * 20000}\n0,1,0\n", {}, [":1: 20003 columns", "at most 4096"]),
+    "long line": (f"t,vx,w,s\n0,1,0,{'x' * (1 << 20)}\n", {},
+                  [":2: 1048582 characters in a line", "at most"]),
+    "large views": (ODOMETRY + "2,1,0\n", {"rows": 4096, "columns": 4096},
+                    ["5 rows of 4096 x 4096 pixels", "table.rows"]),
+    "unit": ("t,vx [furlong/s],w\n0,1,0\n", {},
+             ["'vx [furlong/s]' states the unit 'furlong/s'", "units.length"]),
+    "unit of another": ("t [mm],vx,w\n0,1,0\n", {},
+                        ["states the unit 'mm'", "a unit of time (s, ms,", "units.time"]),
+    "rounded": ("t,vx,w\n" + "".join(f"{k // 4},1,{k}\n" for k in range(16)), {},
+                [":3: t is rounded: 4 rows share each time", "set recording.table.rate=4,"]),
+    "hole": ("t,vx,w\n" + "".join(f"{k},1,{'x' if 9 < k < 15 else 0}\n" for k in range(200)), {},
+             [":12: 5 rows one after another lack odometry (w is 'x'"]),
+    "quaternion": ("t,x,y,a,b,c,d\n0,0,0,0,0,0,1\n1,0,0,0,0,0,0\n2,0,0,1,1,0,1\n", TURNED,
+                   [":3: (a, b, c, d) is [0.0, 0.0, 0.0, 0.0] (and so in 1 more row)", "of length 1"]),
+    "plane": ("t,x,y,z,heading\n0,0,0,0,0\n1,1,0,1,0\n2,2,.01,3,0\n", POSE,
+              ["the path lies in x-z: y hardly changes, z does", "name z as table.pose.y"]),
     "backwards": ("t,vx,w\n0,1,0\n2,1,0\n1,1,0\n", {}, [":4: t goes back from 2.0 to 1.0 s", "sort"]),
     "repeated": ("t,vx,w\n0,1,0\n2,1,0\n2,1,0\n", {}, [":4: t repeats 2.0 s", "drop the repeated rows"]),
     "no rows": ("t,vx,w\n", {}, ["no rows under its header", "at least one row"]),
     "no header": ("0,1,2\n1,1,2\n", {}, [":1: the first line is '0,1,2'", "a header row"]),
     "doubled": ("t,vx,vx,w\n0,1,1,0\n", {}, [":1: several columns are called 'vx'", "once"]),
-    "semicolons": ("t;vx;w\n0;1;0\n", {}, ["separated by semicolons", "commas"]),
-    "tabs": ("t\tvx\tw\n0\t1\t0\n", {}, ["separated by tabs"]),
     "neither": (ODOMETRY, {"velocity": None}, ["none of table.pose, table.velocity", "among t, vx, w"]),
     "both": (ODOMETRY, {"pose": PoseColumns()}, ["more than one of table.pose", "one of them"]),
     "no views": (ODOMETRY, {"views": ViewColumns()}, ["no column 'r0'", "table.views.prefix"]),
@@ -233,7 +263,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "pixels": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns()}, ["2 columns r0", "3 (table.rows 1 x"]),
     "beams": ("t,vx,w,r0,r1\n0,1,0,1,1\n", {"views": ViewColumns(max_range=8)}, ["or a multiple"]),
     "bytes": ("t,vx,w,r0,r1,r2\n0,1,0,0,9,200\n", {"views": ViewColumns()}, [":2: r* holds 200.0", "by 255"]),
-    "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r* is nan"]),
+    "half view": ("t,vx,w,r0,r1,r2\n0,1,0,0,,1\n", {"views": ViewColumns()}, [":2: r1 is empty"]),
     "behind": ("t,vx,w,r0,r1,r2\n0,1,0,0,-1,1\n", {"views": RANGES}, [":2: r* is -1.0", "0 m or more"]),
     "mm": ("t,vx,w,r0,r1,r2\n0,1,0,900,800,700\n", {"views": RANGES}, ["over 800 m", "by 1000"]),
     "bumper": ("t,vx,w,left\n0,1,0,2\n", {"contacts": LEFT}, [":2: left is 2", "1 in contact, 0 without"]),
@@ -274,8 +304,8 @@ OTHERS: dict[str, tuple[str, Callable[[Path], dict[str, Any]], list[str]]] = {
                     [":3: t repeats 0.0 s"]),
     "truth elsewhen": ("t,x,y,heading\n50,0,0,0\n60,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
                        ["t is 50.0 to 60.0 s, the odometry's 0.0 to 1.5", "times that overlap", "one clock"]),
-    "truth time": ("t,x,y,heading\n0,0,0,0\n,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
-                   [":3: t is empty"]),
+    "truth time": ("t,x,y,heading\n0,0,0,0\n,1,0,0\n,1,0,0\n", lambda p: {"truth": TruthColumns(file=p)},
+                   [":3: t is empty (and so in 1 more row)"]),
 }  # fmt: skip
 
 
@@ -292,15 +322,15 @@ def test_faulty_values_in_other_files_are_refused(
 
 
 def test_all_errors_are_reported_together(write: Write, refused: Callable[..., InputError]) -> None:
-    path = write("t,vx,w,r0,r1,r2\n0,1,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
+    path = write("t,vx,w,r0,r1,r2\n0,nan,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
     error = refused(
         lambda: read_csv_recording(path, with_parts(views=ViewColumns())), "vx is nan", "repeats", "300.0"
     )
     assert isinstance(error, InputErrors)
     assert len(error.errors) == 3
-    path = write("t,vx,w\n" + "0,x,1\n" * 20)
-    error = refused(lambda: read_csv_recording(path, VELOCITY), ":9:", "12 more faults like these")
-    assert str(error).count("\n") == 8
+    path = write("t,vx,w\n" + "".join(f"{k},x,1\n" for k in range(20)))
+    error = refused(lambda: read_csv_recording(path, VELOCITY), ":2: vx is 'x' (and so in 19 more rows)")
+    assert "\n" not in str(error)
 
 
 @given(st.text(max_size=200) | st.binary(max_size=200))
@@ -315,6 +345,125 @@ def test_any_text_is_read_or_gives_one_error(tmp_path_factory: Any, text: str | 
         except InputError as error:
             message = str(error)
         assert str(path) in message
+
+
+LEFT_OUT: dict[str, tuple[str, dict[str, Any], list[float], list[str]]] = {
+
+    "pose": ("t,x,y,heading\n0,0,0,0\n1,nan,0,0\n2,2,0,0\n3,3,0,0\n", POSE,
+             [0, 2, 1], [":3: x is nan; expected a finite number; 1 of 4 rows are left out"]),
+    "velocity": ("t,vx,w\n0,1,0\n1,fast,0\n2,1,0\n", {}, [0, 2], [":3: vx is 'fast'"]),
+    "motion": ("t,distance,turn\n0,1,0\n1,1,0\n2,,0\n3,1,0\n", {"velocity": None, "motion": MotionColumns()},
+               [0, 1, 2], [":4: distance is empty"]),
+    "cut off": ("t,vx,w\n0,1,0\n1,1,0\n2,1", {}, [0, 1], [":4: 2 cells; expected 3, as in the header"]),
+    "power loss": ("t,vx,w\n0,1,0\n1,1,0\n\0\0\0\0", {}, [0, 1], [":4: 1 cells"]),
+    "quaternion": ("t,x,y,a,b,c,d\n0,0,0,0,0,0,1\n1,0,0,0,0,0,0\n2,3,0,0,0,0,1\n", TURNED, [0, 3],
+                   [":3: (a, b, c, d)"]),
+    "view": ("t,vx,w,r0,r1,r2\n0,1,0,1,nan,1\n1,1,0,1,inf,1\n", {"views": RANGES},
+             [0, 1], [":2: r1 is nan; expected a finite number; 1 of 2 views are left out"]),
+    "truth": ("t,vx,w,x,y,heading\n0,1,0,1,,1\n1,1,0,1,1,1\n", {"truth": TruthColumns()},
+              [0, 1], [":2: y is empty; expected a number; 1 of 2 true poses are left out"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "parts", "moved", "pieces"), LEFT_OUT.values(), ids=LEFT_OUT.keys())
+def test_one_bad_row_is_left_out_with_a_warning(
+    content: str, parts: dict[str, Any], moved: list[float], pieces: list[str], write: Write
+) -> None:
+    said: list[str] = []
+    path = write(content)
+    source = read_csv_recording(path, with_parts(**parts), InputJudge(warn=said.append))
+    assert source.motion[:, 0].tolist() == moved
+    assert all(piece in said[0] for piece in [str(path), *pieces])
+    assert len(said) == 1
+    if "views" in parts:
+        assert source.seen.tolist() == [False, True]
+
+
+TIME = np.arange(24) / 8
+POSES = np.column_stack([np.sin(TIME), TIME * TIME, TIME - 1.0])  # as a body that turns while it drives
+TURNS = np.column_stack([0 * TIME, 0 * TIME, np.sin(POSES[:, 2] / 2), np.cos(POSES[:, 2] / 2)])
+AHEAD = np.pi / 4 - POSES[:, 2] / 2  # half the turn about the y axis that takes the z axis there
+CAMERA = np.column_stack([0 * TIME, np.sin(AHEAD), 0 * TIME, np.cos(AHEAD)])
+DAYS = np.array([f"2024-05-01T10:00:{t:06.3f}" for t in TIME.tolist()])
+X, Y, H = POSES.T
+NAME, HEIGHT = np.full(24, "odom"), 1 + 0.01 * np.sin(TIME)
+RADS = np.degrees(H)
+AS_USERS_HAVE_THEM: dict[str, tuple[str, list[Any]]] = {
+    "text": ("t,frame_id,x,y,heading,note", [TIME, NAME, X, Y, H, np.full(24, "")]),
+    "quoted text": ("t,x,y,heading,note", [TIME, X, Y, H, np.full(24, '"a, b"')]),
+    "comments": ("# robot 7, Monday\n\n# of 3, 4, 5, 6\nt,x,y,heading", [TIME, X, Y, H]),
+    "comment as header": ("# robot, 7, of, Monday\n#t, x, y, heading", [TIME, X, Y, H]),
+    "units": ("t [s], x [m], y [m], heading [rad]", [TIME, X, Y, H]),
+    "other units": ("t (ms),x [mm],y [mm],heading [°]", [TIME * 1e3, X * 1e3, Y * 1e3, RADS]),
+    "units in names": ("time_ns,x_cm,y_cm,yaw_deg", [TIME * 1e9, X * 100, Y * 100, RADS]),
+    "units below": ("t,x,y,heading\n[us],[km],[km],[deg]", [TIME * 1e6, X / 1e3, Y / 1e3, RADS]),
+    "dates": ("time,x,y,heading", [np.char.add(DAYS, "Z"), X, Y, H]),
+    "dates with zones": ("stamp,x,y,heading",
+                         [np.char.add(np.char.replace(DAYS, "T", " "), "+02:00"), X, Y, H]),
+    "TUM": ("# timestamp tx ty tz qx qy qz qw", [TIME, X, Y, HEIGHT, *TURNS.T]),
+
+    "EuRoC": ("#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z",
+              [(1.4e9 + TIME) * 1e9, X, Y, HEIGHT, TURNS[:, 3], *TURNS.T[:3]]),
+    "rostopic": ("%time,field.header.frame_id,field.pose.pose.position.x,field.pose.pose.position.y,"
+                 + ",".join(f"field.pose.pose.orientation.{axis}" for axis in "xyzw")
+                 + "".join(f",field.pose.covariance{k}" for k in range(36)),
+                 [(1.4e9 + TIME) * 1e9, NAME, X, Y, *TURNS.T, *np.zeros((36, 24))]),
+    "camera": ("t,x,y,z,qx,qy,qz,qw", [TIME, X, 0.01 * HEIGHT, Y, *CAMERA.T]),
+    "rounded": ("t,x,y,heading", [np.floor(TIME), X, Y, H]),
+    "semicolons": ("t;x;y;heading", [TIME, X, Y, H]),
+    "tabs": ("t\tx\ty\theading", [TIME, X, Y, H]),
+    "commas at the end": ("t,x,y,heading,,", [TIME, X, Y, H, np.full(24, ""), np.full(24, "")]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize(("header", "columns"), AS_USERS_HAVE_THEM.values(), ids=AS_USERS_HAVE_THEM.keys())
+def test_a_file_as_users_have_it_is_read_as_the_doctor_describes_it(
+    header: str, columns: list[Any], encoding: str, tmp_path: Path
+) -> None:
+    mark = next((mark for mark in ";\t" if mark in header), "," if "," in header else " ")
+    rows = [mark.join(map(str, row)) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    rows[9:9] = ["# pause, of 3 s"]
+    path = tmp_path / "log.csv"
+    path.write_text("\r\n".join([header, *rows]), encoding=encoding, newline="")
+    source = read_csv_recording(path, CsvConfig.model_validate(describe_csv(path).table))
+    np.testing.assert_allclose(source.motion, from_poses(TIME, POSES), atol=3e-7)
+
+
+def test_settings_name_units_and_the_header_those_of_other_files(write: Write) -> None:
+    """The unit in the settings goes before that of the header, for the odometry; speeds stay per second."""
+    path = write("t [s],vx,w,r0,r1,r2\n0,200,0,,,\n500,200,5.729577951308232,,,\n")
+    views = write("stamp,r0 [mm],r1 [mm],r2 [mm]\n500,4000,8000,9000\n", "views.csv")
+    truth = write("t [s],x,y,heading\n0,0,0,0\n0.5,10,0,90\n", "truth.csv")
+    units = TableUnits(length="cm", angle="deg")
+    config = with_parts(
+        units=TableUnits(time="ms", length="mm", angle="deg"),
+        views=ViewColumns(file=views, time="stamp", max_range=8),
+        truth=TruthColumns(file=truth, units=units),
+    )
+    source = read_csv_recording(path, config)
+    assert source.motion[1] == pytest.approx([0.1 * np.cos(0.025), 0.1 * np.sin(0.025), 0.05, 0.5])
+    assert source.views[1].ravel().tolist() == [0.5, 1.0, 1.0]
+    assert source.truth is not None
+    assert source.truth[1] == pytest.approx([0.1, 0, np.pi / 2])
+
+
+def test_views_of_rows_that_are_left_out_are_lost_with_them(write: Write) -> None:
+    odometry = write(
+        "t,vx,w,label\n0,1,0,0\n1,x,0,1\n2,1,0,2\n" + "".join(f"{k},1,0,3\n" for k in range(3, 41)) + "41"
+    )
+    views = write("t,r0,r1,r2\n" + "".join(f"{k},0,0,{k % 2}\n" for k in range(42)), "views.csv")
+    config = with_parts(views=ViewColumns(file=views), labels=LabelColumns())
+    source = read_csv_recording(odometry, config)
+    assert source.time.tolist() == [0, *range(2, 41)]
+    assert source.seen.all()
+    np.testing.assert_array_equal(source.views[:, 0, 2, 0], source.time % 2)
+    assert source.label.tolist()[:3] == [0, 2, 3]
+
+
+def test_rows_are_counted_where_a_rate_is_given(write: Write) -> None:
+    path = write("t,vx,w\n7,1,0\n7,x,0\n7,1,0\n8,1,0\n")
+    assert read_csv_recording(path, with_parts(rate=4.0)).time.tolist() == [7, 7.5, 7.75]
 
 
 def test_line_numbers_count_empty_lines(write: Write) -> None:

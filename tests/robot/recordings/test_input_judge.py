@@ -12,7 +12,6 @@ import pytest
 from robot.recordings.csv_config import CsvConfig, PoseColumns, TruthColumns, VelocityColumns
 from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.formats import RecordingConfig, open_recording
-from robot.recordings.npz_trace import read_trace
 from robot.recordings.input_judge import (
     DEFAULT_LIMITS,
     RATIO,
@@ -24,6 +23,7 @@ from robot.recordings.input_judge import (
     typical_motion,
     unit_errors,
 )
+from robot.recordings.npz_trace import read_trace
 from robot.recordings.stretch import Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses, from_velocities
@@ -297,9 +297,13 @@ def test_two_wild_rows_are_a_jump_and_no_unit(trace: Path, tmp_path: Path, refus
         changed[name] = changed[name].copy()
         changed[name][[40, 41]] = value, -value
     np.savez(tmp_path / "wild.npz", **changed)
-    refused(lambda: read_trace(tmp_path / "wild.npz"), "row 40: the odometry jumps by 5e+05 m", "largest_step")
+    refused(
+        lambda: read_trace(tmp_path / "wild.npz"), "row 40: the odometry jumps by 5e+05 m", "largest_step"
+    )
     for stretch in (Stretch(25.0), Stretch(None, 15.0)):
-        assert 0 < read_trace(tmp_path / "wild.npz", InputJudge(stretch=stretch)).length < len(changed["in_t"])
+        assert (
+            0 < read_trace(tmp_path / "wild.npz", InputJudge(stretch=stretch)).length < len(changed["in_t"])
+        )
 
 
 def test_a_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path]) -> None:

@@ -167,7 +167,9 @@ def test_several_publishers_are_named_and_chosen(tmp_path: Path, refused: Refuse
         both = [*wheels("odom", "base_link", 0), *wheels(*other, STEP // 2)]
         path = written(tmp_path / "-".join(other), "ros1", sorted(both, key=lambda entry: entry.time))
         pieces = ("/odom, message 1", "odom to base_link (12)", f"{' to '.join(other)} (12)")
-        refused(lambda path=path: opened(path, views=None), *pieces, "odometry.frames to ['odom', 'base_link']")
+        refused(
+            lambda path=path: opened(path, views=None), *pieces, "odometry.frames to ['odom', 'base_link']"
+        )
         one = opened(path, views=None, odometry={"topic": "/odom", "frames": ["odom", "base_link"]})
         assert one.length == 12
 
@@ -178,7 +180,8 @@ def test_numbers_that_cannot_be_are_refused(tmp_path: Path, refused: Refused) ->
     refused(lambda: opened(path, views=None), "/odom, message 3", "the position is nan", "2 of 12 messages")
     path = written(tmp_path, "sqlite3-message", [*WHEELS[:3], bad[0], *WHEELS[4:]])
     assert opened(path, told, views=None).length == 11
-    assert "message 3" in told[0] and "1 of 12 messages are left out" in told[0]
+    assert "message 3" in told[0]
+    assert "1 of 12 messages are left out" in told[0]
     zero = pose(0.0, 0.0, 0.0) | {"orientation": {}}
     poses = [
         Entry("/pose", "geometry_msgs/msg/PoseStamped", TIMES[0], {"header": header(START), "pose": zero})

@@ -1,0 +1,71 @@
+"""Units in the header of a CSV file: `t [ms]`, `x (mm)`, `heading_deg`, `vx [mm/s]`."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min", "h"]
+LengthUnit = Literal["m", "mm", "cm", "km", "in", "ft"]
+AngleUnit = Literal["rad", "deg", "mrad", "rev"]
+
+PER_UNIT: dict[str, dict[str, float]] = {
+    "time": {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "ks": 1e-3, "min": 1 / 60, "h": 1 / 3600},
+    "length": {"m": 1, "mm": 1e3, "cm": 1e2, "km": 1e-3, "in": 1 / 0.0254, "ft": 1 / 0.3048},
+    "angle": {"rad": 1, "deg": 57.29577951308232, "mrad": 1e3, "rev": 0.15915494309189535},
+}
+"""For each quantity, how many of a unit are one s, m or rad."""
+WORDS = {
+    "s": "sec secs second seconds", "ms": "msec msecs millis millisecond milliseconds", "min": "mins minutes",
+    "us": "usec usecs micros microseconds", "ns": "nsec nsecs nanos nanosec nanosecs nanoseconds",
+    "m": "meter meters metre metres", "mm": "millimeter millimeters millimetre millimetres", "ft": "feet",
+    "cm": "centimeter centimeters centimetre centimetres", "in": "inch inches", "deg": "degs degree degrees",
+    "rad": "rads radian radians", "h": "hr hour hours", "m/s": "mps", "deg/s": "dps", "km/h": "kmh kph",
+    "rev/min": "rpm", "": "- 1",
+}  # fmt: skip
+ALIASES = {word: unit for unit, words in WORDS.items() for word in words.split()}
+BRACKETS = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+VAGUE = ("in", "ft", "h", "min", "", "rev")
+"""Units that are no unit at the end of a name: `laser_min`."""
+
+
+def plain_unit(text: str) -> str:
+    """A unit in one spelling: `deg/s` for `°/sec`, `m/s` for `m s^-1`; unknown ones remain."""
+    text = text.strip().lower().replace("µ", "u").replace("μ", "u").replace("°", "deg")
+    text = re.sub(r"[\s*·.]+([a-z]+)\^?-1$|[\s_]*(?:/|_per_| per |_)\s*([a-z]+)$", r"/\1\2", text)
+    text = "/".join(ALIASES.get(word.strip(), word.strip()) for word in text.split("/"))
+    return ALIASES.get(text, text)
+
+
+def per_unit(unit: str, quantity: str) -> float | None:
+    """How many of a unit are one in s, m and rad, for a quantity such as `length` or `angle/time`; None if it
+    is no unit of it."""
+    units, quantities = unit.split("/"), quantity.split("/")
+    if len(units) != len(quantities):
+        return None
+    factors = [PER_UNIT[name].get(part) for name, part in zip(quantities, units, strict=True)]
+    if any(factor is None for factor in factors):
+        return None
+    over, *under = (float(factor or 0) for factor in factors)
+    return over / under[0] if under else over
+
+
+def is_unit(unit: str) -> bool:
+    """Whether it is a unit of anything."""
+    return any(per_unit(unit, name + rate) is not None for name in PER_UNIT for rate in ("", "/time"))
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """The name of a column without its unit, and the unit, '' without one; `[...]` always holds a unit unless
+    it is a number: `ranges[0]` is `ranges0`."""
+    if found := BRACKETS.fullmatch(name):
+        before, square, text = found[1], found[2] is not None, found[2] if found[2] is not None else found[3]
+        if square and text.isdecimal():
+            return before + text, ""
+        if square or is_unit(plain_unit(text)):
+            return split_unit(before)[0] if before.endswith("]") else before, plain_unit(text)
+    words = name.split("_")
+    for count in (3, 2, 1):
+        if len(words) > count and is_unit(unit := plain_unit("_".join(words[-count:]))) and unit not in VAGUE:
+            return "_".join(words[:-count]), unit
+    return name, ""
