@@ -11,10 +11,18 @@ import numpy as np
 from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.images import COMPRESSED, IMAGES, RAW, grey_image
 from robot.recordings.bags.motions import POSES, TWISTS, twist_in_plane
-from robot.recordings.bags.scans import CLOUD, SCAN, cloud_points, is_ring, scan_limits
+from robot.recordings.bags.scans import (
+    CLOUD,
+    SCAN,
+    Extent,
+    cloud_points,
+    extent_of,
+    scan_limits,
+    wider_extent,
+)
 from robot.recordings.bags.stamps import nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
-from robot.recordings.bags.transforms import MOVING, STATIC, read_links
+from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links, turn_between
 from robot.recordings.unit_check import MotionTrack, typical_motion
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
@@ -53,6 +61,7 @@ class ScanShape(NamedTuple):
         beams: of the first message. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
         low, high: limits of the range, m. median: of the ranges within these, m, NaN if there are none.
         nothing, unmeasured: shares of beams without an object in range, and without a measurement.
+        wider: directions of all messages together, if the first has fewer.
     """
 
     beams: int
@@ -63,6 +72,7 @@ class ScanShape(NamedTuple):
     median: float
     nothing: float
     unmeasured: float
+    wider: Extent | None = None
 
 
 class CloudShape(NamedTuple):
@@ -156,11 +166,16 @@ class FrameLink(NamedTuple):
 
 
 class BagDescription(NamedTuple):
-    """A bag. Attributes: topics: by name, with messages. links: frames of /tf and /tf_static."""
+    """A bag.
+
+    Attributes:
+        topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is left out.
+    """
 
     path: Path
     topics: tuple[TopicDescription, ...]
     links: tuple[FrameLink, ...]
+    notes: tuple[str, ...] = ()
 
 
 @np.errstate(all="ignore")  # numbers may be any
@@ -170,7 +185,8 @@ def describe_bag(path: Path) -> BagDescription:
     Raises:
         InputError: the bag is missing, damaged or empty.
     """
-    with Bag(path) as bag:
+    told = list[str]()
+    with Bag(path, told.append) as bag:
         topics = tuple(_describe_topic(bag, topic) for topic in bag.topics.values() if topic.total)
         links = []
         for name in (MOVING, STATIC):
@@ -179,7 +195,7 @@ def describe_bag(path: Path) -> BagDescription:
             except InputError:
                 continue  # the fault of the topic says why
             links += [FrameLink(*pair, name == STATIC, len(link.stamps)) for pair, link in found.items()]
-    return BagDescription(path, topics, tuple(links))
+    return BagDescription(path, topics, tuple(links), tuple(told))
 
 
 def roles_of(kind: str) -> tuple[Role, ...]:
@@ -201,15 +217,20 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
         if not roles:
             received = list(bag.receipts(topic))
         else:
-            for time, content in bag.messages(topic):
+
+            def read(content: Any, place: str) -> None:
+                if summary is not None and (summary.every or not contents):
+                    contents.append(summary.extract(content, topic.kind, place))
+
+            for _, time, content, _ in bag.usable(topic, read):
                 received.append(time)
                 if hasattr(content, "header"):
                     stamps.append(nanoseconds(content.header.stamp))
                     frames = frames if any(frames) else _frames_of(content)
-                if summary is not None and (summary.every or not contents):
-                    contents.append(summary.extract(content, topic.kind, f"{bag.path}, {topic.name}"))
             if summary is not None:
                 shape = summary.shape(contents, stamps or received)
+            if isinstance(shape, ScanShape):
+                shape = shape._replace(wider=_wider(bag, contents))
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
@@ -258,16 +279,30 @@ def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
     nothing |= np.isposinf(ranges)
     within = ranges[~nothing & ~unmeasured]
     median = float(np.median(within)) if len(within) else np.nan
-    fov = len(ranges) * float(content.angle_increment)
-    return len(ranges), fov, is_ring(content), low, high, median, nothing.mean(), unmeasured.mean()
+    own, shares = extent_of(content, where), (nothing.mean(), unmeasured.mean())
+    if not len(ranges):
+        raise InputError(where, "a scan without beams", "at least one")
+    return len(ranges), own.width, own.ring, low, high, median, shares, content.header.frame_id, own
 
 
 def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     medians = np.array([value[5] for value in values])
     median = float(np.nanmedian(medians)) if np.isfinite(medians).any() else np.nan
-    shares = np.mean([value[6:] for value in values], axis=0)
+    shares = np.mean([value[6] for value in values], axis=0)
     beams, fov, ring, low, high = values[0][:5]
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
+
+
+def _wider(bag: Bag, values: list[Any]) -> Extent | None:
+    """What the scans of a topic cover together, in the frame of the first; None if it is as the first."""
+    frames = {value[7] for value in values}
+    mounts = {frame: mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1}
+    first = values[0][7]
+    extents = [
+        own if frame == first else own.turned(turn_between(mounts[frame], mounts[first]))
+        for frame, own in (value[7:] for value in values)
+    ]
+    return wider_extent(extents[0], extents)
 
 
 def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:

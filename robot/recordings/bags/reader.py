@@ -50,7 +50,7 @@ def read_bag(
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
     report = warn or (lambda sentence: None)
-    with Bag(path) as bag:
+    with Bag(path, report) as bag:
         config = with_preset(bag, config)
         _check_roles(bag, config, visual_odometry)
         images = image or ImageViewConfig()

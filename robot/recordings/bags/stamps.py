@@ -37,6 +37,13 @@ def read_messages(bag: Bag, topic: Topic, clock: Clock) -> Iterator[Message]:
         yield Message(number, nanoseconds(content.header.stamp) if stamped else received, content)
 
 
+def read_usable(bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]) -> Iterator[Message]:
+    """The messages of a topic that can be used, with what `read` makes of them (see `Bag.usable`)."""
+    for number, received, content, value in bag.usable(topic, read):
+        stamped = clock == "header" and hasattr(content, "header")
+        yield Message(number, nanoseconds(content.header.stamp) if stamped else received, value)
+
+
 def nanoseconds(stamp: Any) -> int:
     """A time message in ns."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
