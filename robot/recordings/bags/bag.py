@@ -308,6 +308,7 @@ def bag_files(path: Path) -> list[Path]:
     Raises:
         InputError: there is no such bag.
     """
+    path = path.parent if path.name == METADATA else path
     if not path.is_dir():
         require_file(path)
         if path.suffix not in SUFFIXES:

@@ -58,7 +58,7 @@ class ScanShape(NamedTuple):
     """LaserScan.
 
     Attributes:
-        beams: of the first message. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
+        beams: median number. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
         low, high: limits of the range, m. median: of the ranges within these, m, NaN if there are none.
         nothing, unmeasured: shares of beams without an object in range, and without a measurement.
         wider: directions of all messages together, if the first has fewer.
@@ -274,14 +274,16 @@ class Summary(NamedTuple):
 
 
 def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    ranges, (low, high) = np.asarray(content.ranges, float), scan_limits(content)
+    own, ranges, (low, high) = (
+        extent_of(content, where),
+        np.asarray(content.ranges, float),
+        scan_limits(content),
+    )
     nothing, unmeasured = ranges > high, np.isnan(ranges) | (ranges < low)
     nothing |= np.isposinf(ranges)
     within = ranges[~nothing & ~unmeasured]
     median = float(np.median(within)) if len(within) else np.nan
-    own, shares = extent_of(content, where), (nothing.mean(), unmeasured.mean())
-    if not len(ranges):
-        raise InputError(where, "a scan without beams", "at least one")
+    shares = nothing.mean(), unmeasured.mean()
     return len(ranges), own.width, own.ring, low, high, median, shares, content.header.frame_id, own
 
 
@@ -289,7 +291,7 @@ def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     medians = np.array([value[5] for value in values])
     median = float(np.nanmedian(medians)) if np.isfinite(medians).any() else np.nan
     shares = np.mean([value[6] for value in values], axis=0)
-    beams, fov, ring, low, high = values[0][:5]
+    beams, fov, ring, low, high = sorted(values, key=lambda value: value[0])[len(values) // 2][:5]
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
 
 

@@ -2,8 +2,8 @@
 
 A beam is *measured* unless its range is NaN, -inf or below `range_min`. Of measured beams, +inf and ranges
 above `range_max` mean that nothing was there. A sector is the mean of min(range, max_range) / max_range over
-its measured beams; without any it is 1. Where a scan has no beams at all, a sector is as the nearest one that
-has some.
+its measured beams; without any it is 1. Where a scan has no beams at all, sectors are
+interpolated between the nearest ones that have some.
 """
 
 from __future__ import annotations
@@ -80,9 +80,11 @@ def extent_of(message: Any, where: str) -> Extent:
     """The extent of a LaserScan.
 
     Raises:
-        InputError: the angles are not numbers.
+        InputError: the angles are not numbers, or there are no beams.
     """
     first, step, beams = float(message.angle_min), float(message.angle_increment), len(message.ranges)
+    if not beams:
+        raise InputError(where, "0 beams", "at least one")
     if not (np.isfinite(first) and np.isfinite(step) and step != 0):
         raise InputError(where, f"angle_min is {first} and angle_increment {step}", "angles in rad")
     return Extent(first + step * (beams - 1) / 2, step * beams, abs(step))
@@ -140,7 +142,7 @@ def scan_view(
         order = slice(None, None, 1 if own.width * shared.width > 0 else -1)
         return _fan_view(ranges[order], measured[order], pixels, max_range)
     else:
-        angles = own.middle + own.width * ((np.arange(len(ranges)) + 0.5) / max(len(ranges), 1) - 0.5)
+        angles = own.middle + own.width * ((np.arange(len(ranges)) + 0.5) / len(ranges) - 0.5)
         at = _wrapped(angles - shared.middle) / shared.width + 0.5
     inside = (at >= 0) & (at < 1)
     sector = np.minimum((at * pixels).astype(int), pixels - 1)[inside]
@@ -148,9 +150,9 @@ def scan_view(
     there = np.flatnonzero(np.bincount(sector, minlength=pixels))
     if view is None or len(there) == pixels or own.ring:
         return view
-    away = np.abs(np.arange(pixels)[:, None] - there)
-    away = np.minimum(away, pixels - away) if shared.ring else away
-    return view._replace(pixels=view.pixels[there[away.argmin(axis=1)]], covered=len(there) / pixels)
+    around = pixels if shared.ring else None
+    filled = np.interp(np.arange(pixels), there, view.pixels[there], period=around)
+    return view._replace(pixels=filled, covered=len(there) / pixels)
 
 
 def _wrapped(angle: Any) -> Any:
