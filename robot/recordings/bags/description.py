@@ -291,7 +291,7 @@ def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     medians = np.array([value[5] for value in values])
     median = float(np.nanmedian(medians)) if np.isfinite(medians).any() else np.nan
     shares = np.mean([value[6] for value in values], axis=0)
-    beams, fov, ring, low, high = sorted(values, key=lambda value: value[0])[len(values) // 2][:5]
+    beams, (fov, ring, low, high) = int(np.median([value[0] for value in values])), values[0][1:5]
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
 
 
