@@ -65,18 +65,21 @@ def diagnose_recording(path: Path) -> Diagnosis:
     sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
     if "visual_odometry" in found.recording:
         sections["presets"] = ["visual_odometry"]
+    told, faults, contents = list[str](), found.faults, None
     try:
-        with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
+        with open_source(validate(parse(dump_data(sections), path.name), RunConfig), told.append) as source:
             contents = summarise(source)
     except InputError as error:
-        return Diagnosis(found.what, found.table, found.notes, (*found.faults, *str(error).splitlines()))
-    if not contents.whiskers:
-        cell = cell_size(contents.step, found.max_range)
+        faults = (*faults, *str(error).splitlines())
+    if contents is None or not contents.whiskers:
+        cell = cell_size(contents.step if contents else 0.0, found.max_range)
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
         if found.field_of_view is not None:
             sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
-    notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
-    return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
+    notes = (*found.notes, *told, *(facts(contents) if contents else ()))
+    return Diagnosis(
+        found.what, found.table, notes, faults, shortcomings(contents) if contents else (), sections
+    )
 
 
 def diagnose_registered(path: Path) -> Diagnosis | None:

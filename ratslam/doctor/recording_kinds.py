@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robot.recordings.bags.bag import METADATA
 from robot.recordings.bags.description import (
     BagDescription,
     CloudShape,
@@ -18,7 +19,10 @@ from robot.recordings.bags.description import (
     Times,
     ValueShape,
 )
+from robot.recordings.bags.images import IMAGES
+from robot.recordings.bags.scans import CLOUD, SCAN
 from robot.recordings.bags.views import LONGEST
+from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.video import SUFFIXES as VIDEOS
 from tactile.base.errors import InputError
 
@@ -30,6 +34,10 @@ NO_WHEELS = (
     f"odometry: from the images, without scale, for a camera of {USUAL_FOV:g} degrees; set "
     "recording.visual_odometry.fov_deg to yours, or give wheel odometry"
 )
+VIEWS = (SCAN, CLOUD, *IMAGES)
+"""Types of messages that are views."""
+SMALL = ImageViewConfig()
+"""Smaller images are views of their own size."""
 Rows = tuple[tuple[str, ...], ...]
 
 
@@ -59,6 +67,11 @@ def describe_file(path: Path) -> FileContents:
     """
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
+    if path.name == METADATA:
+        bag = _bag(path.parent)
+        if bag.recording is None:
+            return bag
+        return bag._replace(recording={"file": str(path.parent.resolve()), **bag.recording})
     if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
         return _bag(path)
     describe = KINDS.get(path.suffix.lower())
@@ -79,7 +92,7 @@ def _csv(path: Path) -> FileContents:
         *((name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns),
     )
     notes, faults = list(found.parts.values()), []
-    what = f"{path}: a CSV file, {found.rows} rows"
+    what = f"{path}: a CSV file, {counted(found.rows, 'row')}"
     if found.clock is not None:
         clock = found.clock
         what += f" over {clock.last - clock.first:.6g} s"
@@ -116,27 +129,33 @@ def _mcap(path: Path) -> FileContents:
 
 def _bag(path: Path) -> FileContents:
     from robot.recordings.bags.description import describe_bag
-    from robot.recordings.bags.suggestion import suggested_topics
+    from robot.recordings.bags.suggestion import robots_of, suggested_topics
 
     found = describe_bag(path)
     rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]
-    notes, faults = [], []
+    notes, faults = list(found.notes), []
     for topic in found.topics:
         clock = topic.stamped or topic.received
         roles = ", ".join(topic.roles) or "-"
         rows.append(
             (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", in_words(topic.shape), roles)
         )
-        if topic.fault:
+        if topic.fault and topic.kind not in VIEWS:
             notes.append(f"{topic.name}: {topic.fault}")
         if topic.roles:
             notes += clock_notes(topic.name, clock)
     moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
     if found.links:
-        notes.append(f"frames: {', '.join(moving)}; {len(found.links) - len(moving)} fixed links")
+        fixed = len(found.links) - len(moving)
+        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {counted(fixed, 'fixed link')}")
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
+    elif not {"views", "touch"} & topics.keys():
+        faults += [
+            f"{topic.name}: {topic.fault}" for topic in found.topics if topic.kind in VIEWS and topic.fault
+        ]
+    if faults:
         return FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
     notes += [
         f"missing: {name}"
@@ -147,14 +166,27 @@ def _bag(path: Path) -> FileContents:
     end = max(topic.received.last for topic in found.topics)
     what = f"{path}: a bag of {len(found.topics)} topics over {end - start:.4g} s"
     recording: dict[str, Any] = {"topics": topics}
+    if "tf" in (topics.get("odometry") or ()) and (others := robots_of(found)[1:]):
+        named = ", ".join(f"[{parent}, {child}]" for parent, child in others)
+        notes.append(f"other robots: {named}; name one with recording.topics.odometry.tf")
     if "odometry" not in topics:
         recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
         notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
     fov = shape.fov if isinstance(shape, ScanShape) else None
-    if isinstance(shape, ScanShape) and shape.ring:
+    if isinstance(shape, ScanShape) and shape.wider is not None:
+        fov = shape.wider.width
+    if isinstance(shape, ScanShape) and (shape.ring or (shape.wider is not None and shape.wider.ring)):
         fov = 2 * np.pi
+    if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
+        size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
+        recording["image"] = size
     return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def clock_notes(name: str, clock: Times) -> list[str]:
@@ -165,6 +197,9 @@ def clock_notes(name: str, clock: Times) -> list[str]:
         "an earlier stamp than the message before": clock.backwards,
     }
     notes = [f"{name}: {count} messages have {words}" for words, count in counts.items() if count]
+    if 0.5 < clock.ahead < 1e6:
+        cure = "if those of others are not, set recording.topics.clock to bag"
+        notes.append(f"{name}: stamps are {clock.ahead:.3g} s ahead of their receipt; {cure}")
     if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
         notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")
     return notes

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robot.recordings.bags.bag import container_fault
 from robot.recordings.cdr_live import Event
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_scanner import McapScanner, is_foreign
 from robot.recordings.mcap_writer import McapWriter, existing_error
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
@@ -179,6 +180,9 @@ def recover(path: Path, out: Path) -> Recovery:
 
 def _unreadable_recording_error(scanner: McapScanner) -> InputError:
     """The error for a file without a description or without samples."""
+    if is_foreign(scanner.path):
+        found, cure = container_fault(scanner.path) or ("a whole bag of another program", "")
+        return InputError(str(scanner.path), found, "a recording of ratslam", cure)
     if scanner.description is None:
         found = f"cannot be read as a recording: {scanner.broken or 'it has no ratslam metadata'}"
         expected = "an MCAP file written by this version of ratslam"

@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Chunk, Message, Metadata, Schema, Statistics
+from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from robot.drivers.head.cycle_assembly import FrameWindow, assemble_cycle, empty_frames
@@ -29,6 +29,7 @@ from robot.sources.source_info import SourceInfo
 
 METADATA = "ratslam"
 FORMAT = "3"
+OURS = "ratslam "  # and the version: the library that wrote a recording
 
 
 class RecordingDescription(NamedTuple):
@@ -79,19 +80,22 @@ class RecordingDescription(NamedTuple):
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether an MCAP file was written by another program: without our metadata before the first message.
-    False for anything else, such as files that do not exist or are damaged there."""
+    """Whether an MCAP file was written by another program: without our metadata before the first message, or
+    damaged there and not with our name. False for anything else, such as files that do not exist."""
     if not path.is_file():
         return False
+    library = OURS
     try:
         with path.open("rb") as file:
             for record in StreamReader(file, emit_chunks=True).records:
+                if isinstance(record, Header):
+                    library = record.library
                 if isinstance(record, Metadata) and record.name == METADATA:
                     return False
                 if isinstance(record, (Chunk, Message)):
                     return True
     except (OSError, *DAMAGE_ERRORS):
-        return False
+        return not library.startswith(OURS)
     return True
 
 

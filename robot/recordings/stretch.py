@@ -44,24 +44,20 @@ class Stretch(NamedTuple):
     first: float | str | None = None
     last: float | str | None = None
 
-    def rows(self, time: np.ndarray, where: str, start: float | None = None) -> np.ndarray:
-        """[N] bool, the times within the stretch.
+    def inside(self, time: np.ndarray, start: float) -> np.ndarray:
+        """[N] bool, the times [N] s within the stretch of a recording that starts at `start` s."""
+        first, last = (_in_seconds(each, start) for each in self)
+        return (time >= (-np.inf if first is None else first)) & (time <= (np.inf if last is None else last))
 
-        Args:
-            time: [N] s. where: names the recording. start: s, of the recording; None: the first time.
+    def rows(self, time: np.ndarray, where: str) -> np.ndarray:
+        """[N] bool, the times [N] s of a recording within the stretch.
 
         Raises:
             InputError: none is.
         """
         if self == WHOLE or not len(time):
             return np.ones(len(time), bool)
-        start = float(time[np.isfinite(time)].min(initial=np.inf)) if start is None else start
-        first, last = (_in_seconds(each, start) for each in self)
-        inside = np.ones(len(time), bool)
-        if first is not None:
-            inside &= time >= first
-        if last is not None:
-            inside &= time <= last
+        inside = self.inside(time, float(time[np.isfinite(time)].min(initial=np.inf)))
         if not inside.any():
             found = f"nothing from {self.first or 'the start'} to {self.last or 'the end'}"
             expected = f"a stretch of it: it goes from {np.nanmin(time):.3f} to {np.nanmax(time):.3f} s"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from heapq import merge
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from copy import copy
+from functools import cached_property
+from heapq import heappop, heappush, merge
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
+
+import numpy as np
 
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.input_files import missing_error, require_file, unreadable_error
@@ -17,16 +21,26 @@ from tactile.base.errors import InputError
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
+MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
+KNOWN_CODES = {"cdr", "ros2msg", "ros2idl", "omgidl", ""}
+REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+CONVERT = (
+    "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
+    "`mcap convert` or `rosbags-convert`"
+)
 TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 """Types of /tf, of ROS 2 and 1 and of early ROS 1."""
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins with 00
+SPOILT = 0.05
+"""Share of a topic's messages that may be unusable, and at least one; more are an error."""
 
 
 class Topic(NamedTuple):
     """A topic of a bag.
 
     Attributes:
-        kind: its message type, such as nav_msgs/msg/Odometry. total: number of messages.
+        kind: its message type, such as nav_msgs/msg/Odometry. total: number of messages, as the file or
+            metadata.yaml counts them (the larger one).
     """
 
     name: str
@@ -40,16 +54,22 @@ class Bag:
     Args:
         path: a `.bag`, `.db3` or `.mcap` file, a ROS 2 folder with metadata.yaml, or a folder with the
             parts of a ROS 1 bag.
+        warn: called with one sentence for whatever is in the bag and is not read; once for each.
+        stretch: of the times of receipt; only messages within it are read, besides fixed transforms.
 
     Attributes:
-        topics: by name.
+        topics: by name. warn: that function.
 
     Raises:
         InputError: the bag is missing, damaged or empty, or rosbags is not installed.
     """
 
-    def __init__(self, path: Path, stretch: Stretch = WHOLE) -> None:
-        self.path, self.stretch, self._stack = path, stretch, ExitStack()
+    def __init__(
+        self, path: Path, warn: Callable[[str], None] | None = None, stretch: Stretch = WHOLE
+    ) -> None:
+        path = path.parent if path.name == METADATA else path
+        self.path, self._stack, self._told, self._warn = path, ExitStack(), set[str](), warn
+        self._stretch = stretch
         files = bag_files(path)
         try:
             from rosbags import rosbag1, rosbag2
@@ -59,27 +79,51 @@ class Bag:
         first = files[0].suffix == ".bag"
         with damage_errors(path):
             readers: list[Any] = [rosbag1.Reader(file) for file in files] if first else [rosbag2.Reader(path)]
+            if files[0].name == METADATA and not _names_its_storage(files[0]):
+                readers = [rosbag2.Reader(file) for file in files[1:]]
             for reader in readers:
                 reader.open()
                 self._stack.callback(reader.close)
+            listed = [each for reader in readers for each in reader.connections]
+            if not first:
+                readers = [part for reader in readers for part in _storages(reader.storage)]
+                self._report_unlisted(files, readers)
             self._store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
             for kind in TRANSFORMS - self._store.fielddefs.keys():
                 self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
             self._decode = self._store.deserialize_ros1 if first else self._store.deserialize_cdr
             self._readers, self._first = readers, first
-            self.topics = self._list_topics()
+            self.topics = self._list_topics(listed)
         if not sum(topic.total for topic in self.topics.values()):
             self._stack.close()
             raise InputError(str(path), "a bag without messages", "at least one message")
 
-    def _list_topics(self) -> dict[str, Topic]:
+    def warn(self, sentence: str) -> None:
+        if self._warn is not None and sentence not in self._told:
+            self._warn(sentence)
+        self._told.add(sentence)
+
+    def _list_topics(self, listed: list[Any]) -> dict[str, Topic]:
+        """The topics of the files; of the listed connections too, which are those of metadata.yaml if any."""
         topics = dict[str, Topic]()
-        for connection in (each for reader in self._readers for each in reader.connections):
-            name, kind = str(connection.topic), str(connection.msgtype)
-            known = topics.get(name, Topic(name, kind, 0))
-            both = kind if known.kind == kind else f"{known.kind} and {kind}"
-            topics[name] = Topic(name, both, known.total + int(connection.msgcount))
+        for connections in ((each for reader in self._readers for each in reader.connections), listed):
+            before, topics = topics, {}
+            for connection in connections:
+                name, kind = str(connection.topic), str(connection.msgtype)
+                known = topics.get(name, Topic(name, kind, 0))
+                both = kind if known.kind == kind else f"{known.kind} and {kind}"
+                topics[name] = Topic(name, both, known.total + int(connection.msgcount))
+            for name, known in before.items():
+                topics[name] = known._replace(total=max(known.total, topics.get(name, known).total))
         return dict(sorted(topics.items()))
+
+    def _report_unlisted(self, files: list[Path], storages: list[Any]) -> None:
+        """Reports storage files beside metadata.yaml that it does not list."""
+        read = {part.path.name for part in storages} | {files[0].name}
+        unread = [file.name for file in files if not {file.name, file.stem} & read]
+        if unread:
+            cure = "`ros2 bag reindex` lists it"
+            self.warn(f"{self.path}: {', '.join(unread)} is not in {METADATA} and is not read; {cure}")
 
     def topic(self, name: str, key: str) -> Topic:
         """The topic of this name; a leading slash may be missing.
@@ -104,10 +148,71 @@ class Bag:
         Raises:
             InputError: the bag is damaged, or the topic's type is unknown or defined differently.
         """
+        for _, time, content in self._decoded(topic):
+            if isinstance(content, InputError):
+                raise content
+            yield time, content
+
+    def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
+        """The messages of a topic that can be used: number, time of receipt in ns, content, and what `read`
+        makes of the content and its place.
+
+        Messages that cannot be decoded, or for which `read` raises `InputError`, are left out with a warning,
+        up to `SPOILT` of all.
+
+        Raises:
+            InputError: as `messages`, or the first of the others, if they are more, or all.
+        """
+        where, good, spoilt = f"{self.path}, {topic.name}", 0, list[tuple[int, int, InputError]]()
+        for number, time, content in self._decoded(topic):
+            try:
+                if isinstance(content, InputError):
+                    raise content
+                value = read(content, f"{where}, message {number}")
+            except InputError as error:
+                spoilt.append((number, time, error))
+                if len(spoilt) > max(1, SPOILT * topic.total):
+                    raise _spoilt_error(
+                        spoilt[0][2], f"so or alike in over {SPOILT:.0%} of its messages"
+                    ) from error
+                continue
+            good += 1
+            yield number, time, content, value
+        if spoilt:
+            number, time, fault = spoilt[0]
+            if not good:
+                raise fault
+            first = f"the first is message {number}, received at {time / 1e9:.3f} s: {fault.found}"
+            self.warn(
+                f"{where}: {len(spoilt)} of {topic.total} messages cannot be used and are left out; {first}"
+            )
+
+    def _decoded(self, topic: Topic) -> Iterator[tuple[int, int, Any]]:
+        """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
+        decoded."""
         self._check_type(topic)
         with damage_errors(self.path):
-            for time, raw in self._raw(topic):
-                yield time, self._decode(_plain(raw), topic.kind)
+            for number, (time, raw) in enumerate(self._raw(topic)):
+                if not self._is_within(time, topic):
+                    continue
+                try:
+                    content = self._decode(_plain(raw), topic.kind)
+                except Exception as error:  # whatever a decoder raises for damaged bytes
+                    found = f"{len(raw)} bytes that cannot be decoded ({_reason(error)})"
+                    place = f"{self.path}, {topic.name}, message {number}"
+                    content = InputError(place, found, f"a message of type {topic.kind}")
+                yield number, time, content
+
+    def _is_within(self, time: int, topic: Topic) -> bool:
+        """Whether a message received at this time, ns, is read."""
+        if self._stretch == WHOLE or topic.name.endswith("tf_static"):
+            return True
+        return bool(self._stretch.inside(np.array([time / 1e9]), self._start)[0])
+
+    @cached_property
+    def _start(self) -> float:
+        """The first time of receipt, s."""
+        return min(next(self._raw(topic))[0] for topic in self.topics.values() if topic.total) / 1e9
 
     def receipts(self, topic: Topic) -> Iterator[int]:
         """The times of receipt, ns, of the messages of a topic of any type.
@@ -120,23 +225,36 @@ class Bag:
                 yield time
 
     def _raw(self, topic: Topic) -> Iterator[tuple[int, Any]]:
-        parts = []
+        parts, count, time = [], 0, None
         for reader in self._readers:
             chosen = [each for each in reader.connections if each.topic == topic.name]
             if chosen:
-                parts.append(reader.messages(chosen))
-        time = None
+                unindexed = hasattr(reader, "messages_scan") and not reader.chunks
+                parts.append(_scanned(reader, chosen) if unindexed else reader.messages(chosen))
         for _, time, raw in merge(*parts, key=lambda entry: entry[1]):
             if not 0 <= time < 1 << 63:
                 raise ValueError(f"a message received at {time} ns")
             yield int(time), raw
+            count += 1
         if time is None:
             raise ValueError(f"{topic.total} messages of {topic.name} are listed, and none is there")
+        if count < topic.total:
+            found = f"{count} of {topic.total} messages were read, the last received at {time / 1e9:.3f} s"
+            cure = (
+                "the others are listed and not there; `mcap recover` or `ros2 bag reindex` counts them anew"
+            )
+            self.warn(f"{self.path}, {topic.name}: {found}; {cure}")
 
     def _check_type(self, topic: Topic) -> None:
         where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
             raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
+        coded = {getattr(each.ext, "serialization_format", "cdr") for reader in self._readers
+                 for each in reader.connections if each.topic == topic.name}  # fmt: skip
+        if coded - {"cdr"}:
+            raise InputError(
+                where, f"messages encoded as {', '.join(coded - {'cdr'})}", "CDR, of ROS 2", CONVERT
+            )
         if self._first:
             digest = self._store.generate_msgdef(topic.kind)[1]
             connections = (each for reader in self._readers for each in reader.connections)
@@ -162,11 +280,48 @@ def damage_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         raise unreadable_error(path, error) from error
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        cure = (
-            "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+        found, cure = container_fault(path) or (f"cannot be read as a bag: {_reason(error)}", REPAIR)
+        raise InputError(str(path), found, "a whole bag", cure) from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _spoilt_error(error: InputError, count: str) -> InputError:
+    return InputError(error.where, f"{error.found} ({count})", error.expected, error.cure)
+
+
+def container_fault(path: Path) -> tuple[str, str] | None:
+    """What is wrong with an MCAP file as a container, and the cure; None for others."""
+    from mcap.records import Channel, Header, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    if path.suffix != ".mcap" or not path.is_file():
+        return None
+    profile, coded = "", set[str]()
+    with path.open("rb") as file, suppress(Exception):
+        for record in StreamReader(file).records:
+            if isinstance(record, Header):
+                profile = record.profile
+            elif isinstance(record, (Channel, Schema)):
+                coded.add(record.message_encoding if isinstance(record, Channel) else record.encoding)
+            elif isinstance(record, Message):
+                break
+    if coded and (profile != "ros2" or coded - KNOWN_CODES):
+        names = ", ".join(sorted(coded))
+        return (
+            f"cannot be read as a bag: an MCAP file of profile {profile!r} with {names}, not of ROS 2",
+            CONVERT,
         )
-        raise InputError(str(path), f"cannot be read as a bag: {reason}", "a whole bag", cure) from error
+    with path.open("rb") as file:
+        whole = file.seek(0, 2) > len(MCAP) and (file.seek(-len(MCAP), 2), file.read())[1] == MCAP
+    if whole or profile != "ros2":
+        return None
+    return (
+        "cannot be read as a bag: a ROS 2 bag (MCAP) that is cut off",
+        f"`mcap recover {path.name} -o whole.mcap`",
+    )
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -175,6 +330,7 @@ def bag_files(path: Path) -> list[Path]:
     Raises:
         InputError: there is no such bag.
     """
+    path = path.parent if path.name == METADATA else path
     if not path.is_dir():
         require_file(path)
         if path.suffix not in SUFFIXES:
@@ -214,3 +370,50 @@ def _plain(raw: Any) -> bytes:
     import zstandard
 
     return zstandard.ZstdDecompressor().decompressobj().decompress(content)
+
+
+def _names_its_storage(metadata: Path) -> bool:
+    """Whether metadata.yaml says how the files are stored; `ros2 bag reindex` may leave that empty."""
+    lines = metadata.read_text(encoding="utf-8", errors="replace").splitlines()
+    return not any(line.split() in (["storage_identifier:", mark] for mark in ('""', "''")) for line in lines)
+
+
+def _storages(reader: Any) -> list[Any]:
+    """The storage files of a ROS 2 reader; an index of MCAP that lacks parts is not used."""
+    found = list(getattr(reader, "storages", [reader]))
+    for part in found:
+        if not hasattr(part, "meta_scan"):
+            continue
+        counted, stated = sum(each.msgcount for each in part.connections), part.statistics.message_count
+        typed = all(each.msgtype != "__schemaless__" for each in part.connections)
+        if typed and counted == stated and all(chunk.message_index_offsets for chunk in part.chunks):
+            continue
+        before = part.statistics.channel_message_counts
+        part.chunks.clear()
+        part.connections.clear()
+        part.meta_scan()
+        counts = part.statistics.channel_message_counts
+        part.connections = [
+            each._replace(msgcount=max(counts.get(each.id, 0), before.get(each.id, 0)))
+            for each in part.connections
+        ]
+    return found
+
+
+def _scanned(reader: Any, chosen: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """The messages of an MCAP file without index in the order of their times; read with a file handle of its
+    own, so that several topics can be read at a time, and twice, so that few messages wait for their turn."""
+
+    def records() -> Iterator[tuple[Any, int, bytes]]:
+        own = copy(reader)
+        with reader.path.open("rb") as own.bio:
+            yield from own.messages_scan(chosen)
+
+    times, done = sorted(time for _, time, _ in records()), 0
+    waiting = list[tuple[int, int, Any, bytes]]()
+    for number, (connection, time, raw) in enumerate(records()):
+        heappush(waiting, (time, number, connection, raw))
+        while waiting and waiting[0][0] == times[done]:
+            moment, _, connection, raw = heappop(waiting)
+            done += 1
+            yield connection, moment, raw

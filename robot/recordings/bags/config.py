@@ -83,10 +83,19 @@ class ViewsTopic(Topic):
     """Range that becomes 1, m; null: `range_max` of the first scan, at most 8 m."""
     yaw: float | None = None
     """Direction of the sensor in the frame of the robot, rad, counter-clockwise; null: from /tf_static."""
+    span: Annotated[tuple[float, float] | None, FromList] = None
+    """Scans: the directions that are cut into sectors, from the first to the last, rad in the frame of the
+    sensor; a whole turn is a ring; null: those of the first scan."""
     heights: Annotated[tuple[float, float], FromList] = (0.1, 1.0)
     """Point clouds: lowest and highest point that counts, m, in the frame of the robot."""
     tolerance: NonNegativeFloat | None = None
     """Largest time between a view and its nearest sample, s; null: the median step of the odometry."""
+
+    @model_validator(mode="after")
+    def _spans_at_most_a_turn(self) -> ViewsTopic:
+        if self.span is not None and not 0 < abs(self.span[1] - self.span[0]) < 6.284:
+            raise ValueError(f"span is {list(self.span)}: give two directions in rad, at most a turn apart")
+        return self
 
 
 class TouchTopic(Topic):

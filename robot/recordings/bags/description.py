@@ -8,13 +8,21 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import Bag, Topic
+from robot.recordings.bags.bag import SPOILT, Bag, Topic
 from robot.recordings.bags.images import COMPRESSED, IMAGES, RAW, grey_image
 from robot.recordings.bags.motions import POSES, TWISTS, twist_in_plane
-from robot.recordings.bags.scans import CLOUD, SCAN, cloud_points, is_ring, scan_limits
-from robot.recordings.bags.stamps import nanoseconds
+from robot.recordings.bags.scans import (
+    CLOUD,
+    SCAN,
+    Extent,
+    cloud_points,
+    extent_of,
+    scan_limits,
+    wider_extent,
+)
+from robot.recordings.bags.stamps import leaps, nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
-from robot.recordings.bags.transforms import MOVING, STATIC, read_links
+from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links, turn_between
 from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
@@ -28,7 +36,8 @@ class Times(NamedTuple):
     Attributes:
         first, last: s. rate_hz: median; 0 with fewer than two different times. gap, gap_at: longest pause, s,
             and the time at which it begins. zero, repeated, backwards: messages with a stamp of 0, with the
-            stamp of the message before, and with an earlier one.
+            stamp of the message before, and with an earlier one. count: N. leaps: steps that leap where the
+            other clock does not. ahead: median time before the other clock, s.
     """
 
     first: float
@@ -39,20 +48,24 @@ class Times(NamedTuple):
     zero: int
     repeated: int
     backwards: int
+    count: int = 0
+    leaps: int = 0
+    ahead: float = 0.0
 
     @property
     def in_order(self) -> bool:
-        """Whether the messages can be read by this clock."""
-        return not (self.zero or self.backwards)
+        """Whether the messages can be read by this clock; a few are left out."""
+        return max(self.zero, self.backwards) <= max(1, SPOILT * self.count)
 
 
 class ScanShape(NamedTuple):
     """LaserScan.
 
     Attributes:
-        beams: of the first message. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
+        beams: median number. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
         low, high: limits of the range, m. median: of the ranges within these, m, NaN if there are none.
         nothing, unmeasured: shares of beams without an object in range, and without a measurement.
+        wider: directions of all messages together, if the first has fewer.
     """
 
     beams: int
@@ -63,6 +76,7 @@ class ScanShape(NamedTuple):
     median: float
     nothing: float
     unmeasured: float
+    wider: Extent | None = None
 
 
 class CloudShape(NamedTuple):
@@ -156,11 +170,16 @@ class FrameLink(NamedTuple):
 
 
 class BagDescription(NamedTuple):
-    """A bag. Attributes: topics: by name, with messages. links: frames of /tf and /tf_static."""
+    """A bag.
+
+    Attributes:
+        topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is left out.
+    """
 
     path: Path
     topics: tuple[TopicDescription, ...]
     links: tuple[FrameLink, ...]
+    notes: tuple[str, ...] = ()
 
 
 @np.errstate(all="ignore")  # numbers may be any
@@ -170,7 +189,8 @@ def describe_bag(path: Path) -> BagDescription:
     Raises:
         InputError: the bag is missing, damaged or empty.
     """
-    with Bag(path) as bag:
+    told = list[str]()
+    with Bag(path, told.append) as bag:
         topics = tuple(_describe_topic(bag, topic) for topic in bag.topics.values() if topic.total)
         links = []
         for name in (MOVING, STATIC):
@@ -179,7 +199,7 @@ def describe_bag(path: Path) -> BagDescription:
             except InputError:
                 continue  # the fault of the topic says why
             links += [FrameLink(*pair, name == STATIC, len(link.stamps)) for pair, link in found.items()]
-    return BagDescription(path, topics, tuple(links))
+    return BagDescription(path, topics, tuple(links), tuple(told))
 
 
 def roles_of(kind: str) -> tuple[Role, ...]:
@@ -201,19 +221,24 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
         if not roles:
             received = list(bag.receipts(topic))
         else:
-            for time, content in bag.messages(topic):
+
+            def read(content: Any, place: str) -> None:
+                if summary is not None and (summary.every or not contents):
+                    contents.append(summary.extract(content, topic.kind, place))
+
+            for _, time, content, _ in bag.usable(topic, read):
                 received.append(time)
                 if hasattr(content, "header"):
                     stamps.append(nanoseconds(content.header.stamp))
                     frames = frames if any(frames) else _frames_of(content)
-                if summary is not None and (summary.every or not contents):
-                    contents.append(summary.extract(content, topic.kind, f"{bag.path}, {topic.name}"))
             if summary is not None:
                 shape = summary.shape(contents, stamps or received)
+            if isinstance(shape, ScanShape):
+                shape = shape._replace(wider=_wider(bag, contents))
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
-    stamped = times_of(stamps) if stamps else None
+    stamped = times_of(stamps, received) if len(stamps) == len(received) > 0 else None
     return TopicDescription(*topic, times_of(received), stamped, *frames, shape, roles, fault)
 
 
@@ -221,9 +246,10 @@ def _frames_of(content: Any) -> tuple[str, str]:
     return str(content.header.frame_id), str(getattr(content, "child_frame_id", ""))
 
 
-def times_of(stamps: list[int]) -> Times:
-    """The times of N messages, ns, at least one."""
+def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
+    """The times of N messages, ns, at least one; other: by the other clock."""
     times = np.array(stamps, np.int64)
+    others = times if other is None else np.array(other, np.int64)
     steps = np.diff(times)
     ahead = steps[steps > 0]
     longest = int(steps.argmax()) if len(steps) else 0
@@ -236,6 +262,9 @@ def times_of(stamps: list[int]) -> Times:
         zero=int((times == 0).sum()),
         repeated=int((steps == 0).sum()),
         backwards=int((steps < 0).sum()),
+        count=len(times),
+        leaps=int(leaps(times, others).sum()),
+        ahead=float(np.median(times - others)) / 1e9,
     )
 
 
@@ -253,21 +282,37 @@ class Summary(NamedTuple):
 
 
 def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    ranges, (low, high) = np.asarray(content.ranges, float), scan_limits(content)
+    own, ranges, (low, high) = (
+        extent_of(content, where),
+        np.asarray(content.ranges, float),
+        scan_limits(content),
+    )
     nothing, unmeasured = ranges > high, np.isnan(ranges) | (ranges < low)
     nothing |= np.isposinf(ranges)
     within = ranges[~nothing & ~unmeasured]
     median = float(np.median(within)) if len(within) else np.nan
-    fov = len(ranges) * float(content.angle_increment)
-    return len(ranges), fov, is_ring(content), low, high, median, nothing.mean(), unmeasured.mean()
+    shares = nothing.mean(), unmeasured.mean()
+    return len(ranges), own.width, own.ring, low, high, median, shares, content.header.frame_id, own
 
 
 def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     medians = np.array([value[5] for value in values])
     median = float(np.nanmedian(medians)) if np.isfinite(medians).any() else np.nan
-    shares = np.mean([value[6:] for value in values], axis=0)
-    beams, fov, ring, low, high = values[0][:5]
+    shares = np.mean([value[6] for value in values], axis=0)
+    beams, (fov, ring, low, high) = int(np.median([value[0] for value in values])), values[0][1:5]
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
+
+
+def _wider(bag: Bag, values: list[Any]) -> Extent | None:
+    """What the scans of a topic cover together, in the frame of the first; None if it is as the first."""
+    frames = {value[7] for value in values}
+    mounts = {frame: mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1}
+    first = values[0][7]
+    extents = [
+        own if frame == first else own.turned(turn_between(mounts[frame], mounts[first]))
+        for frame, own in (value[7:] for value in values)
+    ]
+    return wider_extent(extents[0], extents)
 
 
 def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:

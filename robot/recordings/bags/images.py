@@ -21,8 +21,17 @@ ENCODINGS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("bgr8", "8UC3"), ("u1", "bgr")),
     **dict.fromkeys(("rgba8",), ("u1", "rgba")),
     **dict.fromkeys(("bgra8", "8UC4"), ("u1", "bgra")),
+    **dict.fromkeys(("yuv422", "uyvy"), ("u1", "-y")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), ("u1", "y-")),
+    **dict.fromkeys(("nv12", "nv21", "nv24"), ("u1", "y")),  # the other planes come after the grey one
+    **{
+        f"bayer_{order}{bits}": (f"u{bits // 8}", "y")
+        for order in ("rggb", "bggr", "gbrg", "grbg")
+        for bits in (8, 16)
+    },
 }
 """Encodings of raw images: NumPy type and channels."""
+NO_DEPTH = "name a topic of grey or colour images with recording.topics.views"
 
 
 def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
@@ -35,6 +44,8 @@ def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
 
 
 def _raw(message: Any, where: str) -> np.ndarray:
+    if message.encoding in ("32FC1", "64FC1"):
+        raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", NO_DEPTH)
     if message.encoding not in ENCODINGS:
         raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(ENCODINGS)}")
     number, channels = ENCODINGS[message.encoding]
@@ -48,10 +59,16 @@ def _raw(message: Any, where: str) -> np.ndarray:
     strides = (step, len(channels) * kind.itemsize, kind.itemsize)
     pixels = np.ndarray((height, width, len(channels)), kind, data.tobytes(), strides=strides)
     if channels == "y":
-        grey = pixels[..., 0]
-        return (grey >> 8).astype(np.uint8) if kind.itemsize == 2 else grey.copy()
+        grey = (pixels[..., 0] >> 8).astype(np.uint8) if kind.itemsize == 2 else pixels[..., 0].copy()
+        return _without_mosaic(grey) if message.encoding.startswith("bayer") else grey
     weights = np.array([LUMA.get(name, 0) for name in channels], np.int32)
     return ((pixels.astype(np.int32) @ weights + 500) // 1000).astype(np.uint8)
+
+
+def _without_mosaic(mosaic: np.ndarray) -> np.ndarray:
+    """[H, W] means of each pixel and its right and lower neighbours, one of each colour of the filter."""
+    near = np.pad(mosaic.astype(np.uint16), ((0, 1), (0, 1)), "reflect" if min(mosaic.shape) > 1 else "edge")
+    return ((near[:-1, :-1] + near[1:, :-1] + near[:-1, 1:] + near[1:, 1:] + 2) // 4).astype(np.uint8)
 
 
 def _decoded(message: Any, where: str) -> np.ndarray:
@@ -59,9 +76,11 @@ def _decoded(message: Any, where: str) -> np.ndarray:
         from PIL import Image, UnidentifiedImageError
     except ImportError:
         raise InputError("pillow", "not installed", "", "pip install 'ratslam[ros]'") from None
+    if "compressedDepth" in message.format:
+        raise InputError(where, f"distances ({message.format})", "a grey or colour image", NO_DEPTH)
     data = bytes(message.data)
     try:
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > LARGEST:
                 raise InputError(where, f"{image.width} x {image.height} pixels", f"at most {LARGEST}")
             if image.mode.startswith("I"):  # 16 bits
@@ -71,7 +90,7 @@ def _decoded(message: Any, where: str) -> np.ndarray:
         raise
     except UnidentifiedImageError:
         found = f"{len(data)} bytes of format {message.format!r}"
-        raise InputError(where, found, "a JPEG or PNG image") from None
+        raise InputError(where, found, "a JPEG, PNG or WebP image") from None
     except Exception as error:
         found = f"an image that cannot be decoded ({error})"
-        raise InputError(where, found, "a JPEG or PNG image") from error
+        raise InputError(where, found, "a JPEG, PNG or WebP image") from error

@@ -10,7 +10,7 @@ import numpy as np
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
 from robot.recordings.bags.motions import PARTS, POSES, TWISTS, pose_in_plane, twist_in_plane
-from robot.recordings.bags.stamps import Clock, Report, Series, as_series, left_out, seconds, stamp_of
+from robot.recordings.bags.stamps import Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors
 from robot.sources.odometry import from_poses, from_velocities
@@ -114,32 +114,29 @@ def _read_series(
     if topic.kind not in POSES and not twist:
         known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
         raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
-    rows, kept, bad, faults = list[Any](), list[Any](), list[InputError](), _PoseFaults(config.plane)
-    for number, (received, content) in enumerate(bag.messages(topic)):
-        frames = _frames_of(content)
-        if config.frames is not None and frames != tuple(frame.lstrip("/") for frame in config.frames):
-            continue
-        place = f"{where}, message {number}"
-        try:
-            if twist:
-                value = twist_in_plane(TWISTS[topic.kind](content))
-            else:
-                parts = PARTS[topic.kind](content)
-                value = pose_in_plane(*parts, place, config.plane)
-                faults.add(content, parts, place)
-            if not np.isfinite(value).all():
-                raise InputError(place, f"velocities {', '.join(map(str, value))}", "finite numbers")
-        except InputError as error:
-            bad.append(InputError(f"{place}, {seconds(received)} s", error.found, error.expected))
-            continue
-        rows.append((number, stamp_of(content, received, clock), received, frames))
-        kept.append(value)
-    count = len(rows) + len(bad)
-    errors = left_out(where, len(bad), count, bad[0], report) if bad else []
+    rows, kept, faults = list[Any](), list[Any](), _PoseFaults(config.plane)
+    wanted = None if config.frames is None else tuple(frame.lstrip("/") for frame in config.frames)
+
+    def read(content: Any, place: str) -> Any:
+        if wanted not in (None, _frames_of(content)):
+            return None
+        if not twist:
+            value = pose_in_plane(*PARTS[topic.kind](content), place, config.plane)
+            faults.add(content, PARTS[topic.kind](content), place)
+        elif not np.isfinite(value := twist_in_plane(TWISTS[topic.kind](content))).all():
+            raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+        return value
+
+    for number, received, content, value in bag.usable(topic, read):
+        if value is not None:
+            rows.append((number, stamp_of(content, received, clock), received, _frames_of(content)))
+            kept.append(value)
+    if not rows:
+        raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
     numbers, stamps, receipts, pairs = ([row[k] for row in rows] for k in range(4))
-    errors += _frame_errors(where, numbers, pairs, role)
+    errors = _frame_errors(where, numbers, pairs, role)
     if not errors:
-        faults.tell(where, count, report)
+        faults.tell(where, len(rows), report)
     values = np.array(kept).reshape(-1, 3)
     series = as_series(where, numbers, stamps, values, clock, report, receipts)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])

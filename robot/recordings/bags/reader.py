@@ -13,11 +13,11 @@ from robot.recordings.alignment import (
     nearest_rows,
     no_overlap_error,
 )
-from robot.recordings.bags.bag import Bag, bag_digest
+from robot.recordings.bags.bag import SPOILT, Bag, bag_digest
 from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
 from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
-from robot.recordings.bags.stamps import LEFT_OUT, Report, Series, other_clock
+from robot.recordings.bags.stamps import Report, Series, other_clock
 from robot.recordings.bags.touch import read_touch
 from robot.recordings.bags.views import KEY, read_image_views, read_range_views
 from robot.recordings.camera.image_view import ImageViewConfig
@@ -49,7 +49,7 @@ def read_bag(
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
     report = judge.say
-    with Bag(path, judge.stretch) as bag:
+    with Bag(path, report, judge.stretch) as bag:
         config = with_preset(bag, config)
         _check_roles(bag, config, visual_odometry)
         images = image or ImageViewConfig()
@@ -187,5 +187,5 @@ def _report_unused(views: Series, unused: np.ndarray, why: str, report: Report) 
     if unused.any():
         first = float(views.time[int(unused.argmax())])
         count = f"{int(unused.sum())} of {len(unused)} views, the first at {first:.3f} s"
-        few = "note: " if unused.mean() <= LEFT_OUT else ""
+        few = "note: " if unused.mean() <= SPOILT else ""
         report(f"{few}{views.where}: {count}, are {why}; they are left out")

@@ -2,11 +2,13 @@
 
 A beam is *measured* unless its range is NaN, -inf or below `range_min`. Of measured beams, +inf and ranges
 above `range_max` mean that nothing was there. A sector is the mean of min(range, max_range) / max_range over
-its measured beams; without any it is 1.
+its measured beams; without any it is 1. Where a scan has no beams at all, sectors are
+interpolated between the nearest ones that have some.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,53 +23,147 @@ POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 """NumPy types of PointField.datatype."""
 
 
+COVERED = 0.5
+"""Share of the sectors in which a view has beams, at least."""
+
+
 class RangeView(NamedTuple):
     """One view.
 
     Attributes:
-        pixels: [P] in 0..1. lowest, typical: smallest and median range measured, m.
+        pixels: [P] in 0..1. lowest, typical: smallest and median range measured, m. covered: share of the
+            sectors in which the message has beams.
     """
 
     pixels: np.ndarray
     lowest: float
     typical: float
+    covered: float = 1.0
 
 
-def scan_view(message: Any, mount: Mount, pixels: int, max_range: float, where: str) -> RangeView | None:
+class Extent(NamedTuple):
+    """The directions that a scan covers, half a beam beyond the outer ones.
+
+    Attributes:
+        middle: rad. width: rad, negative for beams in clockwise order. step: rad between beams.
+    """
+
+    middle: float
+    width: float
+    step: float
+
+    @property
+    def ring(self) -> bool:
+        """Whether it is the whole turn."""
+        return bool(abs(self.width) >= 2 * np.pi - 2 * self.step)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last direction, rad; a ring is all around."""
+        if self.ring:
+            return -np.pi, np.pi
+        return self.middle - self.width / 2, self.middle + self.width / 2
+
+    def turned(self, turn: np.ndarray) -> Extent:
+        """As seen from another sensor; turn: [2, 2] from the plane of the one to that of the other."""
+        ahead = turn @ np.array([np.cos(self.middle), np.sin(self.middle)])
+        flip = float(np.sign(np.linalg.det(turn)))
+        return Extent(float(np.arctan2(ahead[1], ahead[0])), self.width * flip, self.step)
+
+    def fits(self, other: Extent) -> bool:
+        """Whether the outer beams have the same directions, in any order."""
+        away = abs(_wrapped(self.middle - other.middle)) + abs(abs(self.width) - abs(other.width)) / 2
+        return bool(away <= 0.51 * max(self.step, other.step))
+
+
+def extent_of(message: Any, where: str) -> Extent:
+    """The extent of a LaserScan.
+
+    Raises:
+        InputError: the angles are not numbers, or there are no beams.
+    """
+    first, step, beams = float(message.angle_min), float(message.angle_increment), len(message.ranges)
+    if not beams:
+        raise InputError(where, "0 beams", "at least one")
+    if not (np.isfinite(first) and np.isfinite(step) and step != 0):
+        raise InputError(where, f"angle_min is {first} and angle_increment {step}", "angles in rad")
+    return Extent(first + step * (beams - 1) / 2, step * beams, abs(step))
+
+
+def wider_extent(first: Extent, extents: Sequence[Extent]) -> Extent | None:
+    """What scans cover together, in the order of the first; None if that is no more than the first covers, or
+    if most scans cover less than `COVERED` of it."""
+    if first.ring or not extents:
+        return None
+    middle, width, step = np.array(extents).T
+    middle, half = _wrapped(middle - first.middle), np.abs(width) / 2
+    low, high = float((middle - half).min()), float((middle + half).max())
+    whole = 2 * np.pi if any(extent.ring for extent in extents) else min(high - low, 2 * np.pi)
+    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < COVERED * whole:
+        return None
+    return Extent(first.middle + (low + high) / 2, float(np.copysign(whole, first.width)), float(step.max()))
+
+
+def scan_view(
+    message: Any,
+    mount: Mount,
+    pixels: int,
+    max_range: float,
+    where: str,
+    shared: Extent | None = None,
+    turn: np.ndarray | None = None,
+) -> RangeView | None:
     """The sectors of a LaserScan; None if no beam was measured.
 
     A whole ring is cut by the direction of its beams in the frame of the robot, counter-clockwise from behind
     it. Any other scan is a fan, cut into groups of consecutive beams in the order of the message.
 
+    Args:
+        shared: the directions that are cut into sectors; None: those of the scan. If the scan has others, its
+            beams go to sectors by their directions, in the order of `shared`.
+        turn: as in `Extent.turned`, if `shared` is of another sensor.
+
     Raises:
         InputError: the angles are not numbers, or there are fewer beams than pixels.
     """
-    ranges, first, step = np.asarray(message.ranges, float), message.angle_min, message.angle_increment
-    if not (np.isfinite(first) and np.isfinite(step) and step != 0):
-        raise InputError(where, f"angle_min is {first} and angle_increment {step}", "angles in rad")
-    if len(ranges) < pixels:
+    ranges, own = np.asarray(message.ranges, float), extent_of(message, where)
+    own = own if turn is None else own.turned(turn)
+    if shared is None and len(ranges) < pixels:
         raise InputError(where, f"{len(ranges)} beams", f"at least one for each of {pixels} sectors")
+    shared = shared or own
     low, high = scan_limits(message)
     measured = ~np.isnan(ranges) & (ranges >= low)
     ranges = np.where(ranges > high, np.inf, ranges)
-    if is_ring(message):
-        angles = first + step * np.arange(len(ranges))
+    if shared.ring:
+        angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
         ahead = mount.rotation[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
-        turn = (np.arctan2(ahead[1], ahead[0]) + np.pi) / (2 * np.pi)  # from behind, of a whole turn
-        sector = np.minimum((turn % 1.0 * pixels).astype(int), pixels - 1)
-        return _view(ranges, measured, sector, pixels, max_range)
-    return _fan_view(ranges, measured, pixels, max_range)
+        at = (np.arctan2(ahead[1], ahead[0]) + np.pi) / (2 * np.pi) % 1.0  # from behind, of a whole turn
+    elif own.fits(shared) and len(ranges) >= pixels:
+        order = slice(None, None, 1 if own.width * shared.width > 0 else -1)
+        return _fan_view(ranges[order], measured[order], pixels, max_range)
+    else:
+        angles = own.middle + own.width * ((np.arange(len(ranges)) + 0.5) / len(ranges) - 0.5)
+        at = _wrapped(angles - shared.middle) / shared.width + 0.5
+    inside = (at >= 0) & (at < 1)
+    sector = np.minimum((at * pixels).astype(int), pixels - 1)[inside]
+    view = _view(ranges[inside], measured[inside], sector, pixels, max_range)
+    there = np.flatnonzero(np.bincount(sector, minlength=pixels))
+    if view is None or len(there) == pixels or own.ring:
+        return view
+    around = pixels if shared.ring else None
+    filled = np.interp(np.arange(pixels), there, view.pixels[there], period=around)
+    return view._replace(pixels=filled, covered=len(there) / pixels)
+
+
+def _wrapped(angle: Any) -> Any:
+    """In [-pi, pi), rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def scan_limits(message: Any) -> tuple[float, float]:
     """The range limits of a LaserScan, m; 0 and inf if those in the message cannot be meant."""
     low, high = float(message.range_min), float(message.range_max)
     return (low, high) if 0 <= low < high else (0.0, np.inf)
-
-
-def is_ring(message: Any) -> bool:
-    """Whether a LaserScan covers the whole turn."""
-    return len(message.ranges) * abs(message.angle_increment) >= 2 * np.pi - 2 * abs(message.angle_increment)
 
 
 def cloud_view(

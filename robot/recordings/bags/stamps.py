@@ -7,14 +7,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import Bag, Topic
+from robot.recordings.bags.bag import SPOILT, Bag, Topic
 from robot.recordings.input_judge import GAP, LEAST_GAP
 from tactile.base.errors import InputError
 
 Clock = Literal["header", "bag"]
 OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
-LEFT_OUT = 0.05
-"""Largest share of a topic's messages that are left out with a warning; one always is."""
 
 Report = Callable[[str], None]
 
@@ -43,6 +41,12 @@ def stamp_of(content: Any, received: int, clock: Clock) -> int:
     return nanoseconds(content.header.stamp) if stamped else received
 
 
+def read_usable(bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]) -> Iterator[Message]:
+    """The messages of a topic that can be used, with what `read` makes of them (see `Bag.usable`)."""
+    for number, received, content, value in bag.usable(topic, read):
+        yield Message(number, stamp_of(content, received, clock), value)
+
+
 def nanoseconds(stamp: Any) -> int:
     """A time message in ns."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
@@ -58,21 +62,18 @@ def in_seconds(stamps: list[int]) -> np.ndarray:
     return np.array([stamp / 10**9 for stamp in stamps])
 
 
-def left_out(
-    where: str, count: int, total: int, first: InputError, report: Report, at: str = ""
-) -> list[InputError]:
-    """Leaves out some messages of a topic: told as a warning, or an error if they are more than `LEFT_OUT`.
+def left_out(where: str, count: int, total: int, first: InputError, report: Report) -> list[InputError]:
+    """Leaves out some messages of a topic: told as a warning, or an error if they are more than `SPOILT`.
 
     Args:
-        count: of the messages left out, of `total`. first: why the first cannot be used. at: its time.
+        count: of the messages left out, of `total`. first: why the first cannot be used.
     """
     if not count:
         return []
-    if count > max(1, LEFT_OUT * total):
+    if count > max(1, SPOILT * total):
         found = f"{first.found} (so in {count} of {total} messages)"
         return [InputError(first.where, found, first.expected, first.cure)]
-    at = f" at {at}" if at else ""
-    report(f"{first.where}{at}: {first.found}; {count} of {total} messages are left out")
+    report(f"{first.where}: {first.found}; {count} of {total} messages are left out")
     return []
 
 
@@ -85,7 +86,7 @@ def usable_stamps(
     Args:
         received: times of receipt, ns; None if they are not known.
 
-    Errors: more stamps than `LEFT_OUT` are 0 or out of order.
+    Errors: more stamps than `SPOILT` are 0 or out of order.
     """
     times = np.array(stamps, np.int64)
     cure = other_clock(clock) if received is None or clock == "header" else ""

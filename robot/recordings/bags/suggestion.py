@@ -24,8 +24,8 @@ from robot.recordings.bags.transforms import BODIES
 
 TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
 """Names of topics and frames with true poses."""
-ROOT = "odom"
-"""Frame whose link to the robot in /tf is odometry."""
+WHEELS = re.compile(r"/?(|.+[/_.-])(odom|odom_combined)")
+"""Frames whose link to the robot in /tf is odometry, and the prefix of the robot."""
 LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
 SECTORS = 18  # of a view by default
 FASTER = 1.2  # times the odometry's rate: views beyond are the samples
@@ -65,10 +65,8 @@ def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any,
     best = _first(bag, "odometry", [topic for topic in others if topic.kind == ODOMETRY])
     best = best or _first(bag, "odometry", others)
     if best is None:
-        for link in bag.links:
-            if not link.fixed and link.total > 1 and link.parent == ROOT and link.child in BODIES:
-                return {"tf": [link.parent, link.child]}, None
-        return None, None
+        robots = robots_of(bag)
+        return ({"tf": list(robots[0])} if robots else None), None
     shape = best.shape
     still = isinstance(shape, MotionShape) and not shape.pose_path > LEAST_PATH
     if best.kind == ODOMETRY and isinstance(shape, MotionShape) and still and shape.twist_path > LEAST_PATH:
@@ -76,14 +74,34 @@ def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any,
     return best.name, best
 
 
+def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
+    """The frames of the odometry and of the body of each robot in /tf; that with a view comes first."""
+    found = []
+    for link in bag.links:
+        named = WHEELS.fullmatch(link.parent)
+        if (
+            named
+            and not link.fixed
+            and link.total > 1
+            and link.child in [named[1] + body for body in (*BODIES, "base")]
+        ):
+            found.append((named[1], (link.parent, link.child)))
+    views = _views(bag)
+    frame = "" if views is None else views[0].frame.lstrip("/")
+    return [pair for prefix, pair in sorted(found, key=lambda each: not frame.startswith(each[0]))]
+
+
 def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
     for kinds in ((SCAN,), (CLOUD,), IMAGES):
         topic = _first(bag, "views", [topic for topic in bag.topics if topic.kind in kinds])
         if topic is not None:
             shape = topic.shape
+            options: dict[str, Any] = {}
             if isinstance(shape, ScanShape) and shape.beams < SECTORS:
-                return topic, {"topic": topic.name, "rows": 1, "columns": shape.beams}
-            return topic, topic.name
+                options = {"rows": 1, "columns": shape.beams}
+            if isinstance(shape, ScanShape) and shape.wider is not None:
+                options["span"] = [round(angle, 4) for angle in shape.wider.span]
+            return topic, {"topic": topic.name, **options} if options else topic.name
     return None
 
 
@@ -104,9 +122,9 @@ def _first(bag: BagDescription, role: str, topics: Sequence[TopicDescription]) -
 
 
 def _headers_serve(topics: Sequence[TopicDescription]) -> bool:
-    """Whether the stamps in the headers are in order and on one clock."""
+    """Whether the stamps in the headers are in order, do not leap where the bag does not, on one clock."""
     stamped = [topic.stamped for topic in topics if topic.stamped is not None]
-    if not all(times.in_order for times in stamped):
+    if not all(times.in_order and not times.leaps - times.backwards for times in stamped):
         return False
     clocks: list[Times] = [topic.stamped or topic.received for topic in topics]
     return not clocks or bool(

@@ -8,8 +8,7 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import TouchTopic
-from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_messages
-from robot.recordings.sanity_checks import nonfinite_errors
+from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_usable
 from robot.sources.input_files import missing_error
 from tactile.base.errors import InputError
 
@@ -30,30 +29,38 @@ def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Se
         raise InputError(where, f"messages of type {topic.kind}", expected)
     numbers, stamps, values = list[int](), list[int](), list[np.ndarray]()
     names, shape, known = config.joints, None, list[str]()
-    for number, stamp, content in read_messages(bag, topic, clock):
-        place = f"{where}, message {number}"
+
+    def read(content: Any, place: str) -> np.ndarray | None:
+        nonlocal names, shape
         if topic.kind == JOINTS:
-            known += [name for name in content.name if name not in known]
+            known.extend(name for name in content.name if name not in known)
             if names and not set(names) <= set(content.name):
-                continue
-            names = names or tuple(content.name)
-            value = _joint_values(content, names, config.use, place)
+                return None
+            value = _joint_values(content, names or tuple(content.name), config.use, place)
         else:
             value = _array_values(content, place)
+        if not np.isfinite(value).all():
+            raise InputError(place, f"touch is {value[~np.isfinite(value)][0]}", "a finite number")
         shape = shape or _shape(content, len(value), config, place)
         if len(value) != shape[0] * shape[1]:
             expected = f"{shape[0]} x {shape[1]}, as in the first message"
             raise InputError(place, f"{len(value)} values", expected)
-        values.append(value)
-        numbers.append(number)
-        stamps.append(stamp)
+        if topic.kind == JOINTS:
+            names = names or tuple(content.name)
+        return value
+
+    for number, stamp, value in read_usable(bag, topic, clock, read):
+        if value is not None:
+            values.append(value)
+            numbers.append(number)
+            stamps.append(stamp)
     if not values:
         absent = next((name for name in names if name not in known), None)
         if absent is not None:
             raise missing_error(where, "joint", absent, known, "recording.topics.touch.joints")
     scaled = (np.array(values) - config.low) / (config.high - config.low)
     series = as_series(where, numbers, stamps, scaled, clock, report)
-    errors = series.errors + nonfinite_errors(series.values, "touch", series.place)
+    errors = list(series.errors)
     outside = float(np.mean((scaled < 0) | (scaled > 1)))
     if outside > 0.5:
         found = f"values from {np.nanmin(values):.4g} to {np.nanmax(values):.4g}, most of them outside"

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import TRANSFORMS, Bag
-from robot.recordings.bags.motions import pose_in_plane, yaw_of
+from robot.recordings.bags.bag import SPOILT, TRANSFORMS, Bag
+from robot.recordings.bags.motions import yaw_of
 from robot.recordings.bags.stamps import (
     Clock,
     Report,
     Series,
     in_seconds,
     nanoseconds,
-    read_messages,
+    read_usable,
     usable_stamps,
 )
 from robot.sources.input_files import missing_error
@@ -56,6 +56,9 @@ class Mount(NamedTuple):
     position: np.ndarray
 
 
+FORWARD = Mount(np.eye(3), np.zeros(3))
+
+
 def read_links(bag: Bag, name: str, clock: Clock) -> Links:
     """All links on /tf or /tf_static, in any namespace; of fixed links (`/tf_static`) the last transform.
 
@@ -67,19 +70,32 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
         if topic.kind not in TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
             continue
         where = f"{bag.path}, {topic.name}"
-        for number, received, content in read_messages(bag, topic, "bag"):
+        spoilt, total = list[InputError](), 0
+        for number, received, content in read_usable(bag, topic, "bag", lambda content, place: content):
             for each in content.transforms:
                 frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
                 move, turn = each.transform.translation, each.transform.rotation
-                pose_in_plane(move, turn, f"{where}, message {number}, {frames[0]} to {frames[1]}")
+                shift = float(move.x), float(move.y), float(move.z)
+                quaternion = float(turn.x), float(turn.y), float(turn.z), float(turn.w)
+                total += 1
+                if not (np.isfinite((*shift, *quaternion)).all() and any(quaternion)):
+                    place = f"{where}, message {number}, {frames[0]} to {frames[1]}"
+                    found = f"the translation is {shift} and the orientation {quaternion}"
+                    spoilt.append(InputError(place, found, "numbers, and a unit quaternion"))
+                    continue
                 link = links.setdefault(frames, Link([], [], [], []))
                 if name == STATIC:
                     for part in link:
                         part.clear()
                 link.stamps.append(nanoseconds(each.header.stamp) if clock == "header" else received)
-                link.shifts.append((float(move.x), float(move.y), float(move.z)))
-                link.turns.append((float(turn.x), float(turn.y), float(turn.z), float(turn.w)))
+                link.shifts.append(shift)
+                link.turns.append(quaternion)
                 link.numbers.append(number)
+        if len(spoilt) > max(1, SPOILT * total) or total == len(spoilt) > 0:
+            raise spoilt[0]
+        if spoilt:
+            count = f"{len(spoilt)} of {total} transforms cannot be used and are left out"
+            bag.warn(f"{where}: {count}; the first: {spoilt[0]}")
     return links
 
 
@@ -115,7 +131,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     """
     bodies, sensor = (body.lstrip("/"),) if body else BODIES, sensor.lstrip("/")
     if sensor in bodies:
-        return Mount(np.eye(3), np.zeros(3))
+        return FORWARD
     links = read_links(bag, STATIC, clock)
     chain = _first_chain(links, bodies, sensor)
     if chain is None:
@@ -127,6 +143,11 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     for frames, down in chain:
         whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
     return Mount(whole[:3, :3], whole[:3, 3])
+
+
+def turn_between(sensor: Mount, other: Mount) -> np.ndarray:
+    """[2, 2] from the plane of a sensor to that of another one."""
+    return (other.rotation.T @ sensor.rotation)[:2, :2]
 
 
 def _first_chain(links: Links, bodies: Sequence[str], sensor: str) -> Chain | None:

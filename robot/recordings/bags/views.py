@@ -11,9 +11,20 @@ from robot.recordings.alignment import range_errors
 from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.config import ViewsTopic
 from robot.recordings.bags.images import IMAGES, grey_image
-from robot.recordings.bags.scans import CLOUD, SCAN, RangeView, cloud_view, is_ring, scan_limits, scan_view
-from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_messages
-from robot.recordings.bags.transforms import Mount, mount_of
+from robot.recordings.bags.scans import (
+    CLOUD,
+    COVERED,
+    SCAN,
+    Extent,
+    RangeView,
+    cloud_view,
+    extent_of,
+    scan_limits,
+    scan_view,
+    wider_extent,
+)
+from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_usable
+from robot.recordings.bags.transforms import FORWARD, Mount, mount_of, turn_between
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.rows import Frame, camera_rows
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
@@ -49,20 +60,23 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         expected = f"one of {', '.join((SCAN, CLOUD, *IMAGES))}"
         raise InputError(where, f"messages of type {topic.kind}", expected)
     numbers, stamps, found = list[int](), list[int](), list[RangeView]()
-    mount, reach, empty = None, config.max_range, 0
-    for number, stamp, content in read_messages(bag, topic, clock):
-        place = f"{where}, message {number}"
-        mount = mount or _mount(bag, config, body, content, clock, report)
-        reach = reach or _reach(content)
-        view = _range_view(topic, content, mount, config, reach, place)
-        if view is None:
-            empty += 1
+    reader, empty, narrow = _RangeReader(bag, topic, config, body, clock), 0, 0
+    for number, stamp, view in read_usable(bag, topic, clock, reader.view):
+        if view is None or view.covered < COVERED:
+            empty, narrow = empty + (view is None), narrow + (view is not None)
             continue
         found.append(view)
         numbers.append(number)
         stamps.append(stamp)
     if empty:
         report(f"{where}: {empty} of {topic.total} messages have no measured range and are no views")
+    if narrow:
+        count = f"{narrow} of {topic.total} messages"
+        report(f"{where}: {count} cover less than half of the sectors and are no views")
+    if wider := reader.wider_span():
+        cure = f"set {KEY}.span: [{wider[0]:.4f}, {wider[1]:.4f}]"
+        report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
+    reach = reader.reach
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
     series = as_series(where, numbers, stamps, pixels, clock, report)
     lowest, typical = (np.array([getattr(view, name) for view in found]) for name in ("lowest", "typical"))
@@ -92,13 +106,21 @@ def read_image_views(
         InputError: an image cannot be decoded, or does not fit the settings.
     """
     where = f"{bag.path}, {topic.name}"
-    numbers, stamps = list[int](), list[int]()
+    numbers, stamps, sizes = list[int](), list[int](), list[tuple[int, ...]]()
+
+    def image_of(content: Any, place: str) -> np.ndarray:
+        grey = grey_image(content, topic.kind, place)
+        sizes.append(grey.shape)
+        if grey.shape != sizes[0]:
+            found = f"{grey.shape[1]} x {grey.shape[0]} pixels"
+            raise InputError(place, found, f"{sizes[0][1]} x {sizes[0][0]}, as in the first image")
+        return grey
 
     def frames() -> Iterator[Frame]:
-        for number, stamp, content in read_messages(bag, topic, clock):
+        for number, stamp, grey in read_usable(bag, topic, clock, image_of):
             numbers.append(number)
             stamps.append(stamp)
-            yield Frame(stamp / 10**9, grey_image(content, topic.kind, f"{where}, message {number}"))
+            yield Frame(stamp / 10**9, grey)
 
     rows = camera_rows(frames(), image, visual_odometry, where)
     views = as_series(where, numbers, stamps, rows.view, clock, report)
@@ -106,29 +128,67 @@ def read_image_views(
     return BagImages(views, motion)
 
 
-def _range_view(
-    topic: Topic, content: Any, mount: Mount, config: ViewsTopic, reach: float, place: str
-) -> RangeView | None:
-    pixels = config.rows * config.columns
-    if topic.kind == SCAN:
-        return scan_view(content, mount, pixels, reach, place)
-    return cloud_view(content, mount, config.heights, pixels, reach, place)
+class _RangeReader:
+    """Views of the messages of a topic; what the settings leave open is as in the first message.
+
+    Attributes:
+        reach: range that becomes 1, m.
+    """
+
+    def __init__(self, bag: Bag, topic: Topic, config: ViewsTopic, body: str, clock: Clock) -> None:
+        self._bag, self._topic, self._config, self._body, self._clock = bag, topic, config, body, clock
+        self.reach = config.max_range
+        self._mounts = dict[str, Mount]()
+        self._first: tuple[str, Extent] | None = None  # sensor, and directions of the sectors
+        self._extents = list[Extent]()
+
+    def view(self, content: Any, place: str) -> RangeView | None:
+        """As `scan_view` and `cloud_view`."""
+        config, sensor, reach = self._config, content.header.frame_id, self.reach or _reach(content)
+        pixels = config.rows * config.columns
+        if self._topic.kind == CLOUD:
+            view = cloud_view(content, self._mount(sensor), config.heights, pixels, reach, place)
+        else:
+            own = extent_of(content, place)
+            first, shared = self._first or (sensor, _extent_of(config.span, own))
+            turn = turn_between(self._mount(sensor), self._mount(first)) if sensor != first else None
+            mount = self._mount(sensor) if shared.ring else FORWARD
+            known = None if self._first is None and config.span is None else shared
+            view = scan_view(content, mount, pixels, reach, place, known, turn)
+            self._first = first, shared
+            if view is not None:
+                self._extents.append(own if turn is None else own.turned(turn))
+        self.reach = reach
+        return view
+
+    def wider_span(self) -> tuple[float, float] | None:
+        """The directions of all scans, if the setting is missing and the first scan covers less."""
+        if self._first is None or self._config.span is not None:
+            return None
+        wider = wider_extent(self._first[1], self._extents)
+        return None if wider is None else wider.span
+
+    def _mount(self, sensor: str) -> Mount:
+        """The mount of a sensor's frame; one that is unknown is reported."""
+        if sensor not in self._mounts:
+            self._mounts[sensor] = self._find_mount(sensor)
+        return self._mounts[sensor]
+
+    def _find_mount(self, sensor: str) -> Mount:
+        if self._config.yaw is not None:
+            c, s = np.cos(self._config.yaw), np.sin(self._config.yaw)
+            return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+        mount = mount_of(self._bag, self._body, sensor, self._clock) if sensor else None
+        if mount is None:
+            frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
+            cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
+            self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
+        return mount or FORWARD
 
 
-def _mount(bag: Bag, config: ViewsTopic, body: str, content: Any, clock: Clock, report: Report) -> Mount:
-    """The mount of the sensor of a message; that of a whole ring must be known or is reported."""
-    if config.yaw is not None:
-        c, s = np.cos(config.yaw), np.sin(config.yaw)
-        return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    sensor = content.header.frame_id
-    mount = mount_of(bag, body, sensor, clock) if sensor else None
-    if mount is not None:
-        return mount
-    if not hasattr(content, "ranges") or is_ring(content):
-        frames = f"from {body or 'the robot'} to {sensor or 'the sensor'}"
-        cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
-        report(f"{bag.path}: no transform {frames} in /tf_static; {cure}")
-    return Mount(np.eye(3), np.zeros(3))
+def _extent_of(span: tuple[float, float] | None, first: Extent) -> Extent:
+    """The directions of the sectors: of the setting, else of the first scan."""
+    return first if span is None else Extent((span[0] + span[1]) / 2, span[1] - span[0], first.step)
 
 
 def _reach(content: Any) -> float:

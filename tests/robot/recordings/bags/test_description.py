@@ -110,6 +110,21 @@ def test_faults_of_a_topic_are_described(tmp_path: Path) -> None:
 RAYS = {"topic": "/scan", "rows": 1, "columns": 4}
 STILL = [odometry(time, 0, 0, 0, (1.0, 0.0, 0.5)) for time in TIMES]
 UNSTAMPED = [odometry(0, 0.1 * row, 0, 0)._replace(time=time) for row, time in enumerate(TIMES)]
+
+
+def framed(parent: str, child: str) -> list[Entry]:
+    """Odometry on /tf alone."""
+    return [
+        tf(time, transform(time, parent, child, 0.1 * row, 0, quaternion(0.0)))
+        for row, time in enumerate(TIMES)
+    ]
+
+
+def seen_by(frame: str) -> Entry:
+    entry = SCANS[0]
+    return entry._replace(fields=dict(entry.fields) | {"header": header(entry.time, frame)})
+
+
 SUGGESTED: dict[str, tuple[list[list[Entry]], dict[str, Any]]] = {
     "scan": ([WHEELS, SCANS, IMAGES, TRUE], {"odometry": "/odom", "views": RAYS, "truth": "/mocap/pose"}),
     "images": ([WHEELS, IMAGES], {"odometry": "/odom", "views": "/image", "samples": "views"}),
@@ -118,6 +133,19 @@ SUGGESTED: dict[str, tuple[list[list[Entry]], dict[str, Any]]] = {
         {"odometry": "/odom", "touch": {"topic": "/skin", "low": 200.0, "high": 919.0}},
     ),
     "frames": ([FRAMES, SCANS], {"odometry": {"tf": ["odom", "base_link"]}, "views": RAYS}),
+    "frames of a robot": (
+        [framed("robot1/odom", "robot1/base_footprint"), SCANS],
+        {"odometry": {"tf": ["robot1/odom", "robot1/base_footprint"]}, "views": RAYS},
+    ),
+    "frames of two": (
+        [framed("a_odom_combined", "a_base"), framed("b/odom", "b/base_link"), [seen_by("b/laser")]],
+        {"odometry": {"tf": ["b/odom", "b/base_link"]}, "views": RAYS},
+    ),
+    "frames of none": ([framed("map", "odom"), framed("a/odom", "b/base_link"), SCANS], {}),
+    "scans that vary": (
+        [WHEELS, SCANS[:1], [scan(TIMES[5], [2.0] * 24, -0.6, 0.05)]],
+        {"odometry": "/odom", "views": {"topic": "/scan", "span": [-0.625, 0.575]}},
+    ),
     "velocities": ([STILL], {"odometry": {"topic": "/odom", "use": "twist"}}),
     "no stamps": ([UNSTAMPED], {"odometry": "/odom", "clock": "bag"}),
     "nothing": ([SCANS], {}),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
+import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import IndexType, Writer
 
 from ratslam.__main__ import main
 from robot.recordings.bags.description import describe_bag
@@ -18,7 +21,7 @@ from robot.recordings.bags.suggestion import suggested_topics
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.source import Source
 from tactile.base.errors import InputError
-from tests.helpers.ros_bags import Entry, header, odometry, pose, scan, tf, transform, write_bag
+from tests.helpers.ros_bags import Entry, header, odometry, pose, quaternion, scan, tf, transform, write_bag
 
 START, STEP = 1_700_000_000_000_000_000, 100_000_000  # ns
 TIMES = [START + STEP * row for row in range(12)]
@@ -213,7 +216,9 @@ def test_touch_that_does_not_fit_is_refused(tmp_path: Path, refused: Refused) ->
     path = written(tmp_path, "mcap", [*WHEELS, *arrays([0.1, 0.2, 0.3])])
     refused(lambda: opened(path, views=None, touch=touch), "/skin, message 0", "3 values", "2 x 2")
     path = written(tmp_path, "ros1", [*WHEELS, *arrays([700, 800, 900, np.nan])])
-    refused(lambda: opened(path, views=None, touch=touch), "values from 700 to 900", "0 to 1", "touch is nan")
+    refused(lambda: opened(path, views=None, touch=touch), "message 0: touch is nan", "in over 5% of its")
+    path = written(tmp_path, "sqlite3", [*WHEELS, *arrays([700, 800, 900, 900])])
+    refused(lambda: opened(path, views=None, touch=touch), "values from 700 to 900", "0 to 1")
 
 
 def test_empty_bags_are_refused(tmp_path: Path, refused: Refused) -> None:
@@ -252,6 +257,151 @@ def test_the_command_refuses_a_bag_and_writes_nothing(
     assert "Traceback" not in err
     assert "cannot be read as a bag" in err
     assert len(err.strip().splitlines()) == 1
+
+
+RING = [scan(time, np.linspace(1 + 0.1 * row, 4, 36), -np.pi, np.pi / 18) for row, time in enumerate(TIMES)]
+MOUNT = tf(START, transform(START, "base_link", "laser", 0, 0, quaternion(np.pi / 2)), topic="/tf_static")
+INDEX: dict[str, dict[str, Any]] = {
+    "unchunked": {"use_chunking": False},
+    "unchunked, out of order": {"use_chunking": False, "disorder": 3},
+    "chunks without index": {"index_types": IndexType.NONE},
+    "chunks, their index only": {"index_types": IndexType.CHUNK},
+    "no summary": {"use_chunking": False, "use_statistics": False, "use_summary_offsets": False,
+                   "repeat_channels": False, "repeat_schemas": False},
+    "no channels in the summary": {"repeat_channels": False},
+    "no types in the summary": {"repeat_schemas": False},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", INDEX)
+def test_an_mcap_is_read_whole_whatever_its_index(case: str, tmp_path: Path) -> None:
+    """The mount of the ring is read while the ring is; messages may be stored out of order."""
+    options = dict(INDEX[case])
+    disorder = options.pop("disorder", 0)
+    folder = written(tmp_path, "mcap", sorted([*WHEELS, *RING, MOUNT], key=lambda entry: entry.time))
+    with (folder / "run.mcap").open("rb") as old, (tmp_path / "copy.mcap").open("wb") as new:
+        out, ids = Writer(new, chunk_size=2000, **options), dict[int, int]()
+        out.start(profile="ros2", library="test")
+        messages = list(make_reader(old).iter_messages())
+        for schema, channel, message in [*messages[disorder:], *messages[:disorder]]:
+            assert schema is not None
+            if channel.id not in ids:
+                kind = out.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.id] = out.register_channel(channel.topic, "cdr", kind, channel.metadata)
+            out.add_message(ids[channel.id], message.log_time, message.data, message.publish_time)
+        out.finish()
+    told: list[str] = []
+    found, right = (list(opened(path, told)) for path in (tmp_path / "copy.mcap", folder))
+    assert [sample.time for sample in found] == [sample.time for sample in right]
+    assert all(np.array_equal(a.reading.view, b.reading.view) for a, b in zip(found, right, strict=True))
+    assert all(sample.reading.view_seen for sample in found)
+    assert told == []
+
+
+METADATA: dict[str, tuple[str, str, str | None]] = {
+    "more than there are": ("message_count: 12", "message_count: 15", "12 of 15 messages were read"),
+    "fewer": ("message_count: 12", "message_count: 3", None),
+    "none": ("message_count: 12", "message_count: 0", None),
+    "no storage": ("storage_identifier: sqlite3", 'storage_identifier: ""', None),
+    "another file": ("- run.db3", "- run.db3", "copy.db3 is not in metadata.yaml"),
+}
+
+
+@pytest.mark.parametrize("case", METADATA)
+def test_what_is_not_read_is_said(case: str, tmp_path: Path) -> None:
+    old, new, expected = METADATA[case]
+    folder = written(tmp_path, "sqlite3")
+    text = (folder / "metadata.yaml").read_text()
+    assert old in text
+    (folder / "metadata.yaml").write_text(text.replace(old, new))
+    if case == "another file":
+        shutil.copy(folder / "run.db3", folder / "copy.db3")
+    told: list[str] = []
+    assert opened(folder / "metadata.yaml", told).length == 12
+    assert (expected is None) == (not told), told
+    assert expected is None or expected in told[0]
+
+
+def container(path: Path, profile: str, encoding: str, schema: str) -> None:
+    with path.open("wb") as file:
+        out = Writer(file)
+        out.start(profile=profile, library="test")
+        kind = out.register_schema("nav_msgs/msg/Odometry", schema, b"{}")
+        out.add_message(out.register_channel("/odom", encoding, kind), 1, b"{}", 1)
+        out.finish()
+
+
+@pytest.mark.parametrize(
+    "case", [("ros1", "ros1", "ros1msg"), ("", "json", "jsonschema"), ("ros2", "json", "jsonschema")]
+)
+def test_other_containers_are_named(case: tuple[str, str, str], tmp_path: Path, refused: Refused) -> None:
+    path = tmp_path / "other.mcap"
+    container(path, *case)
+    for read in (opened, describe_bag):
+        refused(lambda read=read: read(path), f"of profile '{case[0]}' with", case[1], "rosbags-convert")
+
+
+def test_a_cut_mcap_is_called_a_cut_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = written(tmp_path, "mcap") / "run.mcap"
+    whole = file.read_bytes()
+    for share in (0.3, 0.7, 0.95):
+        file.write_bytes(whole[: int(share * len(whole))])
+        for command in (
+            ["doctor", str(file)],
+            ["tools", "recover", str(file), "-o", str(tmp_path / "new.mcap")],
+        ):
+            assert main(command) == 2
+            error = capsys.readouterr().err
+            assert "a ROS 2 bag (MCAP) that is cut off" in error
+            assert "`mcap recover run.mcap" in error
+
+
+def spoilt(name: str, number: int) -> list[Entry]:
+    """Many messages of which one is spoilt."""
+    entry = (RING * 3)[number]
+    fields = {
+        "angles": {"angle_increment": np.nan},
+        "beams": {"ranges": np.zeros(0, np.float32)},
+        "few": {"ranges": np.ones(5, np.float32)},
+    }[name]
+    return [entry._replace(fields=dict(entry.fields) | fields)]
+
+
+@pytest.mark.parametrize("number", [0, 7])
+@pytest.mark.parametrize("case", ["angles", "beams", "few", "cut", "zero turn", "nan turn"])
+def test_one_bad_message_is_left_out(case: str, number: int, tmp_path: Path) -> None:
+    ring, links = list(RING), [MOUNT] * 2
+    if case.endswith("turn"):
+        turn = quaternion(0.0) | {"w": 0.0 if case == "zero turn" else np.nan}
+        links[number > 0] = tf(START, transform(START, "base_link", "laser", 0, 0, turn), topic="/tf_static")
+    elif case != "cut":
+        ring[number : number + 1] = spoilt(case, number)
+    entries = sorted([*links, *WHEELS, *ring], key=lambda entry: entry.time)
+    path = written(tmp_path, "sqlite3", entries)
+    if case == "cut":
+        with sqlite3.connect(path / "run.db3") as base:
+            rows = base.execute("select m.id from messages m join topics t on m.topic_id = t.id "
+                                "where t.name = '/scan' order by timestamp").fetchall()  # fmt: skip
+            base.execute("update messages set data = substr(data, 1, 60) where id = ?", rows[number])
+    told: list[str] = []
+    seen = [bool(sample.reading.view_seen) for sample in opened(path, told)]
+    assert len(told) == 1
+    assert "1 of" in told[0]
+    if case.endswith("turn"):
+        assert seen == [True] * 12
+    else:
+        assert f"message {number}, received at" in told[0] or "less than half of the sectors" in told[0]
+        assert seen == [row != number for row in range(12)]
+    views = suggested_topics(describe_bag(path))["views"]
+    assert views == (
+        {"topic": "/scan", "span": [-3.1416, 3.1416]} if (case, number) == ("few", 0) else "/scan"
+    )
+
+
+def test_many_bad_messages_are_refused(tmp_path: Path, refused: Refused) -> None:
+    ring = [*spoilt("angles", 0), *spoilt("angles", 1), *RING[2:]]
+    path = written(tmp_path, "mcap", [*WHEELS, *ring])
+    refused(lambda: opened(path), "/scan, message 0: angle_min is", "in over 5% of its messages")
 
 
 def damaged(content: bytes, random: np.random.Generator) -> bytes:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.bags.scans import cloud_view, scan_view
+from robot.recordings.bags.scans import Extent, cloud_view, scan_view, wider_extent
 from robot.recordings.bags.transforms import Mount
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import ROS2, built, scan
@@ -66,6 +66,57 @@ def test_a_ring_of_a_sensor_upside_down_is_turned_over() -> None:
     ranges = np.full(360, 4.0)
     ranges[1:90] = 1.0  # to the left of its axis, hence to the right of the robot
     assert sectors(message(ranges, 0.0, step), 4, ROLLED) == pytest.approx([1, 0.25, 1, 1], abs=0.02)
+
+
+SHARED = Extent(0.0, 1.8, 0.1)  # 18 beams over 1.8 rad: six sectors of three
+VARIED: dict[str, tuple[list[int], float, float, list[float]]] = {
+    "as shared": ([1] * 9 + [2] * 9, -0.85, 0.1, [1, 1, 1, 2, 2, 2]),
+    "clockwise": ([1] * 9 + [2] * 9, 0.85, -0.1, [2, 2, 2, 1, 1, 1]),
+    "a turn on": ([1] * 9 + [2] * 9, -0.85 + 2 * np.pi, 0.1, [1, 1, 1, 2, 2, 2]),
+    "twice as many": ([1] * 18 + [2] * 18, -0.875, 0.05, [1, 1, 1, 2, 2, 2]),
+    "a third as many": ([1, 1, 1, 2, 2, 2], -0.75, 0.3, [1, 1, 1, 2, 2, 2]),
+    "without its ends": ([1] * 6 + [2] * 6, -0.55, 0.1, [1, 1, 1, 2, 2, 2]),
+    "shifted": ([1] * 6 + [2] * 12, -0.55, 0.1, [1, 1, 1, 2, 2, 2]),
+    "too narrow": ([2] * 3, 0.05, 0.1, [2] * 6),
+    "a whole turn": ([1] * 32 + [2] * 31, -np.pi, 0.1, [1, 1, 1, 2, 2, 2]),
+}
+
+
+@pytest.mark.parametrize("case", VARIED)
+def test_beams_go_to_sectors_by_direction(case: str) -> None:
+    ranges, first, step, expected = VARIED[case]
+    view = scan_view(message(ranges, first, step), AHEAD, 6, 4.0, "here", SHARED)
+    assert view is not None
+    assert view.pixels == pytest.approx(np.array(expected) / 4, abs=0.01)
+    assert view.covered == pytest.approx(
+        {"without its ends": 4 / 6, "shifted": 5 / 6, "too narrow": 1 / 6}.get(case, 1)
+    )
+
+
+def test_a_part_of_a_ring_has_the_sectors_of_the_ring() -> None:
+    """Where it has no beams, the sectors are between their neighbours'."""
+    step = 2 * np.pi / 36
+    whole = np.repeat([1.0, 2.0, 3.0, 2.0], 9)
+    shared = Extent(0.0, 2 * np.pi, step)
+    part = message(whole[9:], -np.pi / 2 + step / 2, step)
+    view = scan_view(part, AHEAD, 4, 4.0, "here", shared)
+    assert view is not None
+    assert (view.pixels.tolist(), view.covered) == ([0.5, 0.5, 0.75, 0.5], 0.75)
+    rear = scan_view(part, turned(np.pi), 4, 4.0, "here", shared)
+    assert rear is not None
+    assert rear.pixels.tolist() == [0.75, 0.5, 0.5, 0.5]
+
+
+def test_the_span_of_scans_is_what_they_cover_together() -> None:
+    first = Extent(0.0, -1.0, 0.01)
+    assert wider_extent(first, [first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
+    wider = wider_extent(first, [first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
+    assert wider is not None
+    assert wider.span == pytest.approx((0.7, -0.5))
+    ring = wider_extent(Extent(0.0, 4.0, 0.01), [Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
+    assert ring is not None
+    assert ring.span == (-np.pi, np.pi)
+    assert wider_extent(first, [first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
 
 
 def test_beams_without_a_measurement_do_not_count() -> None:
