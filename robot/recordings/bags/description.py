@@ -36,7 +36,7 @@ class Times(NamedTuple):
     Attributes:
         first, last: s. rate_hz: median; 0 with fewer than two different times. gap, gap_at: longest pause, s,
             and the time at which it begins. zero, repeated, backwards: messages with a stamp of 0, with the
-            stamp of the message before, and with an earlier one. count: N. leaps: steps that leap where the
+            stamp of the message before, and with an earlier one. total: N. leaps: steps that leap where the
             other clock does not. ahead: median time before the other clock, s.
     """
 
@@ -48,14 +48,14 @@ class Times(NamedTuple):
     zero: int
     repeated: int
     backwards: int
-    count: int = 0
+    total: int = 0
     leaps: int = 0
     ahead: float = 0.0
 
     @property
     def in_order(self) -> bool:
         """Whether the messages can be read by this clock; a few are left out."""
-        return max(self.zero, self.backwards) <= max(1, SPOILT * self.count)
+        return max(self.zero, self.backwards) <= max(1, SPOILT * self.total)
 
 
 class ScanShape(NamedTuple):
@@ -262,7 +262,7 @@ def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
         zero=int((times == 0).sum()),
         repeated=int((steps == 0).sum()),
         backwards=int((steps < 0).sum()),
-        count=len(times),
+        total=len(times),
         leaps=int(leaps(times, others).sum()),
         ahead=float(np.median(times - others)) / 1e9,
     )

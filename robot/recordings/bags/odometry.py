@@ -10,7 +10,7 @@ import numpy as np
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
 from robot.recordings.bags.motions import PARTS, POSES, TWISTS, pose_in_plane, twist_in_plane
-from robot.recordings.bags.stamps import Clock, Report, Series, as_series, stamp_of
+from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors
 from robot.sources.odometry import from_poses, from_velocities
@@ -129,16 +129,17 @@ def _read_series(
 
     for number, received, content, value in bag.usable(topic, read):
         if value is not None:
-            rows.append((number, stamp_of(content, received, clock), received, _frames_of(content)))
+            stamps = (stamp_of(content, received, each) for each in (clock, OTHER_CLOCK[clock]))
+            rows.append((number, *stamps, _frames_of(content)))
             kept.append(value)
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
-    numbers, stamps, receipts, pairs = ([row[k] for row in rows] for k in range(4))
+    numbers, times, others, pairs = ([row[k] for row in rows] for k in range(4))
     errors = _frame_errors(where, numbers, pairs, role)
     if not errors:
         faults.tell(where, len(rows), report)
     values = np.array(kept).reshape(-1, 3)
-    series = as_series(where, numbers, stamps, values, clock, report, receipts)
+    series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body
 

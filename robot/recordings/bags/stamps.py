@@ -78,20 +78,19 @@ def left_out(where: str, count: int, total: int, first: InputError, report: Repo
 
 
 def usable_stamps(
-    stamps: list[int], where: str, clock: Clock, report: Report, received: list[int] | None = None
+    stamps: list[int], where: str, clock: Clock, report: Report, other: list[int] | None = None
 ) -> tuple[np.ndarray, list[InputError]]:
     """The messages to use: [M] bool. Those that repeat a stamp, a few with stamp 0 and a few out of order are
     left out and reported.
 
     Args:
-        received: times of receipt, ns; None if they are not known.
+        other: times by the other clock, ns; None if they are not known.
 
     Errors: more stamps than `SPOILT` are 0 or out of order.
     """
     times = np.array(stamps, np.int64)
-    cure = other_clock(clock) if received is None or clock == "header" else ""
-    if received is not None and (np.diff(received) < 0).any():
-        cure = ""
+    worse = clock == "bag" if other is None else bool((np.diff(other) < 0).any())
+    cure = "" if worse else other_clock(clock)
     errors, use = list[InputError](), times != 0
     if not use.all():
         number = int((~use).argmax())
@@ -164,7 +163,7 @@ def as_series(
     values: np.ndarray,
     clock: Clock,
     report: Report,
-    received: list[int] | None = None,
+    other: list[int] | None = None,
 ) -> Series:
     """The values [M, ...] of messages with usable stamps.
 
@@ -173,7 +172,7 @@ def as_series(
     """
     if not stamps:
         raise InputError(where, "no message that can be used", "at least one")
-    use, errors = usable_stamps(stamps, where, clock, report, received)
-    leap = received is not None and leaps(np.array(stamps)[use], np.array(received)[use]).any()
+    use, errors = usable_stamps(stamps, where, clock, report, other)
+    leap = other is not None and leaps(np.array(stamps)[use], np.array(other)[use]).any()
     cure = other_clock(clock) if leap else ""
     return Series(where, in_seconds(stamps)[use], values[use], np.array(numbers)[use], errors, cure)
