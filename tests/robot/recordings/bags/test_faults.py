@@ -186,7 +186,7 @@ def test_numbers_that_cannot_be_are_refused(tmp_path: Path, refused: Refused) ->
     path = written(tmp_path, "sqlite3-message", [*WHEELS[:3], bad[0], *WHEELS[4:]])
     assert opened(path, told, views=None).length == 11
     assert "message 3" in told[0]
-    assert "1 of 12 messages are left out" in told[0]
+    assert "1 of 12 messages cannot be used and are left out" in told[0]
     zero = pose(0.0, 0.0, 0.0) | {"orientation": {}}
     poses = [
         Entry("/pose", "geometry_msgs/msg/PoseStamped", TIMES[0], {"header": header(START), "pose": zero})
