@@ -25,7 +25,7 @@ from ratslam.cli import (
     studies,
     tools,
 )
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, check_output
 from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError
 
@@ -51,6 +51,7 @@ def main(argv: list[str] | None = None) -> int:
         return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     try:
+        check_output(arguments)
         code = arguments.command(arguments)
         sys.stdout.flush()
         return code

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, add_set, prepare_jax
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file
 
@@ -63,7 +63,6 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     output = arguments.output
     if output is None or not diagnosis.config:
         return diagnosis
-    require_new_file(output)
     first = f"# Reads {arguments.path}; written by `python -m ratslam doctor`.\n"
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))

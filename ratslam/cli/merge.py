@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from ratslam.cli.common import Commands, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, prepare_jax
 
 
 def add_commands(commands: Commands) -> None:
@@ -25,7 +25,6 @@ def add_commands(commands: Commands) -> None:
 
 
 def _merge(arguments: argparse.Namespace) -> int:
-    require_new_file(arguments.output)
     prepare_jax()
     from ratslam.pipeline.merge import merge_maps
 

@@ -14,6 +14,7 @@ from ratslam.cli.common import (
     INPUT_ERROR,
     Commands,
     add_config,
+    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
@@ -63,7 +64,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
     study.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
+        "-o", "--output", type=Path, metavar="DIR", check=own_folder("runs.jsonl", "growth.jsonl", "sets"),
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
     study.add_argument(

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 VIEWER = "127.0.0.1:9876"
 """Address of a viewer with its default port."""
@@ -44,7 +45,8 @@ def prepare_target(text: str) -> str:
             "--rerun", "rerun is not installed", "the extra 'view'", "pip install 'ratslam[view]'"
         )
     if text.endswith(".rrd"):
-        return _new_file(Path(text))
+        require_new_file(Path(text))
+        return os.path.abspath(text)
     if text == START:
         _start_viewer()
         return VIEWER
@@ -70,14 +72,6 @@ def split_address(text: str) -> tuple[str, int]:
     if not loopback or not 0 < number < 1 << 16:
         raise InputError("--rerun", repr(text), EXPECTED, "reach another machine through an ssh tunnel")
     return host, number
-
-
-def _new_file(path: Path) -> str:
-    if path.exists():
-        raise InputError(str(path), "exists already", "a new file", "choose another name or move it")
-    if not path.absolute().parent.is_dir():
-        raise InputError(str(path.parent), "no such folder", "a folder for the new file")
-    return str(path.absolute())
 
 
 def _start_viewer() -> None:

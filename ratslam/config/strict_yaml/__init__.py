@@ -21,6 +21,8 @@ from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=Settings)
 
+SCHEMA_START = rb'{\s+"\$schema": "[^"]*",\s+"title": "RunConfig",\s'
+"""Pattern of the beginning of the schema of configurations."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
@@ -132,7 +134,8 @@ def dump_data(data: dict[str, Any]) -> str:
 
 def schema(model: type[BaseModel]) -> dict[str, Any]:
     """The JSON schema by which an editor completes and checks a configuration file."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+    first = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": model.__name__}
+    return first | model.model_json_schema()
 
 
 def _escape(data: Any) -> Any:
