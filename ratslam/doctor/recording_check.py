@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import dump_data, parse, validate
+from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
+from ratslam.pipeline.map_settings import differing_settings
+from ratslam.pipeline.saved_map import SavedMap
+from ratslam.pipeline.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
 from ratslam.pipeline.source import open_source
 from robot.recordings.unit_check import MotionTrack, TypicalMotion, typical_motion
 from robot.sources.registry import SOURCES
@@ -46,8 +51,11 @@ class Contents(NamedTuple):
     whiskers: int
 
 
-def diagnose_recording(path: Path) -> Diagnosis:
+def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     """What a recording is, whether it can be read, and the configuration that reads it.
+
+    Args:
+        like: a map; the configuration then has its view, cells and method. Another sensor is a fault.
 
     Raises:
         InputError: it is missing, or of no known format.
@@ -66,17 +74,41 @@ def diagnose_recording(path: Path) -> Diagnosis:
     if "visual_odometry" in found.recording:
         sections["presets"] = ["visual_odometry"]
     try:
+        if like is not None:
+            fov = found.field_of_view
+            sections = _alike(sections if fov is None else sections | {"recall": {"sector_fov": fov}}, like)
         with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
             contents = summarise(source)
     except InputError as error:
         return Diagnosis(found.what, found.table, found.notes, (*found.faults, *str(error).splitlines()))
-    if not contents.whiskers:
+    if not contents.whiskers and like is None:
         cell = cell_size(contents.step, found.max_range)
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
         if found.field_of_view is not None:
             sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
     notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
     return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
+
+
+def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
+    """The sections with all settings in which the view, the cells or the method of a map differ from theirs.
+
+    Raises:
+        InputError: the recording is of another sensor.
+    """
+    name = f"doctor --like {like.path}"
+    document = override(parse(dump_data(sections), name), [f"backend={like.config.backend}"])
+    given = validate(document, RunConfig)
+    check_same_fov(str(like.path), like.config, given)
+    with open_source(given) as source:
+        config = complete(given, source)
+        found = differences(like.sensor, sensor_of(config, source))
+    settings = settings_of_map(found)
+    if settings is None:
+        check_same_sensor(str(like.path), like.sensor, sensor_of(config, source))
+    method = differing_settings([like.config, config])
+    settings = {key: both[0] for key, both in method.items()} | (settings or {})
+    return override(document, [f"{key}={json.dumps(value)}" for key, value in settings.items()]).data
 
 
 def diagnose_registered(path: Path) -> Diagnosis | None:

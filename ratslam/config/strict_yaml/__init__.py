@@ -23,6 +23,8 @@ Model = TypeVar("Model", bound=Settings)
 
 SCHEMA_START = rb'{\s+"\$schema": "[^"]*",\s+"title": "RunConfig",\s'
 """Pattern of the beginning of the schema of configurations."""
+_ALONE: dict[KeyPath, str] = {("recording", "topics"): "topic"}
+"""Sections in which a text stands for a section with this key alone."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
@@ -104,6 +106,9 @@ def open_path(data: Any, key: str, where: str) -> tuple[Any, KeyPath]:
     path: KeyPath = ()
     for name in key.split("."):
         if path:
+            alone = _ALONE.get(path[:-1])
+            if alone is not None and isinstance(data.get(path[-1]), str):
+                data[path[-1]] = {alone: data[path[-1]]}
             data = _open_section(data, path[-1])
         path += (_step(data, name, where, path),)
     return data, path
