@@ -72,7 +72,7 @@ def _describe(error: OSError) -> str:
     where = "the output: " if _is_of_printing(error) else f"{error.filename}: " if error.filename else ""
     full = "free some space or choose another folder with -o"
     cure = full if error.errno in FULL else "check the path and its permissions"
-    cures = [] if error.errno == errno.EPIPE else [cure]
+    cures = [cure] if error.errno in FULL or error.filename else []
     return where + "; ".join([error.strerror or str(error), *getattr(error, "__notes__", ()), *cures])
 
 

@@ -49,8 +49,12 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     add_config(emulate)
     emulate.add_argument(
-        "--host", metavar="HOST", help="loopback address to listen on (default: from the configuration)"
+        "--host", metavar="HOST", help="address to listen on (default: from the configuration)"
     )
+    emulate.add_argument(
+        "--open-to-network", action="store_true",
+        help="listen on any address: anyone who reaches it may command, fault or stop the emulator",
+    )  # fmt: skip
     emulate.add_argument("--ur-host", metavar="HOST", help="address of the arm that carries the head")
 
 
@@ -85,7 +89,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     config, session = _read_live_config(arguments, head_address=None)
     from robot.live.emulator_config import arm_emulator_config, create_emulator_config, head_emulator_config
 
-    head = config.touch.head
+    head, opened = config.touch.head, {"open_to_network": arguments.open_to_network}
     if (arguments.device == "create") != (session.create is not None):
         found = "that of a Create" if session.create else "that of an arm"
         cure = "the packaged `live_create` is for `create`, `live_maze` for `ur10` and `head`"
@@ -94,15 +98,16 @@ def _emulate(arguments: argparse.Namespace) -> int:
         if session.create is not None:
             from robot.emulators.create import serve as serve_create
 
-            serve_create(create_emulator_config(session.create, arguments.host or session.head.address))
+            address = arguments.host or session.head.address
+            serve_create(create_emulator_config(session.create, address, **opened))
         elif arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
-            serve(arm_emulator_config(session, head, arguments.host))
+            serve(arm_emulator_config(session, head, arguments.host).model_copy(update=opened))
         else:
             from robot.emulators.head import serve as serve_head
 
-            serve_head(head_emulator_config(session, head, arguments.host))
+            serve_head(head_emulator_config(session, head, arguments.host).model_copy(update=opened))
     except KeyboardInterrupt:
         return INTERRUPTED
     return 0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.config.completion import complete
+from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
@@ -60,6 +61,10 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     Raises:
         InputError: it is missing, or of no known format.
     """
+    refuse_other_files(path, "a recording", (RECORDING, FOLDER))
+    if path.suffix.lower() in (".yaml", ".yml"):
+        cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
+        raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
     try:
         found = describe_file(path)
     except InputError:

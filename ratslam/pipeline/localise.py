@@ -13,6 +13,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.atlas.localiser import Localiser
 from ratslam.backends.config import Start
 from ratslam.backends.registry import LOCALISING
+from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.config.run_config import RunConfig, SourceConfig
 from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.core.localisation import Localisation
@@ -127,6 +128,7 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     if is_map(file):
         cure = "give the recording or the configuration whose poses are to be found"
         raise InputError(str(file), "a map, which is no recording", "a recording of the map's sensor", cure)
+    refuse_other_files(file, "a recording or a configuration", (RECORDING, FOLDER))
     like, file = saved.config.recording, file.resolve()
     if like is not None and like.topics is None and (file.is_dir() or file.suffix in (".bag", ".db3")):
         cure = f"`python -m ratslam doctor {file} --like {saved.path} -o FILE.yaml`, and localise FILE.yaml"

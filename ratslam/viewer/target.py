@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import signal
 import socket
@@ -13,6 +12,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
+from robot.emulators.listening import is_loopback
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
 
@@ -64,12 +64,8 @@ def split_address(text: str) -> tuple[str, int]:
         InputError: it is not one.
     """
     host, _, port = text.rpartition(":")
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-        number = int(port)
-    except ValueError:
-        loopback, number = False, 0
-    if not loopback or not 0 < number < 1 << 16:
+    number = int(port) if port.isdecimal() else 0
+    if not is_loopback(host) or not 0 < number < 1 << 16:
         raise InputError("--rerun", repr(text), EXPECTED, "reach another machine through an ssh tunnel")
     return host, number
 

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from ratslam.config.other_files import refuse_other_files
 from ratslam.config.strict_yaml.document import Document, KeyPath, Place, describe, join_keys
 from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.config.strict_yaml.reader import Reader
@@ -39,6 +40,7 @@ def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Docum
         InputError: the file cannot be read or is not strict YAML; with file, line and column.
     """
     name = os.fspath(path)
+    refuse_other_files(Path(name))
     try:
         with Path(name).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
