@@ -27,7 +27,7 @@ from ratslam.cli import (
 )
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, check_output
 from tactile.base.atomic_write import FULL
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, printable
 
 MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
 """The commands, in the order of the help."""
@@ -56,9 +56,9 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except InputError as error:
-        print("\n".join(f"ratslam: error: {line}" for line in str(error).splitlines()), file=sys.stderr)
+        print("\n".join(f"ratslam: error: {line}" for line in str(error).split("\n")), file=sys.stderr)
     except OSError as error:
-        print(f"ratslam: error: {_describe(error)}", file=sys.stderr)
+        print(f"ratslam: error: {printable(_describe(error))}", file=sys.stderr)
         if _is_of_printing(error):
             _leave_output()
     except KeyboardInterrupt:

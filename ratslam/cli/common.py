@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import shtab
 
 from ratslam.config.packaged import packaged_configs
 from ratslam.core.xla_flags import add_xla_flags
+from tactile.base.errors import printable
 from tactile.base.new_file import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
@@ -178,6 +180,11 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     return load_config(arguments.config, arguments.set)
 
 
+def tell(sentence: str) -> None:
+    """Prints one sentence beside the results."""
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr, flush=True)
+
+
 def prepare_jax(keep_compiled: bool = True) -> None:
     """Sets the variables that JAX reads at import: `ratslam.core.xla_flags`, and a disk cache.
 
@@ -185,6 +192,7 @@ def prepare_jax(keep_compiled: bool = True) -> None:
         keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
             sessions in one process.
     """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what fails is raised; a slow compilation is no bug
     os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config, tell
 from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
 from robot.drivers.process_priority import put_last
 from tactile.base.errors import InputError
@@ -74,12 +74,12 @@ def _live(arguments: argparse.Namespace) -> int:
         config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
     with monitor() as start_monitor:
-        ended, card = run_live_session(config, directory, _print, armed=start_monitor, view=target)
+        ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
     if card is not None:
         print(render_scorecard(card))
         print(f"\n{render_health(card)}".rstrip())
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
-    _print(str(ended))
+    tell(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED
     return 0 if ended.outcome.planned else INPUT_ERROR
@@ -129,7 +129,7 @@ def monitor() -> Iterator[Callable[[Path], None]]:
         # A session of its own: it gets no Ctrl-C.
         processes[directory] = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
         put_last(processes[directory].pid)
-        _print(f"{directory}/watch.png shows the map while it grows")
+        tell(f"{directory}/watch.png shows the map while it grows")
 
     try:
         yield start
@@ -158,7 +158,3 @@ def _read_live_config(
         cure = "`live_maze` and `live_create` are examples; `run` maps recordings and simulations"
         raise InputError(f"{arguments.config}: live", "missing", "settings of a live session", cure)
     return config, config.live
-
-
-def _print(line: str) -> None:
-    print(f"ratslam: {line}", file=sys.stderr, flush=True)

@@ -10,7 +10,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax
+from ratslam.cli.common import Commands, prepare_jax, tell
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def _read(path: Path) -> SavedMap:
     prepare_jax()
     from ratslam.pipeline.saved_map import read_map
 
-    return read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
+    return read_map(path, tell)
 
 
 def _info(arguments: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax
+from ratslam.cli.common import Commands, prepare_jax, tell
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
 
@@ -56,7 +56,7 @@ def _path(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.map_way import draw_map_way, find_map_way
     from ratslam.pipeline.saved_map import read_map
 
-    saved = read_map(arguments.map, lambda line: print(f"ratslam: {line}", file=sys.stderr))
+    saved = read_map(arguments.map, tell)
     made = saved.open_session().map
     try:
         way = find_map_way(made, saved, start, goal, arguments.mode)

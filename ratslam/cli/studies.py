@@ -18,6 +18,7 @@ from ratslam.cli.common import (
     positive_integer,
     prepare_jax,
     read_config,
+    tell,
 )
 from ratslam.config.packaged import find_config
 from tactile.base.errors import InputError
@@ -295,6 +296,7 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
+    tell(f"runs {arguments.cycles} cycles with each cheaper setting: this takes ten minutes or more")
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)

@@ -62,7 +62,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
         InputError: it is missing, or of no known format.
     """
     refuse_other_files(path, "a recording", (RECORDING, FOLDER))
-    if path.suffix.lower() in (".yaml", ".yml"):
+    if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
         raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
     try:

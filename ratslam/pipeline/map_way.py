@@ -46,6 +46,9 @@ def find_map_way(
     """
     motion = MotionConfig()
     graph = travel_graph(made.graph(), Travel(motion.speed, motion.turn_rate))
+    if not len(graph):
+        found = f"a map of `backend: {saved.config.backend}` without experiences, which a way leads along"
+        raise InputError(str(saved.path), found, "a map of `backend: recall` or `backend: classic`")
     if start is None:
         first = (
             nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
