@@ -27,7 +27,8 @@ def main() -> None:
     try:
         serve(config)
     except InputError as error:
-        sys.exit(str(error))
+        print(error, file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         pass
 

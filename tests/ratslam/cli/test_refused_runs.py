@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 
 import numpy as np
 import pytest
@@ -68,6 +69,19 @@ def test_what_is_no_configuration_is_named_with_what_reads_it(capsys, tmp_path, 
     shutil.copy(ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz", tmp_path / "map.npz")
     shutil.copy(ROOT / "tests" / "golden" / "a_square3.npz", tmp_path / "trace.npz")
     refuses(capsys, [command, tmp_path / name], f"error: {tmp_path / name}: {message}")
+
+
+def test_an_emulator_listens_on_loopback_and_where_nothing_does(capsys, tmp_path, loopback, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for device, config in (("ur10", "live_maze"), ("head", "live_maze"), ("create", "live_create")):
+        for host in ("0.0.0.0", "192.0.2.1"):
+            command = ["emulate", device, config, "--host", host]
+            refuses(capsys, command, f"'{host}': an address that others may reach", "--open-to-network")
+        refuses(capsys, [*command, "--open-to-network"], "192.0.2.1:30", "cannot listen")
+    for device, port in (("ur10", 30004), ("head", 30100)):
+        with socket.create_server((loopback, port)):
+            words = f"{loopback}:{port}: something listens there already"
+            refuses(capsys, ["emulate", device, "live_maze", "--host", loopback], words)
 
 
 def test_a_seed_of_a_simulation_is_not_for_a_recording(capsys):
