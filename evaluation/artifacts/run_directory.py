@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
@@ -84,7 +85,8 @@ def read_scorecard(path: Path) -> Scorecard:
     except FileNotFoundError:
         raise InputError(str(file), "no such file", "the directory of a scored run") from None
     except ValueError as error:
-        raise InputError(str(file), f"not a scorecard ({error})", "the scorecard.json of a run") from None
+        cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise InputError(str(file), f"not a scorecard ({cause})", "the scorecard.json of a run") from None
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")

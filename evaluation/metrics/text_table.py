@@ -11,6 +11,8 @@ import numpy as np
 
 from tactile.base.errors import InputError
 
+LONGEST = 80
+"""Characters of a bad row that an error shows."""
 Columns = Mapping[str, tuple[str, ...]]
 """Columns to read, in order: name -> alternative names in a header (compared in lower case)."""
 
@@ -46,7 +48,7 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
             rows.append([row[place] for place in where])
             at.append(number)
         elif whole:
-            found = f"'{' '.join(cells)}'"
+            found = f"'{' '.join(cells)[:LONGEST]}'"
             raise InputError(f"{path}:{number}", found, f"{len(names)} finite numbers: {' '.join(names)}")
     if not rows:
         raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")

@@ -25,9 +25,9 @@ from ratslam.cli import (
     studies,
     tools,
 )
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, check_output
 from tactile.base.atomic_write import FULL
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, printable
 
 MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
 """The commands, in the order of the help."""
@@ -51,13 +51,14 @@ def main(argv: list[str] | None = None) -> int:
         return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     try:
+        check_output(arguments)
         code = arguments.command(arguments)
         sys.stdout.flush()
         return code
     except InputError as error:
-        print("\n".join(f"ratslam: error: {line}" for line in str(error).splitlines()), file=sys.stderr)
+        print("\n".join(f"ratslam: error: {line}" for line in str(error).split("\n")), file=sys.stderr)
     except OSError as error:
-        print(f"ratslam: error: {_describe(error)}", file=sys.stderr)
+        print(f"ratslam: error: {printable(_describe(error))}", file=sys.stderr)
         if _is_of_printing(error):
             _leave_output()
     except KeyboardInterrupt:
@@ -71,7 +72,7 @@ def _describe(error: OSError) -> str:
     where = "the output: " if _is_of_printing(error) else f"{error.filename}: " if error.filename else ""
     full = "free some space or choose another folder with -o"
     cure = full if error.errno in FULL else "check the path and its permissions"
-    cures = [] if error.errno == errno.EPIPE else [cure]
+    cures = [cure] if error.errno in FULL or error.filename else []
     return where + "; ".join([error.strerror or str(error), *getattr(error, "__notes__", ()), *cures])
 
 

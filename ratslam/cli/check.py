@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, positive_integer, prepare_jax
+from ratslam.cli.common import Commands, positive_integer, prepare_jax, tell
 
 if TYPE_CHECKING:
     from ratslam.checks.common import Result
@@ -48,6 +48,8 @@ def add_commands(commands: Commands) -> None:
 def _backend(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.checks.backend import check_backend
+
+    tell("this takes a minute or two, most of it compilation, and several on a busy machine")
 
     return _report(arguments, check_backend(arguments.name, arguments.set))
 

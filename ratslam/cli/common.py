@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,8 @@ import shtab
 
 from ratslam.config.packaged import packaged_configs
 from ratslam.core.xla_flags import add_xla_flags
-from tactile.base.new_file import require_new_file as require_new_file
+from tactile.base.errors import printable
+from tactile.base.new_file import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -33,19 +35,49 @@ class CommandParser(argparse.ArgumentParser):
 
     Attributes:
         group, help: heading and line in the help of the program.
+        arguments: its own, in their order. commands: its commands, None if it has none.
     """
 
     group = help = ""
+    commands: Commands | None = None
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.arguments: list[argparse.Action] = []
         super().__init__(*arguments, **options)
         self._negative_number_matcher = NEGATIVE
 
-    def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
+    def add_argument(
+        self, *names: Any, check: Callable[[Path], None] = require_new_file, **options: Any
+    ) -> argparse.Action:
+        """Adds an argument; `check` is called with the value of `-o` before the command (`check_output`)."""
         action = super().add_argument(*names, **options)
+        self.arguments.append(action)
+        if "-o" in names:
+            self.set_defaults(check=check)
         if options.get("type") is Path:
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
+
+
+def require_new_folder(path: Path) -> None:
+    """Checks a folder that is made with those above it."""
+    require_new_file(path, parents=True)
+
+
+def own_folder(*marks: str) -> Callable[[Path], None]:
+    """The check of a folder that a command makes, or goes on with if one of the marks is in it."""
+    return lambda path: require_own_folder(path, marks)
+
+
+def check_output(arguments: argparse.Namespace) -> None:
+    """Refuses an output that is there already, or cannot be made, before the work of any command.
+
+    Raises:
+        InputError: as the `check` of its option.
+    """
+    output = getattr(arguments, "output", None)
+    if output is not None:
+        arguments.check(output)
 
 
 class Commands:
@@ -60,6 +92,8 @@ class Commands:
             required=True, metavar="COMMAND", title="commands", parser_class=CommandParser
         )
         self.parsers: dict[str, CommandParser] = self._subparsers.choices
+        if isinstance(parser, CommandParser):
+            parser.commands = self
 
     def add(
         self,
@@ -146,6 +180,11 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     return load_config(arguments.config, arguments.set)
 
 
+def tell(sentence: str) -> None:
+    """Prints one sentence beside the results."""
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr, flush=True)
+
+
 def prepare_jax(keep_compiled: bool = True) -> None:
     """Sets the variables that JAX reads at import: `ratslam.core.xla_flags`, and a disk cache.
 
@@ -153,6 +192,7 @@ def prepare_jax(keep_compiled: bool = True) -> None:
         keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
             sessions in one process.
     """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what fails is raised; a slow compilation is no bug
     os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return

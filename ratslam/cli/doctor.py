@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, add_set, prepare_jax
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file
 
@@ -29,6 +29,11 @@ def add_commands(commands: Commands) -> None:
     doctor.add_argument(
         "-o", "--output", type=Path, metavar="YAML", help="write the configuration that reads the recording"
     )
+    doctor.add_argument(
+        "--like", type=Path, metavar="MAP",
+        help="with -o: a run directory or map of the same sensor, whose view, cells and method to take, so "
+        "that the recording can be localised in it or continue it",
+    )  # fmt: skip
     doctor.add_argument(
         "--live",
         action="store_true",
@@ -59,11 +64,18 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     from ratslam.config.strict_yaml import dump_data
     from ratslam.doctor.recording_check import diagnose_recording
 
-    diagnosis = diagnose_recording(arguments.path)
+    like = None
+    if arguments.like is not None:
+        from ratslam.backends.registry import LOCALISING
+        from ratslam.pipeline.saved_map import read_map
+
+        like = read_map(arguments.like)
+        if like.config.backend in LOCALISING.values() and like.config.localise.map is not None:
+            like = read_map(like.config.localise.map)
+    diagnosis = diagnose_recording(arguments.path, like)
     output = arguments.output
     if output is None or not diagnosis.config:
         return diagnosis
-    require_new_file(output)
     first = f"# Reads {arguments.path}; written by `python -m ratslam doctor`.\n"
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))

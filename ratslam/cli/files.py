@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from ratslam.cli.common import Commands
+from ratslam.cli.common import Commands, tell
 
 
 def add_commands(commands: Commands) -> None:
@@ -36,7 +35,7 @@ def _export(arguments: argparse.Namespace) -> int:
     export_run(
         arguments.run,
         arguments.output,
-        lambda text: print(f"ratslam: warning: {text}", file=sys.stderr),
+        lambda text: tell(f"warning: {text}"),
         SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
     )
     print(f"{arguments.output}: written")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, add_set, prepare_jax
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file
 
@@ -32,9 +32,6 @@ def add_commands(commands: Commands) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    output: Path | None = arguments.output
-    if output is not None:
-        require_new_file(output)
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
@@ -45,6 +42,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     print(render_rig(rig))
     if not rig.quantities and not rig.settings:
         raise InputError(str(arguments.record), "nothing that tells of the rig", "true poses or whiskers")
+    output: Path | None = arguments.output
     if output is not None:
         text = rig_file(rig, str(arguments.record))
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config, tell
 from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
 from robot.drivers.process_priority import put_last
 from tactile.base.errors import InputError
@@ -49,8 +49,12 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     add_config(emulate)
     emulate.add_argument(
-        "--host", metavar="HOST", help="loopback address to listen on (default: from the configuration)"
+        "--host", metavar="HOST", help="address to listen on (default: from the configuration)"
     )
+    emulate.add_argument(
+        "--open-to-network", action="store_true",
+        help="listen on any address: anyone who reaches it may command, fault or stop the emulator",
+    )  # fmt: skip
     emulate.add_argument("--ur-host", metavar="HOST", help="address of the arm that carries the head")
 
 
@@ -70,12 +74,12 @@ def _live(arguments: argparse.Namespace) -> int:
         config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
     with monitor() as start_monitor:
-        ended, card = run_live_session(config, directory, _print, armed=start_monitor, view=target)
+        ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
     if card is not None:
         print(render_scorecard(card))
         print(f"\n{render_health(card)}".rstrip())
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
-    _print(str(ended))
+    tell(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED
     return 0 if ended.outcome.planned else INPUT_ERROR
@@ -85,7 +89,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
     config, session = _read_live_config(arguments, head_address=None)
     from robot.live.emulator_config import arm_emulator_config, create_emulator_config, head_emulator_config
 
-    head = config.touch.head
+    head, opened = config.touch.head, {"open_to_network": arguments.open_to_network}
     if (arguments.device == "create") != (session.create is not None):
         found = "that of a Create" if session.create else "that of an arm"
         cure = "the packaged `live_create` is for `create`, `live_maze` for `ur10` and `head`"
@@ -94,15 +98,16 @@ def _emulate(arguments: argparse.Namespace) -> int:
         if session.create is not None:
             from robot.emulators.create import serve as serve_create
 
-            serve_create(create_emulator_config(session.create, arguments.host or session.head.address))
+            address = arguments.host or session.head.address
+            serve_create(create_emulator_config(session.create, address, **opened))
         elif arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
-            serve(arm_emulator_config(session, head, arguments.host))
+            serve(arm_emulator_config(session, head, arguments.host).model_copy(update=opened))
         else:
             from robot.emulators.head import serve as serve_head
 
-            serve_head(head_emulator_config(session, head, arguments.host))
+            serve_head(head_emulator_config(session, head, arguments.host).model_copy(update=opened))
     except KeyboardInterrupt:
         return INTERRUPTED
     return 0
@@ -124,7 +129,7 @@ def monitor() -> Iterator[Callable[[Path], None]]:
         # A session of its own: it gets no Ctrl-C.
         processes[directory] = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
         put_last(processes[directory].pid)
-        _print(f"{directory}/watch.png shows the map while it grows")
+        tell(f"{directory}/watch.png shows the map while it grows")
 
     try:
         yield start
@@ -153,7 +158,3 @@ def _read_live_config(
         cure = "`live_maze` and `live_create` are examples; `run` maps recordings and simulations"
         raise InputError(f"{arguments.config}: live", "missing", "settings of a live session", cure)
     return config, config.live
-
-
-def _print(line: str) -> None:
-    print(f"ratslam: {line}", file=sys.stderr, flush=True)

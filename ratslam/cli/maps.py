@@ -10,7 +10,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, prepare_jax, tell
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def _read(path: Path) -> SavedMap:
     prepare_jax()
     from ratslam.pipeline.saved_map import read_map
 
-    return read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
+    return read_map(path, tell)
 
 
 def _info(arguments: argparse.Namespace) -> int:
@@ -88,8 +88,6 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 def _undo(arguments: argparse.Namespace) -> int:
     output: Path | None = arguments.output
-    if output is not None:
-        require_new_file(output)
     prepare_jax()
     from ratslam.pipeline.map_care import finish_undo, replaced_file, undo_sequence
 
@@ -110,7 +108,6 @@ def _undo(arguments: argparse.Namespace) -> int:
 
 
 def _crop(arguments: argparse.Namespace) -> int:
-    require_new_file(arguments.output)
     box = None if arguments.box is None else read_box(arguments.box)
     steps = None if arguments.steps is None else read_steps(arguments.steps)
     saved = _read(arguments.map)

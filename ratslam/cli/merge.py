@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-from ratslam.cli.common import Commands, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, prepare_jax, tell
 
 
 def add_commands(commands: Commands) -> None:
@@ -25,12 +24,9 @@ def add_commands(commands: Commands) -> None:
 
 
 def _merge(arguments: argparse.Namespace) -> int:
-    require_new_file(arguments.output)
     prepare_jax()
     from ratslam.pipeline.merge import merge_maps
 
-    report = merge_maps(
-        arguments.maps, arguments.output, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr)
-    )
+    report = merge_maps(arguments.maps, arguments.output, tell)
     print(json.dumps(report.to_json(), indent=2) if arguments.json else report.describe())
     return 0

@@ -9,8 +9,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax, require_new_file
+from ratslam.cli.common import Commands, prepare_jax, tell
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 if TYPE_CHECKING:
     from ratslam.atlas.route import Way
@@ -40,21 +41,22 @@ def add_commands(commands: Commands) -> None:
         "--mode", choices=("time", "temporal"), default="time",
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
-    path.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw the way to a new file")
+    path.add_argument(
+        "-o", "--output", type=Path, metavar="PNG", check=_require_new_picture,
+        help="draw the way to a new file",
+    )  # fmt: skip
     path.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _path(arguments: argparse.Namespace) -> int:
     start = None if arguments.start == "here" else read_place(arguments.start, "--from")
     goal = read_place(arguments.goal, "--to")
-    if arguments.output is not None:
-        _require_new_picture(arguments.output)
     prepare_jax()
     from ratslam.atlas.route import NoWay
     from ratslam.pipeline.map_way import draw_map_way, find_map_way
     from ratslam.pipeline.saved_map import read_map
 
-    saved = read_map(arguments.map, lambda line: print(f"ratslam: {line}", file=sys.stderr))
+    saved = read_map(arguments.map, tell)
     made = saved.open_session().map
     try:
         way = find_map_way(made, saved, start, goal, arguments.mode)

@@ -13,9 +13,11 @@ from ratslam.cli.common import (
     add_count,
     add_set,
     add_workers,
+    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
+    require_new_folder,
 )
 from ratslam.cli.reproduce_tables import add_tables
 from ratslam.config.packaged import find_config
@@ -63,8 +65,9 @@ def add_commands(commands: Commands) -> None:
     add_config(threshold)
     add_workers(threshold, 1)
     threshold.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder for threshold.png and threshold.csv"
-    )
+        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
+        help="new folder for threshold.png and threshold.csv",
+    )  # fmt: skip
     tables = names.add(
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
@@ -76,6 +79,7 @@ def add_commands(commands: Commands) -> None:
     add_row_names(real, REAL_ROWS)
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
+        check=own_folder("real.md"),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
     add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", MAP_ROWS, 32000)
@@ -86,7 +90,10 @@ def add_commands(commands: Commands) -> None:
         "reproduce templates create_arena -o runs/templates.npz",
     )  # fmt: skip
     add_config(train)
-    train.add_argument("-o", "--output", type=Path, required=True, metavar="NPZ", help="the new file")
+    train.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="NPZ", check=require_new_folder,
+        help="the new file",
+    )  # fmt: skip
 
 
 def add_rows(
@@ -108,6 +115,7 @@ def add_rows(
     add_count(parser, "--first", first, "seed of the first session; each has the next one")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
+        check=own_folder(f"{name}.md", name),
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
     add_workers(parser, 1)
@@ -127,6 +135,7 @@ def add_figure(names: Commands, name: str, title: str) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
+        check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
         help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
     )  # fmt: skip
     add_set(parser)

@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.common import (
+    INTERRUPTED,
+    CommandParser,
+    Commands,
+    add_config,
+    prepare_jax,
+    read_config,
+    require_new_folder,
+)
 
 
 def add_commands(commands: Commands) -> None:
@@ -36,11 +44,12 @@ def add_commands(commands: Commands) -> None:
     )
 
 
-def add_run_directory(parser: argparse.ArgumentParser) -> None:
+def add_run_directory(parser: CommandParser) -> None:
     """Adds the option that names the run directory."""
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/CONFIG)"
-    )
+        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
+        help="new run directory (default runs/CONFIG)",
+    )  # fmt: skip
 
 
 def add_rerun(parser: argparse.ArgumentParser) -> None:

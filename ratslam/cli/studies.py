@@ -14,9 +14,11 @@ from ratslam.cli.common import (
     INPUT_ERROR,
     Commands,
     add_config,
+    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
+    tell,
 )
 from ratslam.config.packaged import find_config
 from tactile.base.errors import InputError
@@ -63,7 +65,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
     study.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
+        "-o", "--output", type=Path, metavar="DIR", check=own_folder("runs.jsonl", "growth.jsonl", "sets"),
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
     study.add_argument(
@@ -294,6 +296,7 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
+    tell(f"runs {arguments.cycles} cycles with each cheaper setting: this takes ten minutes or more")
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ratslam.cli.common import Commands
 from tactile.base.atomic_write import write_text_atomically
+from tactile.base.new_file import make_new_file, require_new_file
 
 MOVED = {name: f"tools {name}" for name in ("recover", "convert", "schema", "version", "completion")}
 """Commands that stood beside the others before, and what each is now."""
@@ -42,7 +43,7 @@ def add_commands(commands: Commands) -> None:
         "schema", _schema, "print the JSON schema of configurations, for editors",
         "tools schema -o runs/schema.json",
     )  # fmt: skip
-    schema.add_argument("-o", "--output", type=Path, metavar="FILE", help=to_file)
+    schema.add_argument("-o", "--output", type=Path, metavar="FILE", check=_require_schema, help=to_file)
 
     tools.add("version", _version, "print the versions of ratslam, Python and JAX", "tools version")
 
@@ -74,10 +75,16 @@ def _convert(arguments: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(converted.settings)
     if output:
-        write_text_atomically(output, text)
+        make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     else:
         print(text, end="")
     return 0
+
+
+def _require_schema(path: Path) -> None:
+    from ratslam.config.strict_yaml import SCHEMA_START
+
+    require_new_file(path, replaces=SCHEMA_START)
 
 
 def _schema(arguments: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ from ratslam.config.plugin_settings import check_plugins, resolved_plugin
 from ratslam.config.presets import PresetName
 from ratslam.config.renamed_keys import RENAMED
 from ratslam.config.strict_yaml import load, validate
+from ratslam.config.strict_yaml.document import Document
 from robot.live.config import LiveConfig
 from robot.recordings.formats import RecordingConfig
 from robot.simulation.create.session import CreateSimulationConfig
@@ -26,6 +27,7 @@ from robot.simulation.rat.session import RatSimulationConfig
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 from tactile.base.config import Settings
+from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
 from tactile.frontend import TouchConfig
 
@@ -53,6 +55,9 @@ class ScoreConfig(Settings):
     """File of true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric; null: without it."""
 
 
+SOURCE_SECTIONS = ("recording", "simulation", "create_simulation", "rat_simulation", "source", "live")
+
+
 class SourceConfig(Settings):
     """The source of a run, exactly one of six, and the processing of whisker readings to views."""
 
@@ -76,7 +81,7 @@ class SourceConfig(Settings):
     @field_validator("live", mode="after")
     @classmethod
     def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
-        names = ("recording", "simulation", "create_simulation", "rat_simulation", "source")
+        names = SOURCE_SECTIONS[:-1]
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
         if all(name in info.data for name in names) and not cls.fewest_sources <= len(given) <= 1:
@@ -147,6 +152,19 @@ def load_config(
     """
     path = find_config(path)
     document = merge_includes(load(path, assignments), path.parent)
+    _check_sources(document, assignments)
     config = validate(document, RunConfig if source_required else LoopConfig)
     check_plugins(document, config)
     return config.with_absolute_paths(path.parent.resolve())
+
+
+def _check_sources(document: Document, assignments: Sequence[str]) -> None:
+    """Raises `InputError` if an assignment sets a part of a source that the configuration does not have."""
+    there = {name for name in SOURCE_SECTIONS if document.data.get(name) is not None}
+    own = {name for name in there if document.places[(name,)].key != "--set"}
+    for assignment in assignments:
+        name = assignment.partition("=")[0]
+        if own and name.partition(".")[0] in there - own:
+            found = f"a setting of another source: this configuration has {' and '.join(sorted(own))}"
+            cure = "a seed belongs to simulated sessions" if name.endswith(".seed") else ""
+            raise InputError(f"--set {name}", found, "settings of that", cure)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ratslam.config.completion import complete
+from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import dump_data, parse, validate
+from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
+from ratslam.pipeline.map_settings import differing_settings
+from ratslam.pipeline.saved_map import SavedMap
+from ratslam.pipeline.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
 from ratslam.pipeline.source import open_source
 from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
 from robot.sources.registry import SOURCES
@@ -46,12 +52,19 @@ class Contents(NamedTuple):
     whiskers: int
 
 
-def diagnose_recording(path: Path) -> Diagnosis:
+def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     """What a recording is, whether it can be read, and the configuration that reads it.
+
+    Args:
+        like: a map; the configuration then has its view, cells and method. Another sensor is a fault.
 
     Raises:
         InputError: it is missing, or of no known format.
     """
+    refuse_other_files(path, "a recording", (RECORDING, FOLDER))
+    if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
+        cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
+        raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
     try:
         found = describe_file(path)
     except InputError:
@@ -67,11 +80,14 @@ def diagnose_recording(path: Path) -> Diagnosis:
         sections["presets"] = ["visual_odometry"]
     told, faults, contents = list[str](), found.faults, None
     try:
+        if like is not None:
+            fov = found.field_of_view
+            sections = _alike(sections if fov is None else sections | {"recall": {"sector_fov": fov}}, like)
         with open_source(validate(parse(dump_data(sections), path.name), RunConfig), told.append) as source:
             contents = summarise(source)
     except InputError as error:
         faults = (*faults, *str(error).splitlines())
-    if contents is None or not contents.whiskers:
+    if like is None and not (contents and contents.whiskers):
         cell = cell_size(contents.step if contents else 0.0, found.max_range)
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
         if found.field_of_view is not None:
@@ -80,6 +96,27 @@ def diagnose_recording(path: Path) -> Diagnosis:
     return Diagnosis(
         found.what, found.table, notes, faults, shortcomings(contents) if contents else (), sections
     )
+
+
+def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
+    """The sections with all settings in which the view, the cells or the method of a map differ from theirs.
+
+    Raises:
+        InputError: the recording is of another sensor.
+    """
+    name = f"doctor --like {like.path}"
+    document = override(parse(dump_data(sections), name), [f"backend={like.config.backend}"])
+    given = validate(document, RunConfig)
+    check_same_fov(str(like.path), like.config, given)
+    with open_source(given) as source:
+        config = complete(given, source)
+        found = differences(like.sensor, sensor_of(config, source))
+    settings = settings_of_map(found)
+    if settings is None:
+        check_same_sensor(str(like.path), like.sensor, sensor_of(config, source))
+    method = differing_settings([like.config, config])
+    settings = {key: both[0] for key, both in method.items()} | (settings or {})
+    return override(document, [f"{key}={json.dumps(value)}" for key, value in settings.items()]).data
 
 
 def diagnose_registered(path: Path) -> Diagnosis | None:

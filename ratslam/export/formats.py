@@ -16,7 +16,6 @@ from ratslam.export.run_cells import read_run_cells, score_run_cells
 from ratslam.export.run_files import ExportedRun, read_exported_run
 from ratslam.pose_graph.io import read_json
 from ratslam.rats.spikes import SpikeConfig, write_spikes
-from robot.recordings.mcap_writer import existing_error
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file, new_folder, require_new_file
 
@@ -83,8 +82,7 @@ def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
     final, pieces = directory / "trajectory.tum", directory / "pieces.csv"
     if pieces.exists():
         beside = output.with_suffix(".pieces.csv")
-        if beside.exists():
-            raise existing_error(beside)
+        require_new_file(beside)
         warn(f"{PARTED}; {beside} says which of them each pose is in")
         make_new_file(beside, lambda path: shutil.copyfile(pieces, path))
     _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
@@ -108,9 +106,8 @@ def _write_graphml(directory: Path, output: Path, warn: Warn) -> None:
 def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
     """map_server's YAML file, and beside it the image of the same name."""
     grid = read_grid(_file(directory / "grid.npz", "an occupancy grid"))
-    image = output.with_suffix(".pgm")
-    if image.exists():
-        raise existing_error(image)
+    for suffix in (".pgm", ".yaml"):  # whatever the case of the one given
+        require_new_file(output.with_suffix(suffix))
     write_nav2(output.parent, grid, output.stem)
 
 

@@ -25,7 +25,7 @@ from robot.drivers.process_priority import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
 from robot.live.selftest import check_disk
-from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 from tactile.features.calibration import Calibration
 
 
@@ -54,9 +54,8 @@ def run_live_session(
     """
     assert config.live is not None
     choose = prepare_arm_session if config.live.create is None else prepare_create_session
+    require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
-    if directory.exists():
-        raise InputError(str(directory), "exists already", "a new run directory", "choose another with -o")
     log(check_disk(config.live, directory))
     with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
         robot = open_robot(stopped)

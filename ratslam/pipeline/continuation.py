@@ -14,7 +14,7 @@ from ratslam.pipeline.map_settings import check_same_method
 from ratslam.pipeline.saved_map import SavedMap, read_map
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Source
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, printable
 
 
 def resume_session(
@@ -34,7 +34,7 @@ def resume_session(
         InputError: there is no map; it was made with another sensor, method or settings; or another recording
             cannot go on from it, because it is one piece.
     """
-    saved = read_map(path, lambda sentence: print(f"ratslam: {sentence}", file=sys.stderr))
+    saved = read_map(path, lambda sentence: print(f"ratslam: {printable(sentence)}", file=sys.stderr))
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)

@@ -13,6 +13,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.atlas.localiser import Localiser
 from ratslam.backends.config import Start
 from ratslam.backends.registry import LOCALISING
+from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.config.run_config import RunConfig, SourceConfig
 from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.core.localisation import Localisation
@@ -21,6 +22,7 @@ from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.run import print_status, process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.saved_map import SavedMap, is_map
+from ratslam.pipeline.sensor import check_same_fov
 from ratslam.pipeline.source import open_observations
 from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
@@ -73,7 +75,8 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
     the rest as the map was made.
 
     Raises:
-        InputError: the map was made by a method in whose maps nothing can be localised.
+        InputError: the map was made by a method in whose maps nothing can be localised, or with a sensor of
+            another field of view.
     """
     if saved.config.backend not in LOCALISING:
         found = f"a map made by `backend: {saved.config.backend}`"
@@ -82,6 +85,7 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
             found = f"{found}, {reason}"
         cure = "map the place again with `backend: recall`, or by whiskers with `backend: grid`"
         raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
+    check_same_fov(str(saved.path), saved.config, config)
     own = {name: getattr(config, name) for name in OWN}
     place = config.localise.model_copy(update={"map": saved.path.resolve()})
     return saved.config.model_copy(
@@ -124,7 +128,11 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     if is_map(file):
         cure = "give the recording or the configuration whose poses are to be found"
         raise InputError(str(file), "a map, which is no recording", "a recording of the map's sensor", cure)
+    refuse_other_files(file, "a recording or a configuration", (RECORDING, FOLDER))
     like, file = saved.config.recording, file.resolve()
+    if like is not None and like.topics is None and (file.is_dir() or file.suffix in (".bag", ".db3")):
+        cure = f"`python -m ratslam doctor {file} --like {saved.path} -o FILE.yaml`, and localise FILE.yaml"
+        raise InputError(str(file), "a bag or a folder", f"such a recording as {like.file.name}", cure)
     recording = RecordingConfig(file=file) if like is None else like.model_copy(update={"file": file})
     sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
     text = dump(saved.config.model_copy(update=sources))

@@ -29,9 +29,13 @@ def check_same_settings(where: str, of_map: RunConfig, other: RunConfig) -> None
     """
     different = differing_settings([of_map, other])
     if different:
-        assigned = (shlex.quote(f"{name}={_text(both[0])}") for name, both in different.items())
-        cure = " ".join(f"--set {assignment}" for assignment in assigned)
+        cure = assignments({name: both[0] for name, both in different.items()})
         raise _error(where, different, f"`{cure}` takes those of the map")
+
+
+def assignments(settings: dict[str, Any]) -> str:
+    """Settings as options of a command."""
+    return " ".join(f"--set {shlex.quote(f'{name}={_text(value)}')}" for name, value in settings.items())
 
 
 def differing_settings(configs: Sequence[RunConfig]) -> dict[str, list[Any]]:

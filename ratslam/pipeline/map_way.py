@@ -21,8 +21,8 @@ from ratslam.pipeline.goal_planner import HEADING_RADIUS, experience_at, felt_wa
 from ratslam.pipeline.saved_map import SavedMap
 from robot.live.goal_config import GoalConfig
 from robot.world.head_trajectory import MotionConfig
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file
 from tactile.whiskers.head_geometry import ur10_head
 
 FARTHEST, TOLERANCE = (GoalConfig.model_fields[name].default for name in ("farthest", "tolerance"))
@@ -46,6 +46,9 @@ def find_map_way(
     """
     motion = MotionConfig()
     graph = travel_graph(made.graph(), Travel(motion.speed, motion.turn_rate))
+    if not len(graph):
+        found = f"a map of `backend: {saved.config.backend}` without experiences, which a way leads along"
+        raise InputError(str(saved.path), found, "a map of `backend: recall` or `backend: classic`")
     if start is None:
         first = (
             nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
@@ -71,4 +74,4 @@ def draw_map_way(path: Path, made: Map, saved: SavedMap, way: Way) -> None:
     title = f"From experience {way.experiences[0]} to {way.experiences[-1]}"
     line = f"{way.length:.2f} m, {way.seconds:.0f} s over {len(way.experiences)} of {len(nodes)} experiences"
     figure = draw_way(title, line, nodes, links, way.poses, felt)
-    write_atomically(path, lambda temporary: figure.savefig(temporary, metadata={"Software": None}))
+    make_new_file(path, lambda temporary: figure.savefig(temporary, metadata={"Software": None}))

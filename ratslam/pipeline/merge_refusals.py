@@ -9,8 +9,9 @@ from pathlib import Path
 from ratslam.atlas.overlap import Overlap, overlap, remembered
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.map_archive import digest_of
+from ratslam.pipeline.map_settings import assignments
 from ratslam.pipeline.saved_map import SavedMap
-from ratslam.pipeline.sensor import first_difference
+from ratslam.pipeline.sensor import differences, settings_of_map
 from tactile.base.errors import InputError
 
 OTHERS = "maps of different sessions"
@@ -39,11 +40,17 @@ def keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
 
 
 def _check_sensors(first: SavedMap, second: SavedMap) -> None:
-    different = first_difference(first.sensor, second.sensor)
-    if different is not None:
-        what, one, other = different
-        found = f"made with another sensor than {first.path}: {what} is {other} here and {one} there"
-        raise InputError(str(second.path), found, "maps of one sensor", "merge those of each sensor alone")
+    different = differences(first.sensor, second.sensor)
+    if different:
+        clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
+        settings, cure = settings_of_map(different), "merge those of each sensor alone"
+        other = "another sensor"
+        if settings:
+            config = second.path.with_name("config.yaml")
+            other = "other settings of the sensor"
+            cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
+        found = f"made with {other} than {first.path}: {clauses}"
+        raise InputError(str(second.path), found, "maps of one sensor", cure)
 
 
 def _check_sessions(maps: Sequence[SavedMap]) -> None:

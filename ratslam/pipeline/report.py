@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluation.report.page import PageRun, check_report_libraries, write_page
+from evaluation.report.page import PAGE_START, PageRun, check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.config.changed_settings import ChangedSetting, changed_settings
 from ratslam.config.packaged import read_citation
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_writable
+from tactile.base.new_file import require_new_file
 
 NAME = "report.html"
 """Name of the page in a run directory."""
@@ -20,14 +20,15 @@ def write_report(directories: Sequence[Path], path: Path) -> None:
     """Writes the page of a run, or of several and their comparison; the file works without network.
 
     Args:
-        directories: of runs, also of interrupted or killed ones. path: the file, replaced if it exists.
+        directories: of runs, also of interrupted or killed ones. path: the file; a page that was
+            there is replaced.
 
     Raises:
-        InputError: a folder holds no run or a malformed one, the file cannot be written, or the extra
+        InputError: a folder holds no run or a malformed one, the file exists and is no page, or the extra
             [report] is not installed.
     """
     check_report_libraries("report")
-    require_writable(path)
+    require_new_file(path, replaces=PAGE_START)
     runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
     write_page(path, runs, read_citation())
 

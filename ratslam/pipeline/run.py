@@ -21,7 +21,7 @@ from ratslam.pipeline.runner import Runner, open_runner
 from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
 from robot.sources.source import Source
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, printable
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
@@ -58,7 +58,7 @@ def process_source(runner: Runner, source: Source) -> bool:
     """
     samples = islice(iter(source), runner.skipped, None)
     total = None if source.length is None else source.length - runner.skipped
-    bar = tqdm(total=total, unit="step", desc=source.name, file=sys.stderr, mininterval=0.5)
+    bar = tqdm(total=total, unit="step", desc=printable(source.name), file=sys.stderr, mininterval=0.5)
     with bar, catch_interrupt("finishing this chunk and writing the results") as interrupted:
         while not interrupted() and (chunk := list(islice(samples, CHUNK - runner.session.steps % CHUNK))):
             steps = runner.process(chunk)
@@ -85,7 +85,14 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     raw = config.simulation is None or config.simulation.raw
     frontend = None if raw else Frontend(config.touch, source.info.calibration)
     recorder = open_recorder(path, source)
-    bar = tqdm(source, unit="whisk", desc=source.name, file=sys.stderr, mininterval=0.5, total=source.length)
+    bar = tqdm(
+        source,
+        unit="whisk",
+        desc=printable(source.name),
+        file=sys.stderr,
+        mininterval=0.5,
+        total=source.length,
+    )
     with recorder, bar, catch_interrupt("closing the file") as interrupted:
         for sample in bar:
             if frontend is not None and isinstance(sample.reading, Cycle | Whisk):
@@ -141,4 +148,4 @@ def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
 
 def print_status(sentence: str) -> None:
     """Prints one sentence about the progress."""
-    print(f"ratslam: {sentence}", file=sys.stderr)
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr)

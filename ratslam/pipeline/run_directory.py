@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 COLUMNS = (
     "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "doubt", "outcome",
@@ -36,8 +37,7 @@ class RunDirectory:
 
     def __init__(self, path: Path, columns: Iterable[str] = ()) -> None:
         self.path = path
-        if path.exists():
-            raise InputError(str(path), "exists already", "a new run directory", "choose another with -o")
+        require_new_file(path, parents=True)
         try:
             path.mkdir(parents=True)
         except OSError as error:

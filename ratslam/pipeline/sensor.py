@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ratslam.config.flat_settings import flat_settings
 from ratslam.config.run_config import RunConfig
+from ratslam.pipeline.map_settings import assignments
 from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.source import Source
 from tactile.base.errors import InputError
@@ -20,8 +23,10 @@ WORDS = {
     "view_shape": "the shape of the views",
     "whiskers": "the number of whiskers",
     "unit": "the unit of the views",
-    "cell": "pose_cells.cell_size",
 }
+CELL = "pose_cells.cell_size"
+SAME_FOV = 0.05  # rad
+GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length")
 
 
 class Sensor(NamedTuple):
@@ -74,46 +79,106 @@ def sensor_of(config: RunConfig, source: Source) -> Sensor:
     else:
         kind, made = VIEWS, _view_settings(config)
     transform = made | {f"templates.{name}": value for name, value in templates.items()}
-    transform = {name: value for name, value in transform.items() if value is not None}
+    views = {name: value for name, value in transform.items() if name.startswith("recording.")}
+    transform = {name: value for name, value in transform.items() if value is not None} | views
     plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
     unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
     return Sensor(kind, source.view_shape, source.whiskers, unit, cell, *plain)
 
 
+class Difference(NamedTuple):
+    """What differs between two sensors, and its values; `what` is the name of a setting, or in words."""
+
+    what: str
+    ours: Any
+    others: Any
+
+
 def disagreement(of_map: Sensor, other: Sensor) -> str:
-    """The first way in which another sensor differs from that of a map, as a clause; '' if they agree."""
-    found = first_difference(of_map, other)
-    if found is None:
-        return ""
-    what, ours, others = found
-    return f"{what} is {others} and was {ours} when the map was made"
+    """How another sensor differs from that of a map, as a clause; '' if they agree."""
+    found = [[("null" if each is None else each) for each in found] for found in differences(of_map, other)]
+    clauses = [f"{what} is {others} and was {ours}" for what, ours, others in found]
+    return f"{', '.join(clauses)} when the map was made" if clauses else ""
 
 
-def first_difference(one: Sensor, other: Sensor) -> tuple[str, Any, Any] | None:
-    """What differs first between two sensors, and its values; None if they agree.
-
-    Settings that only one of them knows do not count.
+def differences(one: Sensor, other: Sensor) -> list[Difference]:
+    """What differs between two sensors. Settings that only one of them knows do not count; of sensors of two
+    kinds, only the kind is named.
     """
-    for name in ("kind", "view_shape", "whiskers", "unit", "cell"):
-        ours, others = getattr(one, name), getattr(other, name)
-        if ours != others:
-            return WORDS[name], ours, others
-    known = one.geometry | one.transform
-    for key, value in (other.geometry | other.transform).items():
-        if known.get(key, value) != value:
-            return key, known[key], value
-    return None
+    if one.kind != other.kind:
+        return [Difference(WORDS["kind"], one.kind, other.kind)]
+    known = flat_settings(one.geometry | one.transform | {CELL: one.cell})
+    others = flat_settings(other.geometry | other.transform | {CELL: other.cell})
+    found = [
+        Difference(key, known[key], value) for key, value in others.items() if known.get(key, value) != value
+    ]
+    shaped = any(setting.what.endswith((".rows", ".columns")) for setting in found)
+    for name in ("view_shape", "whiskers", "unit"):
+        ours, theirs = getattr(one, name), getattr(other, name)
+        if ours != theirs and not (shaped and name == "view_shape"):
+            found.insert(0, Difference(WORDS[name], ours, theirs))
+    return found
+
+
+def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:
+    """The settings that make a sensor that of a map; None if the device or its views differ beyond them."""
+    if any(each.what in WORDS.values() or each.what.startswith(GEOMETRY) for each in found):
+        return None
+    return {key: ours for key, ours, _ in found}
 
 
 def check_same_sensor(where: str, of_map: Sensor, other: Sensor) -> None:
-    """Raises `InputError` with the reason if a map cannot be used with another sensor.
+    """Raises `InputError` with the reason if a map cannot be used with another sensor, or other settings of
+    it.
 
     Args:
         where: the map, for the error.
     """
-    found = disagreement(of_map, other)
+    found = differences(of_map, other)
+    settings = settings_of_map(found)
+    if settings:
+        what = f"made with other settings of the sensor: {disagreement(of_map, other)}"
+        cure = f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
+        raise InputError(where, what, "a map of these settings", cure)
     if found:
-        raise InputError(where, f"made with another sensor: {found}", f"a map of this sensor ({other.kind})")
+        reason = disagreement(of_map, other)
+        raise InputError(where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})")
+
+
+def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
+    """Raises `InputError` if the recordings of two configurations see other angles, as far as they say so;
+    views of two formats, such as a table and a bag, are only compared if both say it.
+
+    Args:
+        where: the map, for the error.
+    """
+    fov, own = (config.recall.sector_fov for config in (of_map, other))
+    formats = [_format_of(config) for config in (of_map, other)]
+    if isinstance(fov, str) and isinstance(own, str):
+        return
+    if isinstance(fov, str) or isinstance(own, str):
+        if formats[0] == formats[1] or "" in formats:
+            return
+    elif abs(fov - own) <= SAME_FOV:
+        return
+    angles = ["an unknown angle" if isinstance(angle, str) else f"{angle:.4g} rad" for angle in (fov, own)]
+    found = (
+        f"made with another sensor: {formats[0] or 'views'} over {angles[0]}, and not {formats[1] or 'views'}"
+    )
+    cure = "if it is the same sensor, set recall.sector_fov in both configurations to its field of view"
+    raise InputError(where, f"{found} over {angles[1]}", "a map of this sensor", cure)
+
+
+def _format_of(config: RunConfig) -> str:
+    """What the views of a recording are made of, in words; '' where it does not say."""
+    recording = config.recording
+    if recording is None:
+        return ""
+    if recording.topics is not None:
+        return "topics of a bag"
+    if recording.file.suffix.lower() in VIDEO_SUFFIXES:
+        return "frames of a video"
+    return "a table" if recording.table.views is not None else ""
 
 
 def _settings(section: str, settings: Any) -> dict[str, Any]:
@@ -128,9 +193,12 @@ def _view_settings(config: RunConfig) -> dict[str, Any]:
     image = _settings("recording.image", recording.image)
     if recording.topics is not None:
         topic = recording.topics.views
-        kept = {} if topic is None else {"max_range": topic.max_range, "heights": list(topic.heights)}
+        kept = {} if topic is None else topic.model_dump(include={"rows", "columns", "max_range", "heights"})
         return image | {f"recording.topics.views.{name}": value for name, value in kept.items()}
     if recording.file.suffix.lower() in VIDEO_SUFFIXES:
         return image
-    views = recording.table.views
-    return {} if views is None else {"recording.table.views.max_range": views.max_range}
+    table = recording.table
+    if table.views is None:
+        return {}
+    shape = {f"recording.table.{name}": getattr(table, name) for name in ("rows", "columns")}
+    return shape | {"recording.table.views.max_range": table.views.max_range}

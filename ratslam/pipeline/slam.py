@@ -16,13 +16,14 @@ from ratslam.core.backend import Map
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.localise import localising
-from ratslam.pipeline.saved_map import describe_readings, read_map, write_map
+from ratslam.pipeline.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
 from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 from tactile.features.whisker_image import view_shape
 from tactile.frontend import TouchConfig
@@ -122,9 +123,14 @@ class Slam:
         another recording (`ratslam.pipeline.continuation`).
 
         Args:
-            path: of the file; its folder is made, and an older file is replaced.
+            path: of the file; its folder is made, and an older map is replaced.
+
+        Raises:
+            InputError: something else is there.
         """
         file = Path(path)
+        if file.is_symlink() or not is_map(file):
+            require_new_file(file, parents=True)
         file.parent.mkdir(parents=True, exist_ok=True)
         frontend = {} if self._frontend is None else self._frontend.arrays()
         write_map(file, self.session, self.config, self.source, estimate=self.estimate, frontend=frontend)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import signal
 import socket
@@ -13,7 +12,9 @@ from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
+from robot.emulators.listening import is_loopback
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 VIEWER = "127.0.0.1:9876"
 """Address of a viewer with its default port."""
@@ -44,7 +45,8 @@ def prepare_target(text: str) -> str:
             "--rerun", "rerun is not installed", "the extra 'view'", "pip install 'ratslam[view]'"
         )
     if text.endswith(".rrd"):
-        return _new_file(Path(text))
+        require_new_file(Path(text))
+        return os.path.abspath(text)
     if text == START:
         _start_viewer()
         return VIEWER
@@ -62,22 +64,10 @@ def split_address(text: str) -> tuple[str, int]:
         InputError: it is not one.
     """
     host, _, port = text.rpartition(":")
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-        number = int(port)
-    except ValueError:
-        loopback, number = False, 0
-    if not loopback or not 0 < number < 1 << 16:
+    number = int(port) if port.isdecimal() else 0
+    if not is_loopback(host) or not 0 < number < 1 << 16:
         raise InputError("--rerun", repr(text), EXPECTED, "reach another machine through an ssh tunnel")
     return host, number
-
-
-def _new_file(path: Path) -> str:
-    if path.exists():
-        raise InputError(str(path), "exists already", "a new file", "choose another name or move it")
-    if not path.absolute().parent.is_dir():
-        raise InputError(str(path.parent), "no such folder", "a folder for the new file")
-    return str(path.absolute())
 
 
 def _start_viewer() -> None:

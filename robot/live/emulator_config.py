@@ -50,11 +50,13 @@ def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None 
     )
 
 
-def create_emulator_config(create: CreateLiveConfig, address: str) -> CreateEmulatorConfig:
+def create_emulator_config(
+    create: CreateLiveConfig, address: str, open_to_network: bool = False
+) -> CreateEmulatorConfig:
     """A Create in the arena of the session's plan, its serial port a link of the session's name.
 
     Args:
-        address: of its whiskers, HOST or HOST:PORT.
+        address: of its whiskers, HOST or HOST:PORT. open_to_network: whether it need not be loopback.
 
     Raises:
         InputError: the address or the port is that of a real device.
@@ -67,7 +69,11 @@ def create_emulator_config(create: CreateLiveConfig, address: str) -> CreateEmul
         raise InputError("live.create.port", create.port, "a name for the emulated port", cure)
     plan, whiskers = create.plan, create.plan.whiskers
     bridge = BridgeEmulatorConfig(
-        host=where.host, port=where.port, stream=StreamConfig(rate=whiskers.rate), seed=plan.seed
+        host=where.host,
+        port=where.port,
+        open_to_network=open_to_network,
+        stream=StreamConfig(rate=whiskers.rate),
+        seed=plan.seed,
     )
     world = CreateWorldConfig(
         arena=plan.arena,

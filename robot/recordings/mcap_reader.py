@@ -16,14 +16,15 @@ from robot.recordings.bags.bag import container_fault
 from robot.recordings.cdr_live import Event
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import McapScanner, is_foreign
-from robot.recordings.mcap_writer import McapWriter, existing_error
+from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
 from robot.sources.input_files import raise_errors, require_file, unreadable_error
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
-from tactile.base.atomic_write import flush_to_disk, write_atomically
+from tactile.base.atomic_write import flush_to_disk
 from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file, require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 
@@ -152,8 +153,7 @@ def recover(path: Path, out: Path) -> Recovery:
         InputError: `path` has no readable sample, or `out` exists.
     """
     require_file(path)
-    if out.exists():
-        raise existing_error(out)
+    require_new_file(out)
     scanner = McapScanner(path)
     entries = scanner.entries()
     first = next(entries, None)
@@ -174,7 +174,7 @@ def recover(path: Path, out: Path) -> Recovery:
             raise _unreadable_recording_error(scanner)
         flush_to_disk(path)
 
-    write_atomically(out, write)
+    make_new_file(out, write)
     return Recovery(scanner.count, scanner.broken)
 
 

@@ -17,14 +17,10 @@ from robot.recordings.mcap_scanner import METADATA, RecordingDescription
 from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
-
-
-def existing_error(path: Path) -> InputError:
-    """The error for an output file that exists."""
-    return InputError(str(path), "exists already", "a new file", "choose another name or move it")
 
 
 class RecordingWriteError(InputError):
@@ -69,8 +65,9 @@ class McapWriter:
         self.path = path
         try:
             self._file = WholeChunkFile(path)
-        except FileExistsError as error:
-            raise existing_error(path) from error
+        except FileExistsError:
+            require_new_file(path)  # says what is there
+            raise
         except OSError as error:
             raise InputError(str(path), f"cannot be written ({error.strerror})") from error
         self._chunk_s = chunk_s

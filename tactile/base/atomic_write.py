@@ -22,7 +22,12 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     The temporary name keeps the file's suffix and contains the process id, so two processes may write the
     same file. If `write` raises, `path` stays as it was and the temporary file is removed. A file that is
     replaced keeps its mode. Errors of the temporary file name `path`.
+
+    Raises:
+        InputError: `path` is a device or a FIFO, which a file would replace.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(str(path), "a device or a FIFO", "a file")
     temporary = temporary_path(path)
     try:
         with errors_of(path, temporary):

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
+
+_CONTROL = re.compile(
+    "([\0-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff])\\1*"
+)
 
 
 class InputError(ValueError):
@@ -25,11 +30,22 @@ class InputError(ValueError):
             parts.append(f"expected {expected}")
         if cure:
             parts.append(cure)
-        super().__init__("; ".join(parts))
+        super().__init__(printable("; ".join(parts)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the parts, so that a worker process can return the error."""
         return type(self), (self.where, self.found, self.expected, self.cure)
+
+
+def printable(text: str) -> str:
+    """A text whose control characters, but line ends, are written out: those of a terminal, of directions of
+    writing, and halves of pairs, as names and contents of files may have them."""
+    return _CONTROL.sub(_written_out, text)
+
+
+def _written_out(found: re.Match[str]) -> str:
+    escape, times = found[1].encode("unicode_escape").decode(), len(found[0])
+    return escape * times if times < 4 else f"{escape} ({times} times)"
 
 
 class InputErrors(InputError):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
@@ -15,22 +16,62 @@ from tactile.base.atomic_write import errors_of, temporary_path
 from tactile.base.errors import InputError
 
 CURE = "choose another with -o"
+_BEGINNING = 1 << 13  # bytes of a file by which it is known again
 
 
-def require_new_file(path: Path) -> None:
-    """Checks, before anything is measured, that a file or a folder can be made.
+def require_new_file(path: Path, *, replaces: bytes = b"", parents: bool = False) -> None:
+    """Checks, before any work, that a file or a folder can be made.
+
+    Args:
+        replaces: pattern of the beginning of a file that may be replaced, as the same command made it before;
+            b"": nothing may. parents: whether folders above it that are missing will be made.
 
     Raises:
-        InputError: it exists already, or its folder does not or cannot be written in.
+        InputError: something is there already, be it a file, a folder, a link or a device; or its folder is
+            missing or cannot be written in.
     """
-    if os.path.lexists(path):
+    if os.path.lexists(path) and not (replaces and _begins(path, replaces)):
         dangles = path.is_symlink() and not path.exists()
         found = f"a link to {os.readlink(path)}, which does not exist" if dangles else "exists already"
-        raise InputError(str(path), found, "a new file", CURE)
-    if not os.path.isdir(path.parent):
-        found = "not a folder" if os.path.lexists(path.parent) else "no such folder"
-        raise InputError(str(path.parent), found, "an existing folder", "make it first")
-    require_writable(path)
+        expected = "a new file, or one that this command made before" if replaces else "a new file"
+        raise InputError(str(path), found, expected, CURE)
+    first = path
+    while parents and not os.path.lexists(first.parent):
+        first = first.parent
+    if not os.path.isdir(first.parent):
+        found = "not a folder" if os.path.lexists(first.parent) else "no such folder"
+        raise InputError(str(first.parent), found, "an existing folder", "make it first")
+    require_writable(first)
+
+
+def require_own_folder(path: Path, marks: Sequence[str]) -> None:
+    """Checks, before any work, that a folder can be made, or is empty, or one to go on with.
+
+    Args:
+        marks: names of files that the same command has made in it before; one suffices.
+
+    Raises:
+        InputError: it is another folder or no folder, has links or devices in it, or cannot be written in.
+    """
+    if path.is_symlink() or not path.is_dir():
+        require_new_file(path, parents=True)
+        return
+    inside = sorted(path.iterdir())
+    if inside and not any(path / mark in inside for mark in marks):
+        found = f"a folder with other files, such as {inside[0].name}"
+        raise InputError(str(path), found, "a new folder, or one that this command made before", CURE)
+    for file in inside:
+        if file.is_symlink() or not (file.is_file() or file.is_dir()):
+            raise InputError(str(file), "a link or a device", "files of this command", CURE)
+    require_writable(path / f"{marks[0]}.new")
+
+
+def _begins(path: Path, pattern: bytes) -> bool:
+    """Whether a path is a file of its own that begins with a pattern."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return re.match(pattern, file.read(_BEGINNING), re.DOTALL) is not None
 
 
 def require_writable(path: Path) -> None:

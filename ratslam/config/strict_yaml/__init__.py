@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from ratslam.config.other_files import refuse_other_files
 from ratslam.config.strict_yaml.document import Document, KeyPath, Place, describe, join_keys
 from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.config.strict_yaml.reader import Reader
@@ -21,6 +22,10 @@ from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=Settings)
 
+SCHEMA_START = rb'{\s+"\$schema": "[^"]*",\s+"title": "RunConfig",\s'
+"""Pattern of the beginning of the schema of configurations."""
+_ALONE: dict[KeyPath, str] = {("recording", "topics"): "topic"}
+"""Sections in which a text stands for a section with this key alone."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
@@ -35,6 +40,7 @@ def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Docum
         InputError: the file cannot be read or is not strict YAML; with file, line and column.
     """
     name = os.fspath(path)
+    refuse_other_files(Path(name))
     try:
         with Path(name).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
@@ -102,6 +108,9 @@ def open_path(data: Any, key: str, where: str) -> tuple[Any, KeyPath]:
     path: KeyPath = ()
     for name in key.split("."):
         if path:
+            alone = _ALONE.get(path[:-1])
+            if alone is not None and isinstance(data.get(path[-1]), str):
+                data[path[-1]] = {alone: data[path[-1]]}
             data = _open_section(data, path[-1])
         path += (_step(data, name, where, path),)
     return data, path
@@ -132,7 +141,8 @@ def dump_data(data: dict[str, Any]) -> str:
 
 def schema(model: type[BaseModel]) -> dict[str, Any]:
     """The JSON schema by which an editor completes and checks a configuration file."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
+    first = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": model.__name__}
+    return first | model.model_json_schema()
 
 
 def _escape(data: Any) -> Any:

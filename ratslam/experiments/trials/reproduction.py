@@ -14,6 +14,7 @@ from tqdm import tqdm
 from evaluation.plots import style
 from ratslam.experiments.studies.executor import run_tasks
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -78,6 +79,7 @@ def reproduce(
     if name not in paper.protocols:
         raise InputError("NAME", repr(name), f"one of {', '.join(paper.protocols)}")
     protocol = paper.protocols[name]
+    require_new_file(directory / f"{name}.png", parents=True)
     jobs = paper.plan(protocol, sets, seed, assignments)
     batches = paper.run(name, jobs, workers)
     rows, interrupted = write_rows(directory / f"{name}.csv", paper.key, paper.fields, batches)
@@ -102,8 +104,7 @@ def write_rows(
     Raises:
         InputError: the file exists.
     """
-    if path.exists():
-        raise InputError(str(path), "exists", "a folder without it", "choose another folder with -o")
+    require_new_file(path, parents=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[ResultRow] = []
     with path.open("w", encoding="utf-8", newline="") as file:

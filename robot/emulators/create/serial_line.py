@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from robot.drivers.create.protocol import BAUD
+from tactile.base.atomic_write import temporary_path
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
@@ -58,9 +59,6 @@ class Terminal:
             raise InputError(sys.platform, "has no pseudo-terminals", "Linux or macOS") from None
         self._termios, self._tty = termios, tty
         self._link = None if link is None else Path(link)
-        if self._link is not None and os.path.lexists(self._link) and not self._link.is_symlink():
-            cure = "choose another name for the emulated port (`live.create.port`)"
-            raise InputError(str(link), "exists and is no link", "a name for the emulated port", cure)
         self.plugged = False
         self.plug()
 
@@ -72,11 +70,16 @@ class Terminal:
         self._tty.setraw(self._slave)
         os.set_blocking(self.master, False)
         self.path = os.ttyname(self._slave)
+        if self._link is not None and os.path.lexists(self._link):
+            left = self._link.is_symlink() and Path(os.readlink(self._link)).parent == Path(self.path).parent
+            if not left:  # by an emulator that was killed
+                cure = "choose another name for the emulated port (`live.create.port`)"
+                expected = "a new name for the emulated port"
+                raise InputError(str(self._link), "exists and is no emulated port", expected, cure)
         self.plugged = True
         if self._link is not None:
-            new = self._link.with_name(f"{self._link.name}.new")
+            new = temporary_path(self._link)
             try:
-                new.unlink(missing_ok=True)
                 new.symlink_to(self.path)
                 new.replace(self._link)
             except OSError as error:

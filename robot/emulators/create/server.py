@@ -159,8 +159,8 @@ def serve(config: CreateEmulatorConfig) -> None:
     """Emulates a Create until the process ends; prints the port and `ready` when it listens.
 
     Raises:
-        InputError: no pseudo-terminals, an invalid arena, or the port's name is taken.
-        OSError: a port of the bridge is in use.
+        InputError: no pseudo-terminals, an invalid arena, the port's name is taken, or the address of the
+            bridge cannot be used.
     """
     server = CreateServer(config)
     try:

@@ -24,6 +24,8 @@ class BridgeEmulatorConfig(Settings):
 
     host: str = "127.0.0.1"
     """Address to listen on."""
+    open_to_network: bool = False
+    """Whether the address may be one that others reach, who may then command, fault or stop it."""
     port: Annotated[int, Field(ge=0, le=65535)] = PORT
     """Port of the emulated USB."""
     control_port: Annotated[int, Field(ge=0, le=65535)] = CONTROL_PORT

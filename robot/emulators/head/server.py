@@ -24,6 +24,7 @@ from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
 from robot.emulators.head.pose_source import AlongPath, CarriedByArm, PoseSource
 from robot.emulators.head.whiskers import maze_whiskers
+from robot.emulators.listening import listening
 from robot.world.head_trajectory import HeadPath
 from robot.world.scene import KidnapConfig, make_scene
 from tactile.whiskers.head_geometry import ur10_head
@@ -38,7 +39,7 @@ def serve(config: HeadEmulatorConfig) -> None:
     """Serves a head until the process ends; prints `ready` when it listens.
 
     Raises:
-        InputError: invalid maze or path. OSError: the port is in use.
+        InputError: invalid maze or path, or the address cannot be used.
     """
     head = ur10_head(config.head)
     made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
@@ -71,14 +72,15 @@ async def open_server(
         do: executes a fault request at a time, s, and returns the answer.
 
     Raises:
-        OSError: a port is in use.
+        InputError: the address cannot be used.
     """
     server = HeadServer(bridge, do)
     async with contextlib.AsyncExitStack() as stack:
         for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
-            await stack.enter_async_context(
-                await asyncio.start_server(_ignore_disconnects(client), config.host, port, reuse_address=True)
-            )
+            talk = _ignore_disconnects(client)
+            with listening(config.host, port, config.open_to_network):
+                opened = await asyncio.start_server(talk, config.host, port, reuse_address=True)
+            await stack.enter_async_context(opened)
         yield server
 
 

@@ -39,6 +39,8 @@ class UrEmulatorConfig(Settings):
 
     host: str = "127.0.0.11"
     """Address to listen on; the ports are the real ones, so every emulator needs an address of its own."""
+    open_to_network: bool = False
+    """Whether the address may be one that others reach, who may then command, fault or stop it."""
     hz: Literal[125, 500] = 125
     """Control steps and states per second: 125 for a CB3 (a UR-10 of 2016), 500 for an e-Series."""
     polyscope: Annotated[str, Field(pattern=r"^(\d+\.\d+(\.\d+)?)?$")] = ""

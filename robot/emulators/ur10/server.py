@@ -16,6 +16,7 @@ from typing import Protocol
 
 from robot.drivers.process_priority import urgent
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
+from robot.emulators.listening import listening
 from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
 from robot.emulators.ur10.controller import EmulatedController
@@ -77,7 +78,8 @@ class ControllerServer:
             FAULT_PORT: lambda: FaultSession(self.faults),
         }
         for port, make_session in ports.items():
-            listener = socket.create_server((config.host, port), backlog=16)
+            with listening(config.host, port, config.open_to_network):
+                listener = socket.create_server((config.host, port), backlog=16)
             listener.setblocking(False)
             self._selector.register(listener, selectors.EVENT_READ, make_session)
 
@@ -168,7 +170,7 @@ def serve(config: UrEmulatorConfig) -> None:
     """Emulates a controller until the process is ended; prints "ready" when it listens.
 
     Raises:
-        InputError: the arm cannot reach its start pose.
+        InputError: the arm cannot reach its start pose, or the address cannot be used.
     """
     try:
         server = ControllerServer(config)

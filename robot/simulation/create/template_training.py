@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.simulation.create.session import CreateSimulationConfig, drive_into_wall, train_strain_templates
-from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd
 from tactile.wall_estimation.estimators import WallContact, contact_points, fused_wall
@@ -49,8 +49,7 @@ def train_to_file(config: CreateSimulationConfig, path: Path) -> StrainTemplates
     Raises:
         InputError: the file exists, or the whiskers have no contact.
     """
-    if path.exists():
-        raise InputError(str(path), "exists", "a new file", "choose another name with -o")
+    require_new_file(path, parents=True)
     templates = train_strain_templates(config)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_templates(templates, path)

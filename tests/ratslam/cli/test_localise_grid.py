@@ -32,6 +32,11 @@ localise: {{log_odds: 4, particles: 4000}}
 """
 
 
+def test_a_way_needs_experiences(arena: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["path", str(arena / "map"), "--to", "0,0"]) == 2
+    assert "a map of `backend: grid` without experiences" in capsys.readouterr().err
+
+
 @pytest.fixture(scope="module")
 def arena(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration and the run directory of its map."""

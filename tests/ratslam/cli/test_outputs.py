@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import signal
@@ -14,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from ratslam.cli import main
+from ratslam.cli import build_parser, main
+from ratslam.cli.common import CommandParser, Commands
 from ratslam.pipeline.map_care import map_info
 from ratslam.pipeline.saved_map import read_map
 from tests.helpers.square_run import copy_square_run
@@ -43,6 +45,71 @@ def full_disk() -> Iterator[None]:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
+
+
+Words = tuple[str, ...]
+
+
+def programs(commands: Commands, words: Words = ()) -> Iterator[tuple[Words, CommandParser]]:
+    """The commands that run, each by its words."""
+    for name, parser in commands.parsers.items():
+        if parser.commands is None:
+            yield (*words, name), parser
+        else:
+            yield from programs(parser.commands, (*words, name))
+
+
+PROGRAMS = dict(programs(build_parser().commands))
+READ = {"--continue", "--localise", "--recording", "--relations", "--like"}
+"""Options that name a file to be read; all others of a path are outputs."""
+
+
+def test_every_output_is_called_o() -> None:
+    options = {
+        action.option_strings[0]
+        for parser in PROGRAMS.values()
+        for action in parser.arguments
+        if action.type is Path and action.option_strings
+    }
+    assert options - READ == {"-o"}
+
+
+@pytest.mark.parametrize("words", [key for key, parser in PROGRAMS.items() if " -o" in parser.format_help()])
+def test_no_command_writes_over_what_is_there(words: Words, tmp_path: Path, capsys) -> None:
+    more: list[object] = []
+    for action in PROGRAMS[words].arguments:
+        if not action.option_strings or (action.required and "-o" not in action.option_strings):
+            more += [*action.option_strings[:1], next(iter(action.choices or "1"))]
+    if words == ("map", "crop"):
+        more += ["--piece", 0]
+    there = {name: tmp_path / f"{name}.png" for name in ("file", "link", "dangling", "fifo", "folder")}
+    there["file"].write_text("theirs")
+    there["folder"].mkdir()
+    (there["folder"] / "a").write_text("theirs")
+    there["link"].symlink_to("file.png")
+    there["dangling"].symlink_to("nowhere.png")
+    os.mkfifo(there["fifo"])
+    terminal = os.openpty()
+    there["device"] = Path(os.ttyname(terminal[1]))
+    before = {path: path.lstat().st_ino for path in there.values()}
+    for path in there.values():
+        if words[0] != "path" or path != there["device"]:  # no picture by its name
+            assert refused(capsys, *words, *more, "-o", path).startswith(f"{path}: ")
+    assert {path: path.lstat().st_ino for path in there.values()} == before
+    assert there["file"].read_text() == (there["folder"] / "a").read_text() == "theirs"
+    assert {*tmp_path.iterdir(), there["device"]} == set(before)
+    list(map(os.close, terminal))
+
+
+def test_a_page_and_a_schema_replace_their_like(tmp_path: Path, capsys) -> None:
+    run, page, schema = copy_square_run(tmp_path / "run"), tmp_path / "a.html", tmp_path / "a.json"
+    for _ in range(2):
+        assert main(["report", str(run), "-o", str(page)]) == 0
+        assert main(["tools", "schema", "-o", str(schema)]) == 0
+    for path in (page, schema):
+        path.write_text(f"x{path.read_text()}")
+    assert refused(capsys, "report", run, "-o", page).startswith(f"{page}: exists already")
+    assert refused(capsys, "tools", "schema", "-o", schema).startswith(f"{schema}: exists already")
 
 
 def sequence(path: Path) -> int:

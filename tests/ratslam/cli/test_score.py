@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
+from evaluation.artifacts.run_directory import read_scorecard
 from ratslam.cli import main
+from tactile.base.errors import InputError
 from tests.ratslam.cli.run_cases import refuses
 
 
@@ -13,6 +17,13 @@ def test_score_refuses_a_folder_or_file_without_a_log(capsys, tmp_path):
     (tmp_path / "log.csv").write_text("t,id\n0,1\n")
     refuses(capsys, ["score", tmp_path / "log.csv"], "log.csv")
     refuses(capsys, ["score", tmp_path / "log.csv", "--base", "-1"], "--base: -1")
+
+
+def test_a_broken_scorecard_is_one_line(square, tmp_path):
+    (tmp_path / "scorecard.json").write_text('{"name": 3}')
+    with pytest.raises(InputError, match=r"not a scorecard \(.*\)") as caught:
+        read_scorecard(tmp_path)
+    assert "http" not in str(caught.value).replace("\n", "http")
 
 
 def test_a_scored_directory_gives_its_scorecard(capsys, square):

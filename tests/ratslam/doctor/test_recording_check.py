@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
+from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig, load_config
+from ratslam.config.strict_yaml import dump_data, parse, validate
+from ratslam.doctor.recording_check import diagnose_recording
+from ratslam.pipeline.localise import localising
+from ratslam.pipeline.map_settings import differing_settings
+from ratslam.pipeline.saved_map import SavedMap, describe_readings
+from ratslam.pipeline.sensor import differences, sensor_of
 from ratslam.pipeline.source import open_source
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_video
 from tests.helpers.ros_bags import odometry, scan, write_bag
 
@@ -60,6 +68,7 @@ def folder(tmp_path: Path) -> Path:
 def written(folder: Path, name: str) -> RunConfig:
     """The configuration that the doctor writes for a recording."""
     output = folder / "elsewhere.yaml"
+    output.unlink(missing_ok=True)
     assert main(["doctor", str(folder / name), "-o", str(output)]) == 0
     return load_config(output)
 
@@ -193,3 +202,39 @@ def test_the_turtlebot_bag_runs_as_the_doctor_says(reference_data: Path, tmp_pat
     with open_source(config) as source:
         assert source.length == 920
         assert sum(bool(sample.reading.view_seen) for sample in source) == 355
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("lab_odometry.csv", ["recording.table.columns=4", "recording.table.views.max_range=1.5"]),
+        ("run", ["recording.topics.views.rows=2", "recording.topics.views.max_range=3"]),
+        ("loop.avi", ["recording.image.rows=6", "recording.image.crop.y_min=9"]),
+        ("touch.mcap", ["touch.image.tallest=0.2"]),
+    ],
+)
+def test_a_configuration_like_a_map_fits_it(folder: Path, name: str, settings: list[str]) -> None:
+    """It has every setting of the sensor and the method that a session in the map needs."""
+    written(folder, name)
+    settings += ["pose_cells.cell_size=0.07", "keyframes.min_score=0.7"]
+    with open_source(load_config(folder / "elsewhere.yaml", settings)) as source:
+        config = complete(load_config(folder / "elsewhere.yaml", settings), source)
+        like = SavedMap(folder / "map.npz", "", "", config, describe_readings(source), "", {})
+    found = diagnose_recording(folder / name, like)
+    assert not found.faults
+    with open_source(validate(parse(dump_data(found.config), "like.yaml"), RunConfig)) as source:
+        completed = complete(validate(parse(dump_data(found.config), "like.yaml"), RunConfig), source)
+        assert differences(like.sensor, sensor_of(completed, source)) == []
+    assert differing_settings([config, completed]) == {}
+
+
+def test_a_configuration_like_a_map_of_another_sensor_is_a_fault(folder: Path) -> None:
+    config = written(folder, "run")
+    with open_source(config) as source:
+        like = SavedMap(
+            folder / "map.npz", "", "", complete(config, source), describe_readings(source), "", {}
+        )
+    for name, words in (("touch.mcap", "the sensor is whisker head"), ("lab_odometry.csv", "a table")):
+        assert any(words in fault for fault in diagnose_recording(folder / name, like).faults)
+    with pytest.raises(InputError, match=r"topics of a bag over .* rad, and not a table over an unknown"):
+        localising(written(folder, "lab_odometry.csv"), like)

@@ -147,14 +147,35 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         ({"unit": "signed"}, "the unit of the views is signed"),
         ({"whiskers": 18}, "the number of whiskers is 18 and was 0"),
         ({"kind": "whisker head"}, "the sensor is whisker head and was camera or laser"),
-        ({"transform": {"templates.patch": 2}}, "templates.patch is 2 and was 0"),
+        ({"geometry": {"touch.head.length": 2}}, "touch.head.length is 2 and was 1"),
     ],
 )
 def test_other_sensors_are_refused(run: ratslam.Result, changes: dict, message: str) -> None:
-    sensor = read_map(run.directory).sensor
+    sensor = read_map(run.directory).sensor._replace(geometry={"touch.head.length": 1})
     check_same_sensor("map.npz", sensor, sensor._replace(transform={}))
+    if message is None:
+        sensor, message = (
+            sensor._replace(geometry={"touch.head.length": 1}),
+            "touch.head.length is 2 and was 1",
+        )
     with pytest.raises(InputError, match=f"map.npz: made with another sensor: {message}"):
         check_same_sensor("map.npz", sensor, sensor._replace(**changes))
+
+
+def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam.Result) -> None:
+    sensor = read_map(run.directory).sensor
+    views = "recording.topics.views"
+    of_map = sensor._replace(
+        transform={f"{views}.max_range": None, f"{views}.columns": 6, "templates.patch": 0}
+    )
+    other = of_map._replace(
+        transform={f"{views}.max_range": 5.0, f"{views}.columns": 4}, view_shape=(3, 4, 1), cell=0.2
+    )
+    with pytest.raises(InputError, match="made with other settings of the sensor: ") as caught:
+        check_same_sensor("map.npz", of_map, other)
+    cure = f"`--set {views}.max_range=null --set {views}.columns=6 --set pose_cells.cell_size=0.1`"
+    assert cure in caught.value.cure
+    assert "shape" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

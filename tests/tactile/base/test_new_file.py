@@ -10,7 +10,13 @@ import pytest
 
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
-from tactile.base.new_file import make_new_file, new_folder, require_new_file, require_writable
+from tactile.base.new_file import (
+    make_new_file,
+    new_folder,
+    require_new_file,
+    require_own_folder,
+    require_writable,
+)
 
 
 def refusal(path: Path) -> str:
@@ -39,6 +45,22 @@ def test_what_cannot_be_made_is_refused_by_its_own_name(tmp_path: Path, monkeypa
     denied = refusal(tmp_path / "new")
     assert denied.startswith(f"{tmp_path / 'new'}: cannot be written (Permission denied)")
     assert {path.name for path in tmp_path.iterdir()} == {"file", "link"}
+
+
+def test_a_folder_that_the_same_command_made_goes_on(tmp_path: Path) -> None:
+    own, other = tmp_path / "own", tmp_path / "other"
+    for folder in (own, other):
+        require_own_folder(folder, ["runs.jsonl"])
+        folder.mkdir()
+        require_own_folder(folder, ["runs.jsonl"])
+    (own / "runs.jsonl").touch()
+    (other / "table.csv").touch()
+    require_own_folder(own, ["runs.jsonl"])
+    with pytest.raises(InputError, match=r"other: a folder with other files, such as table\.csv"):
+        require_own_folder(other, ["runs.jsonl"])
+    (own / "table.csv").symlink_to(other / "table.csv")
+    with pytest.raises(InputError, match=r"own/table\.csv: a link or a device"):
+        require_own_folder(own, ["runs.jsonl"])
 
 
 def test_a_file_that_appears_meanwhile_stays(tmp_path: Path, monkeypatch) -> None:

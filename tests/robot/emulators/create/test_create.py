@@ -120,9 +120,13 @@ def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path: Path) -> None:
     pytest.importorskip("termios", reason="needs pseudo-terminals")
     name = tmp_path / "create.tty"
     name.write_text("mine")
-    with pytest.raises(InputError, match="is no link"):
+    with pytest.raises(InputError, match="is no emulated port"):
         Terminal(str(name))
     assert name.read_text() == "mine"
+    name.unlink()
+    name.symlink_to("/etc/hostname")
+    with pytest.raises(InputError, match="is no emulated port"):
+        EmulatedTerminal(str(name))
     name.unlink()
     name.symlink_to("/dev/pts/none")  # left by an emulator that was killed
     terminal = Terminal(str(name))

@@ -1,0 +1,41 @@
+"""The addresses on which emulators listen: loopback, unless the network is asked for."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tactile.base.errors import InputError
+
+OPENS = "anyone who reaches this address may command, fault or stop the emulator"
+
+
+@contextmanager
+def listening(host: str, port: int, open_to_network: bool) -> Iterator[None]:
+    """A context that opens a port.
+
+    Raises:
+        InputError: the address is not loopback and the network was not asked for, or it cannot be used.
+    """
+    if not (open_to_network or is_loopback(host)):
+        cure = f"or give --open-to-network: then {OPENS}"
+        found, expected = "an address that others may reach", "loopback, such as 127.0.0.11"
+        raise InputError(repr(host), found, expected, cure)
+    try:
+        yield
+    except OSError as error:
+        where, cure = f"{host}:{port}", "choose an address of this machine with --host"
+        if error.errno == errno.EADDRINUSE:
+            found = "something listens there already, such as another emulator"
+            raise InputError(where, found, "a free address", f"use it, stop it, or {cure}") from None
+        raise InputError(where, f"cannot listen ({error.strerror})", "a free address", cure) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is reached from this machine only."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
