@@ -71,12 +71,15 @@ def run_live_session(
             except SessionFault as error:
                 fault = error.fault
             except OperatorStop:
-                done = f"after {robot.count} {robot.unit}s"
+                done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
+                done = done if robot.count else "nothing was recorded"
                 fault = Fault(SessionOutcome.INTERRUPTED, done, time.monotonic())
             report = _report(fault, robot, mapper, rig.rest())
-        card = mapper.finish(not fault.outcome.planned) if robot.count else None
-    with suppress(OSError):  # a full disk has been reported
-        (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        try:
+            card = mapper.finish(not fault.outcome.planned) if robot.count else None
+        finally:
+            with suppress(OSError):  # a full disk has been reported
+                (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return fault, card
 
 
