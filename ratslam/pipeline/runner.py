@@ -44,15 +44,17 @@ from ratslam.pipeline.saved_map import NAME, describe_readings, read_map, write_
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of
+from tactile.base.atomic_write import temporary_path
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation
 from tactile.whiskers.head_geometry import ur10_head
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
-"""Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
-A run continued after a kill repeats at most these. The interval grows, because each checkpoint holds the
-whole run and would make the total cost O(N^2) at a fixed interval."""
+"""Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more,
+but at most twice the steps before the first of the two. A run continued after a kill repeats at most these.
+The interval grows, because each checkpoint holds the whole run and would make the total cost O(N^2) at a
+fixed interval."""
 
 
 class Runner:
@@ -83,7 +85,8 @@ class Runner:
         self._odometry_pose = np.zeros(3)
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
-        self._saved, self._estimate = session.steps, estimate
+        self._begun = self._saved = session.steps
+        self._estimate, self._readings = estimate, describe_readings(source)
         self._cells = open_cell_recorder(config, source, session.backend, directory.path)
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
@@ -113,9 +116,9 @@ class Runner:
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
             self._directory.append({"online_error.csv": f"{float(samples[-1].time)!r},{error!r}\n"})
-        if self.session.steps - self._saved >= max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE):
-            self._checkpoint()
-            self._saved = self.session.steps
+        longest = max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE)
+        if self.session.steps - self._saved >= min(longest, max(CHUNK, 2 * (self._saved - self._begun))):
+            self.checkpoint()
         if self._observers:
             self._report(samples, observations, steps, odometry)
         return steps
@@ -129,8 +132,35 @@ class Runner:
         Args:
             interrupted: whether the source has more samples.
         """
+        status = "interrupted" if interrupted else "complete"
+        file = self._directory.path / NAME
+        # Of a complete run it appears last: after a kill before, there are samples to go on with.
+        made = file if interrupted else temporary_path(file)
+        self._write_map(made, compressed=True)  # before a solution moves poses
+        try:
+            card = self._write_results()
+        finally:
+            made.replace(file)
+        _write_manifest(self._directory, self._manifest | {"status": status, "steps": self.session.steps})
+        for observer in self._observers:
+            observer.finish(
+                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
+            )
+        return card
+
+    def checkpoint(self) -> None:
+        """Writes the map file."""
+        self._write_map(self._directory.path / NAME, compressed=False)
+        self._saved = self.session.steps
+
+    def _write_map(self, path: Path, compressed: bool) -> None:
+        write_map(
+            path, self.session, self._config, self._readings,
+            recording=self._source.digest, estimate=self._estimate, compressed=compressed,
+        )  # fmt: skip
+
+    def _write_results(self) -> Scorecard:
         directory, config = self._directory, self._config
-        self._checkpoint()
         time = np.loadtxt(directory.path / "online.tum", usecols=0, ndmin=1)
         write_map_results(directory.path, self.session.map, time)
         if self._cells is not None:
@@ -139,14 +169,7 @@ class Runner:
         save_closure_views(self._images, directory)
         save_grid_map(directory)
         save_changes(self.session.map, config.touch, directory)
-        card = score_and_plot(directory.path, config.score)
-        status = "interrupted" if interrupted else "complete"
-        _write_manifest(directory, self._manifest | {"status": status, "steps": self.session.steps})
-        for observer in self._observers:
-            observer.finish(
-                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
-            )
-        return card
+        return score_and_plot(directory.path, config.score)
 
     def _report(
         self,
@@ -171,12 +194,6 @@ class Runner:
     def _map_report(self) -> MapReport:
         session = self.session
         return MapReport(session.map.judged_closures(), session.backend.activity(session.state))
-
-    def _checkpoint(self) -> None:
-        write_map(
-            self._directory.path / NAME, self.session, self._config, describe_readings(self._source),
-            recording=self._source.digest, estimate=self._estimate,
-        )  # fmt: skip
 
 
 @contextmanager
