@@ -33,7 +33,7 @@ from ratslam.pipeline.artifacts import (
 )
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.cell_recorder import open_cell_recorder
-from ratslam.pipeline.continuation import resume_session
+from ratslam.pipeline.continuation import checkpoint_of, resume_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.map_results import score_and_plot, write_map_results
@@ -45,7 +45,6 @@ from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of
 from tactile.base.atomic_write import temporary_path
-from tactile.base.errors import InputError
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation
 from tactile.whiskers.head_geometry import ur10_head
@@ -141,7 +140,8 @@ class Runner:
             card = self._write_results()
         finally:
             made.replace(file)
-        _write_manifest(self._directory, self._manifest | {"status": status, "steps": self.session.steps})
+        manifest = self._manifest | {"status": status, "steps": self.session.steps}
+        self._directory.text("manifest.json", _manifest_text(manifest))
         for observer in self._observers:
             observer.finish(
                 self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
@@ -221,17 +221,18 @@ def open_runner(
     build_metrics(config.score.metrics)
     check_finished_map(config, source)
     session = session or build_session(config, source)
-    skip, estimate = resume_session(session, resume, config, source) if resume else (0, START)
-    if source.length is not None and source.length <= skip:
-        found = f"already holds all {skip} samples of {source.name}"
-        raise InputError(str(resume), found, "that of an unfinished run")
-    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns()) as files:
-        text = dump(config)
+    begun = None if resume is None else checkpoint_of(resume)
+    skip, estimate = (0, START) if begun is None else resume_session(session, begun, config, source)
+    text = dump(config)
+    manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
+    running = _manifest_text(manifest | {"status": "running"})
+    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns(), running) as files:
         files.text("config.yaml", text)
-        manifest = _manifest(config, text, source, resume)
-        _write_manifest(files, manifest | {"status": "running"})
         save_world(source.info, files)
-        yield Runner(config, source, files, manifest, session, skip, observers, estimate)
+        runner = Runner(config, source, files, manifest, session, skip, observers, estimate)
+        if begun is not None:
+            runner.checkpoint()  # nothing else of this folder holds the map before
+        yield runner
 
 
 def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
@@ -302,11 +303,11 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
         check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
 
 
-def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:
-    directory.text("manifest.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
+def _manifest_text(content: dict[str, Any]) -> str:
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:
+def _manifest(config: RunConfig, text: str, source: Source) -> dict[str, Any]:
     made = source.info.simulation
     packages = ("ratslam", "jax", "jaxlib", "numpy", "scipy", "networkx")
     return {
@@ -317,5 +318,4 @@ def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None)
         "simulation": made and made.model_dump(),
         "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
         "seeds": {"session": config.session.seed},
-        "continued": resume is not None,
     }
