@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.recordings.cdr_live import Event
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_scanner import UNCLOSED, McapScanner
 from robot.recordings.mcap_writer import McapWriter, existing_error
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
@@ -77,6 +77,8 @@ class Recording(ClosedSource):
         self.warning = ""
         if self.truncated:
             self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
+        if scanner.broken == UNCLOSED:
+            self.warning = f"{path}: {UNCLOSED}; all {self.length} samples are there that were written"
         time = self._check_columns(np.frombuffer(columns).reshape(scanner.count, -1), limits)
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated and warn is not None:
