@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +22,9 @@ class Manifest(NamedTuple):
         status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
             finished, the outcome from its report. source: name of the recording or simulation.
         total: final number of steps, if known. seed: of the session, if known.
-        versions: of the program, its libraries and Python.
+        versions: of the program, its libraries and Python. continued: whether it went on from a map.
+        killed: it has not ended, and no process writes it. digest: sha256 of its recording or simulation,
+            '' of a live session.
     """
 
     status: str = RUNNING
@@ -29,6 +32,9 @@ class Manifest(NamedTuple):
     total: int | None = None
     seed: int | None = None
     versions: Mapping[str, str] = {}
+    continued: bool = False
+    killed: bool = False
+    digest: str = ""
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -47,12 +53,27 @@ def read_manifest(directory: Path) -> Manifest:
             total=None if content["continued"] else recording["samples"],
             seed=content.get("seeds", {}).get("session"),
             versions={str(name): str(version) for name, version in versions.items()},
+            continued=bool(content["continued"]),
+            killed=content["status"] == RUNNING and _is_left(directory / "steps.csv"),
+            digest=str(recording.get("sha256", "")),
         )
     except FileNotFoundError:
         found = Manifest()
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
     return found._replace(status=_session_outcome(directory)) if found.status == RUNNING else found
+
+
+def _is_left(file: Path) -> bool:
+    """Whether no process holds the lock of a run; False where that cannot be told."""
+    try:
+        with file.open("rb") as opened:
+            fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return True  # before its first line
+    except OSError:
+        return False
+    return True
 
 
 def _session_outcome(directory: Path) -> str:

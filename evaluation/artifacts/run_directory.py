@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -112,7 +113,14 @@ def read_walls(path: Path) -> np.ndarray:
 
 
 def first_step(path: Path) -> int:
-    """The number of the first step of a run directory: above 0 if the run continues another."""
+    """The number of the first step of a run directory: above 0 if the run continues another.
+
+    Manifests of earlier versions do not tell it; the map of a run that has ended does.
+    """
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        told = json.loads((path / "manifest.json").read_text(encoding="utf-8")).get("first_step")
+        if isinstance(told, int):
+            return told
     saved = checkpoint_steps(path)
     return max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
 

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.manifest import RUNNING, read_manifest
 from evaluation.artifacts.run_directory import check_run_directory, checkpoint_steps
 from tactile.base.errors import InputError
 
+KILLED = "killed"
+"""Status of a run that has not ended and that no process writes."""
 WATCH_IMAGE = "watch.png"
 """The monitor's own image in the run directory; ignored when looking for activity of the run."""
 
@@ -27,7 +29,7 @@ class RunProgress(NamedTuple):
 
     Attributes:
         status: from the manifest; of a live session that ended before its map was finished, the outcome from
-            its report; `running` without either. total: final number of steps, if known.
+            its report; without either `running`, or `killed`. total: final number of steps, if known.
         path: [N, 3] online poses in the map frame, m, m, rad. sd: [3] standard deviations of the last pose;
             NaN before it. odometry: [N, 3] from the start of this run. truth: [N, 2] m, NaN if unknown.
         doubt: probability that the map is worse than odometry at the last step; None if it is not judged.
@@ -95,7 +97,7 @@ class RunMonitor:
         began, last = self._date("config.yaml"), self._date("steps.csv")
         return RunProgress(
             name=self.directory.resolve().name,
-            status=manifest.status,
+            status=KILLED if manifest.killed and manifest.status == RUNNING else manifest.status,
             total=manifest.total,
             path=rows[:, 1:4],
             sd=rows[-1, 4:7] if count else np.full(3, np.nan),

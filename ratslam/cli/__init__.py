@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import signal
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
 from ratslam.cli import (
@@ -25,7 +29,7 @@ from ratslam.cli import (
     studies,
     tools,
 )
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, check_output
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands, check_output
 from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError, printable
 
@@ -50,9 +54,39 @@ def main(argv: list[str] | None = None) -> int:
         print(f"ratslam: error: `{argv[0]}` is now `ratslam {RETIRED[argv[0]]}`", file=sys.stderr)
         return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
+    with _sigterm_as_interrupt() as terminated:
+        code = _run_command(arguments)
+    return TERMINATED if code == INTERRUPTED and terminated else code
+
+
+@contextmanager
+def _sigterm_as_interrupt() -> Iterator[list[int]]:
+    """Lets SIGTERM (of `kill`, `timeout`, systemd, Docker) do what Ctrl-C does; yields the list to which each
+    is added."""
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+        handler = signal.getsignal(signal.SIGINT)
+        if not callable(handler):  # a program in the background ignores Ctrl-C
+            raise KeyboardInterrupt
+        handler(signal.SIGINT, frame)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield caught
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _run_command(arguments: argparse.Namespace) -> int:
+    """Runs a command and prints its errors; returns the exit code."""
     try:
         check_output(arguments)
-        code = arguments.command(arguments)
+        code: int = arguments.command(arguments)
         sys.stdout.flush()
         return code
     except InputError as error:

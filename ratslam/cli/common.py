@@ -24,6 +24,8 @@ INPUT_ERROR = 2
 """Exit code after an error that the user can correct."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C; the results up to then are on disk."""
+TERMINATED = 143
+"""The same after SIGTERM, as of `kill`, `timeout`, systemd and Docker."""
 
 
 NEGATIVE = re.compile(r"-\.?\d")

@@ -62,6 +62,7 @@ def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.metrics.scorecard import render_health, render_scorecard
     from ratslam.live.session import run_live_session
+    from ratslam.pipeline.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
@@ -73,7 +74,7 @@ def _live(arguments: argparse.Namespace) -> int:
         check_assignments(arguments.set, saved)
         config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
-    with monitor() as start_monitor:
+    with catch_interrupt("stopping the robot"), monitor() as start_monitor:
         ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
     if card is not None:
         print(render_scorecard(card))

@@ -62,7 +62,7 @@ def add_commands(commands: Commands) -> None:
 
 def _watch(arguments: argparse.Namespace) -> int:
     from evaluation.artifacts.manifest import RUNNING
-    from evaluation.monitor.progress import WATCH_IMAGE
+    from evaluation.monitor.progress import KILLED, WATCH_IMAGE
     from evaluation.monitor.watch import watch_run
 
     for name in ("every", "patience"):
@@ -75,9 +75,9 @@ def _watch(arguments: argparse.Namespace) -> int:
         )
     finally:
         line.end()
-    if seen.status == RUNNING and not arguments.once:
-        cure = f"; `run --continue {arguments.directory / 'map.npz'}` continues" if seen.checkpoint else ""
-        print(f"no output for {seen.silence:.0f} s: the run was killed{cure}")
+    silent = f"no output for {seen.silence:.0f} s: " if seen.status == RUNNING else ""
+    if seen.status == KILLED or (silent and not arguments.once):
+        print(f"{silent}the run was killed; `run --continue {arguments.directory}` continues")
     print(f"{arguments.directory / WATCH_IMAGE} shows its map")
     return 0
 

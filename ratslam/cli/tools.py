@@ -56,9 +56,11 @@ def add_commands(commands: Commands) -> None:
 
 def _recover(arguments: argparse.Namespace) -> int:
     from robot.recordings.mcap_reader import recover
+    from robot.recordings.mcap_scanner import UNCLOSED
 
     report = recover(arguments.recording, arguments.output)
     lost = f"; the rest is lost: {report.reason}" if report.reason else ""
+    lost = f"; all that was written: {UNCLOSED}" if report.reason == UNCLOSED else lost
     print(f"{arguments.output}: {report.samples} samples{lost}")
     return 0
 

@@ -42,12 +42,21 @@ def diagnose_run(path: Path) -> Diagnosis:
         InputError: it is not a run directory, or has no steps.
     """
     check_run_directory(path)
-    status = read_manifest(path).status
+    manifest = read_manifest(path)
+    proceed = f"continue it: python -m ratslam run {path}/config.yaml --continue {path}/map.npz"
+    if not manifest.digest and load_config(path / "config.yaml").recording is not None:  # a live session
+        proceed = f"map its recording: python -m ratslam run {path}/config.yaml"
+    if manifest.killed and not has_steps(path):
+        return Diagnosis(f"{path}: a run that was killed before its first step", advice=(proceed,))
     run, config = read_run(path), load_config(path / "config.yaml")
     closures, outcomes = count_closures(path), count_outcomes(path)
+    status = "killed" if manifest.killed else manifest.status
     what = f"{path}: a run of {len(run.time)} steps ({status}), backend {config.backend}"
     verdict = judge_map(run.doubt)
-    notes = [f"{verdict.headline}. {verdict.reason}", *error_notes(run)]
+    judgement = f"{verdict.headline}. {verdict.reason}"
+    if manifest.killed:
+        judgement = "It was killed, or ended by an error: the poses are those found on the way, not judged"
+    notes = [judgement, *error_notes(run)]
     if closures is not None:
         notes.append(
             f"loop closures: {closures.accepted} of {closures.proposed} accepted, "
@@ -60,9 +69,15 @@ def diagnose_run(path: Path) -> Diagnosis:
     advice = settings_to_try(run, config, closures)
     if (path / "calibration.yaml").exists():
         advice.append(f"copy {path}/calibration.yaml into the configuration of this robot's next session")
-    if status != "complete" and (path / "map.npz").exists():
-        advice.insert(0, f"continue it: python -m ratslam run {path}/config.yaml --continue {path}/map.npz")
+    if manifest.killed or (status != "complete" and (path / "map.npz").exists()):
+        advice.insert(0, proceed)
     return Diagnosis(what, (), tuple(notes), tuple(faults), tuple(advice))
+
+
+def has_steps(path: Path) -> bool:
+    """Whether a run directory has a step."""
+    online = path / "online.tum"
+    return online.exists() and online.stat().st_size > 0
 
 
 def error_notes(run: RunArrays) -> list[str]:

@@ -10,7 +10,6 @@ import gc
 import multiprocessing
 import os
 import queue
-import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Step
 from robot.drivers.process_priority import step_back
+from robot.drivers.withheld_signals import withheld_signals
 from robot.sources.source import Sample
 from robot.sources.source_info import SourceInfo
 from tactile.base.errors import InputError
@@ -97,7 +97,8 @@ class Mapper:
         self._line, theirs = context.Pipe()
         target = process or run_mapper
         self._process = context.Process(target=target, args=(theirs,), daemon=True, name="ratslam mapper")
-        self._process.start()
+        with withheld_signals():
+            self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
         self._view = view
@@ -206,9 +207,9 @@ class Mapper:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._card is None and self._process.is_alive():
-            self._process.kill()
-        self._process.join(5.0)
+        self._process.join(0.0 if self._card is None else 5.0)
+        self._process.kill()  # at the end of this process SIGTERM would be sent, which it does not get
+        self._process.join()
         self._outbox.put(True)
         self._line.close()
 
@@ -259,7 +260,6 @@ class PipeSource:
 
 def run_mapper(line: Connection) -> None:
     """The main function of the mapper process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     step_back()  # compilation uses all cores
     try:
         _map(line)

@@ -59,24 +59,37 @@ def run_live_session(
     log(check_disk(config.live, directory))
     with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
         robot = open_robot(stopped)
-        with robot.rig as rig:
-            try:
-                calibration = robot.prepare(mapper, log)
-                log("armed")
-                armed(directory)
-                with open_recorder(robot.job, calibration) as rig.recorder:
-                    _run(robot, mapper)
-                fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
-            except SessionFault as error:
-                fault = error.fault
-            except OperatorStop:
-                done = f"after {robot.count} {robot.unit}s"
-                fault = Fault(SessionOutcome.INTERRUPTED, done, time.monotonic())
-            report = _report(fault, robot, mapper, rig.rest())
-        card = mapper.finish(not fault.outcome.planned) if robot.count else None
-    with suppress(OSError):  # a full disk has been reported
-        (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        fault, standing, card = None, False, None
+        try:
+            with robot.rig as rig:
+                try:
+                    calibration = robot.prepare(mapper, log)
+                    log("armed")
+                    armed(directory)
+                    with open_recorder(robot.job, calibration) as rig.recorder:
+                        _run(robot, mapper)
+                    fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
+                except SessionFault as error:
+                    fault = error.fault
+                except OperatorStop:
+                    fault = _interruption(robot)
+                except KeyboardInterrupt:  # a second one
+                    fault = _interruption(robot)
+                    raise
+                standing = rig.rest()
+            if robot.count:
+                card = mapper.finish(not fault.outcome.planned)
+        finally:
+            if fault is not None:
+                _write_report(directory, _report(fault, robot, mapper, standing))
     return fault, card
+
+
+def _interruption(robot: LiveRobot) -> Fault:
+    done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
+    return Fault(
+        SessionOutcome.INTERRUPTED, done if robot.count else "nothing was recorded", time.monotonic()
+    )
 
 
 def open_recorder(job: MappingJob, calibration: Calibration | None) -> LiveRecorder:
@@ -103,6 +116,11 @@ def _run(robot: LiveRobot, mapper: Mapper) -> None:
         except SessionFault as error:
             robot.rig.record_event("fault", str(error.fault))
             raise
+
+
+def _write_report(directory: Path, report: dict[str, Any]) -> None:
+    with suppress(OSError):  # a full disk has been reported
+        (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
 
 
 def _report(fault: Fault, robot: LiveRobot, mapper: Mapper, standing: bool) -> dict[str, Any]:

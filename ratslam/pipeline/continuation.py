@@ -5,16 +5,41 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from evaluation.artifacts.manifest import read_manifest
 from ratslam.backends.registry import LOCALISING
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
-from ratslam.pipeline.estimate import PoseEstimate
+from ratslam.pipeline.estimate import START, PoseEstimate
 from ratslam.pipeline.map_settings import check_same_method
-from ratslam.pipeline.saved_map import SavedMap, read_map
+from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, read_map
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Source
 from tactile.base.errors import InputError, printable
+
+
+def checkpoint_of(path: Path) -> Path | None:
+    """The map to continue: `path`, or None for a run that was killed before its first checkpoint.
+
+    Remains of a checkpoint that a killed process was writing are removed.
+
+    Raises:
+        InputError: that run went on from another map.
+    """
+    folder = path if path.is_dir() else path.parent
+    if map_file(path) != folder / NAME or not (folder / "manifest.json").is_file():
+        return path
+    manifest = read_manifest(folder)
+    if manifest.killed:
+        for file in folder.glob(f".*.{NAME}"):
+            file.unlink()
+    if not manifest.killed or (folder / NAME).exists():
+        return path
+    found = "killed before its first checkpoint"
+    if manifest.continued:
+        raise InputError(str(folder), found, "a run with a map", "continue the map that it went on from")
+    _say(f"{folder}: {found}; the recording is mapped from its beginning")
+    return None
 
 
 def resume_session(
@@ -30,11 +55,13 @@ def resume_session(
     Returns:
         how many samples of the source are in the map, and the estimate of its last step.
 
+    A killed run that has mapped the whole recording, without its results, begins anew.
+
     Raises:
-        InputError: there is no map; it was made with another sensor, method or settings; or another recording
-            cannot go on from it, because it is one piece.
+        InputError: there is no map, or it holds the whole recording; it was made with another sensor, method
+            or settings; or another recording cannot go on from it, because it is one piece.
     """
-    saved = read_map(path, lambda sentence: print(f"ratslam: {printable(sentence)}", file=sys.stderr))
+    saved = read_map(path, _say)
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)
@@ -44,7 +71,18 @@ def resume_session(
     if samples is None:
         session.begin_recording()
         session.begin_piece()  # the robot may have been carried since
+    elif source.length is not None and samples >= source.length:
+        if session.earlier or not read_manifest(saved.path.parent).killed:
+            found = f"already holds all {samples} samples of {source.name}"
+            raise InputError(str(path), found, "that of an unfinished run")
+        _say(f"{path}: killed after its last sample; the recording is mapped from its beginning")
+        session.restart(config.session.seed)
+        return 0, START
     return samples or 0, saved.estimate
+
+
+def _say(sentence: str) -> None:
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr)
 
 
 def _require_pieces(empty: Map, saved: SavedMap, source: Source) -> None:

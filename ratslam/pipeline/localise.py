@@ -19,7 +19,7 @@ from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.core.localisation import Localisation
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.progress import Observer
-from ratslam.pipeline.run import print_status, process_source
+from ratslam.pipeline.run import LAST_TASK, catch_interrupt, print_status, process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.saved_map import SavedMap, is_map
 from ratslam.pipeline.sensor import check_same_fov
@@ -169,6 +169,7 @@ def localise(
     with (
         open_observations(localising(config, saved), print_status) as (completed, source),
         open_runner(completed, source, directory, observers=observers) as runner,
+        catch_interrupt(LAST_TASK),
     ):
         interrupted = process_source(runner, source)
         card = runner.finish(interrupted)

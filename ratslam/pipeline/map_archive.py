@@ -118,8 +118,8 @@ def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+def write_arrays(path: Path, arrays: dict[str, Any], compressed: bool = True) -> None:
     """Writes the arrays to a file that may be moved to its place afterwards."""
     with path.open("wb") as file:  # with a path, NumPy would add a suffix
-        np.savez_compressed(file, **arrays)
+        (np.savez_compressed if compressed else np.savez)(file, **arrays)
     flush_to_disk(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import signal
 import sys
 import threading
@@ -9,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from types import FrameType
 
 from tqdm import tqdm
 
@@ -24,6 +26,10 @@ from robot.sources.source import Source
 from tactile.base.errors import InputError, printable
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
+
+LAST_TASK = "finishing this chunk and writing the results"
+RETRY = 0.01
+"""Time after which a Ctrl-C that came at a bad moment is sent again, s."""
 
 
 def run(
@@ -45,6 +51,7 @@ def run(
     with (
         open_observations(config, print_status) as (completed, source),
         open_runner(completed, source, directory, resume, observers=observers) as runner,
+        catch_interrupt(LAST_TASK),
     ):
         interrupted = process_source(runner, source)
         return runner.finish(interrupted), interrupted
@@ -55,15 +62,21 @@ def process_source(runner: Runner, source: Source) -> bool:
 
     Returns:
         whether Ctrl-C ended it early.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C ended it before the first sample.
     """
     samples = islice(iter(source), runner.skipped, None)
     total = None if source.length is None else source.length - runner.skipped
     bar = tqdm(total=total, unit="step", desc=printable(source.name), file=sys.stderr, mininterval=0.5)
-    with bar, catch_interrupt("finishing this chunk and writing the results") as interrupted:
+    with bar, catch_interrupt(LAST_TASK) as interrupted:
+        begun = False
         while not interrupted() and (chunk := list(islice(samples, CHUNK - runner.session.steps % CHUNK))):
-            steps = runner.process(chunk)
+            begun, steps = True, runner.process(chunk)
             bar.update(len(chunk))
             bar.set_postfix(places=int(steps[-1].estimate.place) + 1, refresh=False)
+        if interrupted() and not begun:
+            raise KeyboardInterrupt
         return interrupted()
 
 
@@ -119,11 +132,36 @@ def open_recorder(path: Path, source: Source) -> Recorder:
     )
 
 
+class _Interrupts:
+    """Handler of Ctrl-C: the first is noted, the second raises `KeyboardInterrupt`, and further ones are
+    ignored, because what the second has left is being closed.
+
+    Args:
+        last_task: printed at the first: the work left before the program ends.
+    """
+
+    def __init__(self, last_task: str) -> None:
+        self._last_task, self._count = last_task, 0
+
+    def pressed(self) -> bool:
+        return self._count > 0
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self._count == 1 and _is_collecting(frame):  # Python would print the exception and go on
+            threading.Timer(RETRY, os.kill, (os.getpid(), signal.SIGINT)).start()
+            return
+        self._count += 1
+        if self._count == 1:
+            print(f"\nratslam: interrupted; {self._last_task} ...", file=sys.stderr)
+        elif self._count == 2:
+            raise KeyboardInterrupt
+
+
 @contextmanager
 def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
     """Yields a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`.
 
-    In a thread other than the main one Ctrl-C is not caught.
+    Within another such block it is that block's. In a thread other than the main one Ctrl-C is not caught.
 
     Args:
         last_task: printed at the first Ctrl-C: the work left before the program ends.
@@ -131,19 +169,24 @@ def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    pressed: list[int] = []
-
-    def press(number: int, frame: Any) -> None:
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(number)
-        print(f"\nratslam: interrupted; {last_task} ...", file=sys.stderr)
-
-    before = signal.signal(signal.SIGINT, press)
+    before = signal.getsignal(signal.SIGINT)
+    if isinstance(before, _Interrupts):
+        yield before.pressed
+        return
+    handler = _Interrupts(last_task)
+    signal.signal(signal.SIGINT, handler)
     try:
-        yield lambda: bool(pressed)
+        yield handler.pressed
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _is_collecting(frame: FrameType | None) -> bool:
+    """Whether a frame is that of a callback of the garbage collector (JAX has one), or is called by it."""
+    codes = [getattr(callback, "__code__", None) for callback in gc.callbacks]
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
+    return frame is not None
 
 
 def print_status(sentence: str) -> None:

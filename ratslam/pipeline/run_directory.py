@@ -6,6 +6,7 @@ interrupt, a kill or a full disk leaves a readable prefix.
 
 from __future__ import annotations
 
+import fcntl
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,14 +29,17 @@ STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error
 class RunDirectory:
     """A new run directory; a context manager that closes its text files.
 
+    Its process holds a lock on steps.csv, by which a run is told from one that was killed.
+
     Args:
-        columns: columns of steps.csv that the backend adds.
+        columns: columns of steps.csv that the backend adds. manifest: the first text of manifest.json, which
+            is there before the other files.
 
     Raises:
         InputError: the directory exists or cannot be created.
     """
 
-    def __init__(self, path: Path, columns: Iterable[str] = ()) -> None:
+    def __init__(self, path: Path, columns: Iterable[str] = (), manifest: str = "") -> None:
         self.path = path
         require_new_file(path, parents=True)
         try:
@@ -44,7 +48,11 @@ class RunDirectory:
             raise InputError(
                 str(path), f"cannot be created ({error.strerror})", "a writable folder"
             ) from None
+        if manifest:
+            self.text("manifest.json", manifest)
         self._streams = {name: (path / name).open("x", encoding="utf-8", newline="") for name in STREAMS}
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(self._streams["steps.csv"], fcntl.LOCK_EX)
         heads = {"steps.csv": ",".join((*COLUMNS, *columns)), "online_error.csv": "t,error"}
         heads["timing.csv"] = "step,steps,seconds"
         self.append({name: head + "\n" for name, head in heads.items()})

@@ -33,7 +33,7 @@ from ratslam.pipeline.artifacts import (
 )
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.cell_recorder import open_cell_recorder
-from ratslam.pipeline.continuation import resume_session
+from ratslam.pipeline.continuation import checkpoint_of, resume_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.map_changes import save_changes
 from ratslam.pipeline.map_results import score_and_plot, write_map_results
@@ -44,15 +44,16 @@ from ratslam.pipeline.saved_map import NAME, describe_readings, read_map, write_
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of
-from tactile.base.errors import InputError
+from tactile.base.atomic_write import temporary_path
 from tactile.base.se2 import compose, tum_line
 from tactile.base.types import Observation
 from tactile.whiskers.head_geometry import ur10_head
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
-"""Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more.
-A run continued after a kill repeats at most these. The interval grows, because each checkpoint holds the
-whole run and would make the total cost O(N^2) at a fixed interval."""
+"""Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more,
+but at most twice the steps before the first of the two. A run continued after a kill repeats at most these.
+The interval grows, because each checkpoint holds the whole run and would make the total cost O(N^2) at a
+fixed interval."""
 
 
 class Runner:
@@ -83,7 +84,8 @@ class Runner:
         self._odometry_pose = np.zeros(3)
         self._truth = GrowableArray((3,), np.float64)
         self._online_error = OnlineErrorLog(session.steps)
-        self._saved, self._estimate = session.steps, estimate
+        self._begun = self._saved = session.steps
+        self._estimate, self._readings = estimate, describe_readings(source)
         self._cells = open_cell_recorder(config, source, session.backend, directory.path)
         self._observers, self._schedule = observers, MapSchedule(session.steps)
         for observer in observers:
@@ -113,9 +115,9 @@ class Runner:
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
             self._directory.append({"online_error.csv": f"{float(samples[-1].time)!r},{error!r}\n"})
-        if self.session.steps - self._saved >= max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE):
-            self._checkpoint()
-            self._saved = self.session.steps
+        longest = max(CHECKPOINT_EVERY, self.session.steps // CHECKPOINT_SHARE)
+        if self.session.steps - self._saved >= min(longest, max(CHUNK, 2 * (self._saved - self._begun))):
+            self.checkpoint()
         if self._observers:
             self._report(samples, observations, steps, odometry)
         return steps
@@ -129,8 +131,36 @@ class Runner:
         Args:
             interrupted: whether the source has more samples.
         """
+        status = "interrupted" if interrupted else "complete"
+        file = self._directory.path / NAME
+        # Of a complete run it appears last: after a kill before, there are samples to go on with.
+        made = file if interrupted else temporary_path(file)
+        self._write_map(made, compressed=True)  # before a solution moves poses
+        try:
+            card = self._write_results()
+        finally:
+            made.replace(file)
+        manifest = self._manifest | {"status": status, "steps": self.session.steps}
+        self._directory.text("manifest.json", _manifest_text(manifest))
+        for observer in self._observers:
+            observer.finish(
+                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
+            )
+        return card
+
+    def checkpoint(self) -> None:
+        """Writes the map file."""
+        self._write_map(self._directory.path / NAME, compressed=False)
+        self._saved = self.session.steps
+
+    def _write_map(self, path: Path, compressed: bool) -> None:
+        write_map(
+            path, self.session, self._config, self._readings,
+            recording=self._source.digest, estimate=self._estimate, compressed=compressed,
+        )  # fmt: skip
+
+    def _write_results(self) -> Scorecard:
         directory, config = self._directory, self._config
-        self._checkpoint()
         time = np.loadtxt(directory.path / "online.tum", usecols=0, ndmin=1)
         write_map_results(directory.path, self.session.map, time)
         if self._cells is not None:
@@ -139,14 +169,7 @@ class Runner:
         save_closure_views(self._images, directory)
         save_grid_map(directory)
         save_changes(self.session.map, config.touch, directory)
-        card = score_and_plot(directory.path, config.score)
-        status = "interrupted" if interrupted else "complete"
-        _write_manifest(directory, self._manifest | {"status": status, "steps": self.session.steps})
-        for observer in self._observers:
-            observer.finish(
-                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
-            )
-        return card
+        return score_and_plot(directory.path, config.score)
 
     def _report(
         self,
@@ -171,12 +194,6 @@ class Runner:
     def _map_report(self) -> MapReport:
         session = self.session
         return MapReport(session.map.judged_closures(), session.backend.activity(session.state))
-
-    def _checkpoint(self) -> None:
-        write_map(
-            self._directory.path / NAME, self.session, self._config, describe_readings(self._source),
-            recording=self._source.digest, estimate=self._estimate,
-        )  # fmt: skip
 
 
 @contextmanager
@@ -204,17 +221,18 @@ def open_runner(
     build_metrics(config.score.metrics)
     check_finished_map(config, source)
     session = session or build_session(config, source)
-    skip, estimate = resume_session(session, resume, config, source) if resume else (0, START)
-    if source.length is not None and source.length <= skip:
-        found = f"already holds all {skip} samples of {source.name}"
-        raise InputError(str(resume), found, "that of an unfinished run")
-    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns()) as files:
-        text = dump(config)
+    begun = None if resume is None else checkpoint_of(resume)
+    skip, estimate = (0, START) if begun is None else resume_session(session, begun, config, source)
+    text = dump(config)
+    manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
+    running = _manifest_text(manifest | {"status": "running"})
+    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns(), running) as files:
         files.text("config.yaml", text)
-        manifest = _manifest(config, text, source, resume)
-        _write_manifest(files, manifest | {"status": "running"})
         save_world(source.info, files)
-        yield Runner(config, source, files, manifest, session, skip, observers, estimate)
+        runner = Runner(config, source, files, manifest, session, skip, observers, estimate)
+        if begun is not None:
+            runner.checkpoint()  # nothing else of this folder holds the map before
+        yield runner
 
 
 def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
@@ -285,11 +303,11 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
         check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
 
 
-def _write_manifest(directory: RunDirectory, content: dict[str, Any]) -> None:
-    directory.text("manifest.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
+def _manifest_text(content: dict[str, Any]) -> str:
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None) -> dict[str, Any]:
+def _manifest(config: RunConfig, text: str, source: Source) -> dict[str, Any]:
     made = source.info.simulation
     packages = ("ratslam", "jax", "jaxlib", "numpy", "scipy", "networkx")
     return {
@@ -300,5 +318,4 @@ def _manifest(config: RunConfig, text: str, source: Source, resume: Path | None)
         "simulation": made and made.model_dump(),
         "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
         "seeds": {"session": config.session.seed},
-        "continued": resume is not None,
     }

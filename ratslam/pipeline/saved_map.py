@@ -186,12 +186,14 @@ def write_map(
     recording: str = "",
     estimate: PoseEstimate = START,
     frontend: Mapping[str, np.ndarray] | None = None,
+    compressed: bool = True,
 ) -> None:
     """Writes a map file atomically: a reader, also after a kill or a power failure, finds the file that was
     there or the new one.
 
     Args, in addition to `SavedMap`:
-        source: as `describe_readings` gives it.
+        source: as `describe_readings` gives it. compressed: False takes a tenth of the time and thrice the
+            space.
     """
     arrays: dict[str, Any] = session.arrays() | {
         "format": np.array(FORMAT),
@@ -202,7 +204,7 @@ def write_map(
     arrays |= {ESTIMATE + name: value for name, value in estimate_arrays(estimate).items()}
     arrays |= {FRONTEND + name: np.asarray(value) for name, value in (frontend or {}).items()}
     arrays["sha256"] = np.array(digest_of(arrays))
-    write_atomically(path, lambda temporary: write_arrays(temporary, arrays))
+    write_atomically(path, lambda temporary: write_arrays(temporary, arrays, compressed))
 
 
 def describe_readings(source: Source) -> SourceDescription:

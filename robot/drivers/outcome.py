@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 
 class SessionOutcome(Enum):
-    """How a live session ended; the value tells the operator what to do."""
+    """How a live session ended; the value tells the operator what to do, if anything."""
 
-    COMPLETE = "nothing to do"
+    COMPLETE = ""
     REACHED = "the robot is at its last goal"
     BLOCKED = "no way to the goal is left: clear the way, or map it again"
     LOST = "the robot does not know where it is: start again where the map ended"
-    INTERRUPTED = "stopped by the operator; `run` on the recording maps the recorded part"
+    INTERRUPTED = "stopped by the operator"
     REFUSED = "the robot has not moved: correct what the self-test reports and start again"
     ARM_GONE = "check the controller and its network, then start again from the present pose"
     ARM_STALE = "no states from the controller: check the network and the controller's load"
@@ -38,7 +38,7 @@ class SessionOutcome(Enum):
     HEAD_GARBLED = "unreadable data from the head: check the cable and the decoder's settings"
     CLOCK_JUMPED = "a device's clock jumped: restart that device"
     DISK_FULL = "free disk space; the recording is complete up to that point"
-    MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording maps the recorded part"
+    MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording, if there is one, maps it"
 
     @property
     def planned(self) -> bool:
@@ -58,4 +58,4 @@ class Fault(NamedTuple):
     time: float
 
     def __str__(self) -> str:
-        return f"{self.outcome.name.lower()}: {self.detail}; {self.outcome.value}"
+        return "; ".join(filter(None, [f"{self.outcome.name.lower()}: {self.detail}", self.outcome.value]))

@@ -15,7 +15,7 @@ import numpy as np
 from robot.recordings.bags.bag import container_fault
 from robot.recordings.cdr_live import Event
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
-from robot.recordings.mcap_scanner import McapScanner, is_foreign
+from robot.recordings.mcap_scanner import UNCLOSED, McapScanner, is_foreign
 from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.recorder import Recorder
 from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
@@ -77,6 +77,8 @@ class Recording(ClosedSource):
         self.warning = ""
         if self.truncated:
             self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
+        if scanner.broken == UNCLOSED:
+            self.warning = f"{path}: {UNCLOSED}; all {self.length} samples are there that were written"
         rows = np.frombuffer(columns).reshape(scanner.count, -1)
         inside = judge.stretch.rows(rows[:, 0], str(path))
         self._first, self._last = int(inside.argmax()), len(inside) - int(inside[::-1].argmax())

@@ -23,32 +23,45 @@ CHUNK_LIMIT = 1 << 28  # bytes; ratslam writes 64 kB, or one sample if that is l
 DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
+class Unclosed(EndOfFile):
+    """The file ends after a whole record, as that of a killed writer does, and not with its closing one."""
+
+
 class _BoundedFile:
-    """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`."""
+    """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`.
+
+    Attributes:
+        left: bytes not read yet.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
-        self._left = file.seek(0, 2)
+        self.left = file.seek(0, 2)
         file.seek(0)
 
     def read(self, size: int) -> bytes:
-        if not 0 <= size <= self._left:
+        if not 0 <= size <= self.left:
             raise EndOfFile
         content = self._file.read(size)
         if len(content) != size:
             raise EndOfFile  # the file shrank meanwhile
-        self._left -= size
+        self.left -= size
         return content
 
 
 def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
     """All records in order, those in chunks included; raises one of `DAMAGE_ERRORS`."""
-    reader = StreamReader(cast(Any, _BoundedFile(file)), emit_chunks=True, validate_crcs=True)
-    for record in reader.records:
-        if isinstance(record, Chunk):
-            yield from _open_chunk(record)
-        elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
-            yield record
+    bounded, left = _BoundedFile(file), -1  # bytes after the last whole record
+    reader = StreamReader(cast(Any, bounded), emit_chunks=True, validate_crcs=True)
+    try:
+        for record in reader.records:
+            left = bounded.left
+            if isinstance(record, Chunk):
+                yield from _open_chunk(record)
+            elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
+                yield record
+    except EndOfFile as error:
+        raise Unclosed if left == 0 else error from None
 
 
 def _open_chunk(chunk: Chunk) -> list[McapRecord]:

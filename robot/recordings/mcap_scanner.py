@@ -21,7 +21,7 @@ from robot.drivers.head.cycle_assembly import FrameWindow, assemble_cycle, empty
 from robot.drivers.head.decoder import Frames
 from robot.recordings.cdr import MAX_NUMBERS, Malformed, decode, decode_truth
 from robot.recordings.cdr_live import Event, decode_cut, decode_event, decode_frames, decode_states
-from robot.recordings.mcap_records import DAMAGE_ERRORS, read_records
+from robot.recordings.mcap_records import DAMAGE_ERRORS, Unclosed, read_records
 from robot.recordings.schemas import ARM, CUT, FRAMES, READINGS, SCHEMA_OF, SCHEMAS, TRUTH
 from robot.sources.input_files import unreadable_error
 from robot.sources.source import Sample
@@ -30,6 +30,8 @@ from robot.sources.source_info import SourceInfo
 METADATA = "ratslam"
 FORMAT = "3"
 OURS = "ratslam "  # and the version: the library that wrote a recording
+UNCLOSED = "it ends without its closing record"
+"""Reason to stop at the end of a file whose writer was killed: all that was written is there."""
 
 
 class RecordingDescription(NamedTuple):
@@ -188,6 +190,7 @@ class McapScanner:
         except DAMAGE_ERRORS as error:
             text = str(error) or type(error).__name__
             self.broken = "it ends too early" if isinstance(error, EndOfFile) else text
+            self.broken = UNCLOSED if isinstance(error, Unclosed) and truth is None else self.broken
         else:
             self.broken = ""
 

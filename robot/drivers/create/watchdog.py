@@ -19,6 +19,7 @@ import time
 from robot.drivers.create import protocol
 from robot.drivers.create.serial_link import NoPort, PortBusy, SerialPort, open_port
 from robot.drivers.process_priority import become_urgent
+from robot.drivers.withheld_signals import withheld_signals
 from tactile.base.errors import InputError
 
 START_LIMIT = 10.0
@@ -41,13 +42,10 @@ class Watchdog:
 
     def __init__(self, port: str, patience: float, replug: float) -> None:
         command = [sys.executable, "-m", "robot.drivers.create.watchdog", port, repr(patience), repr(replug)]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-            start_new_session=True,  # an interrupt from the terminal must not end it first
-        )
+        with withheld_signals():  # they must not end it before the session
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
+            )
         self._patience = patience
         self._beaten = self._heard = -math.inf  # times of the last beat and of the last echo
         self._ready = threading.Event()

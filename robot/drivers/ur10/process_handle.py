@@ -15,6 +15,7 @@ from typing import Any
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.config import ArmConfig
 from robot.drivers.ur10.safety import Finding
+from robot.drivers.withheld_signals import withheld_signals
 
 CONNECTION_LOST = ("closed the connection", "Connection reset", "Connection refused", "End of file")
 
@@ -35,15 +36,17 @@ class ArmProcess:
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
         }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "robot.drivers.ur10.rtde_process", str(shared), config.model_dump_json()],
-            pass_fds=[shared],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            bufsize=0,
-            env=environment,
-        )
+        module = "robot.drivers.ur10.rtde_process"
+        with withheld_signals():
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", module, str(shared), config.model_dump_json()],
+                pass_fds=[shared],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                bufsize=0,
+                env=environment,
+            )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._orders, self._reports = self._process.stdin, self._process.stdout

@@ -197,7 +197,6 @@ def main(shared_fd: str, text: str) -> None:
     reports = os.dup(1)
     os.dup2(2, 1)
     os.set_blocking(0, False)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles interrupts
     become_urgent()
     config = ArmConfig.model_validate_json(text)
     shared = SharedState(int(shared_fd))

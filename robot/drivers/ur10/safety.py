@@ -12,7 +12,7 @@ import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.base_transform import tcp_tilt
-from robot.drivers.ur10.config import SPEED_CAP, TURN_CAP, ArmConfig
+from robot.drivers.ur10.config import SPEED_CAP, ArmConfig
 
 REACH = 3.0  # m; a UR-10 reaches 1.3. A larger distance means an invalid state
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way
@@ -110,8 +110,8 @@ def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None
 
     A controller gets the speed of the tool centre point only, and derives the turning rate from it
     (`turn_ratio`). A path shorter than speed^2 / acceleration, or than 1 mm, counts as a turn on the spot:
-    the tool cannot exceed `speed` on it at any commanded speed. On longer paths the move is slowed down so
-    that it turns by at most 1 rad/s.
+    the tool cannot exceed `speed` on it at any commanded speed. On longer paths the commanded speed is
+    `speed`, or less where the turning rate derived from it would exceed that on the spot.
     """
     target = check_target(config, target, from_tcp)
     speed = config.speed if speed is None else speed
@@ -123,7 +123,6 @@ def plan_move(config: ArmConfig, target: Any, from_tcp: Any, speed: float | None
         commanded = config.turn_rate / config.turn_ratio
     else:
         commanded = min(speed, config.turn_rate / config.turn_ratio if turn > way else speed)
-        commanded = min(commanded, TURN_CAP * way / turn) if turn else commanded
     seconds = max(way, turn / config.turn_ratio) / commanded + commanded / config.acceleration
     return Move(target, commanded, seconds, max(way, turn) / commanded + commanded / config.acceleration)
 

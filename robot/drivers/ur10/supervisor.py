@@ -198,7 +198,7 @@ class Supervisor:
         if off is None and self._ended(pending):
             self._done = pending.number
         elif off is not None and now > pending.deadline:
-            return Finding(SessionOutcome.NOT_ARRIVED, f"late, {off}")
+            return Finding(SessionOutcome.NOT_ARRIVED, f"late (planned: {pending.move.seconds:.0f} s), {off}")
         elif off is not None and self._ended(pending):
             self._elsewhere = self._elsewhere or now
             if now - self._elsewhere > ELSEWHERE_TIME:

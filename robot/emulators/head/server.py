@@ -43,8 +43,9 @@ def serve(config: HeadEmulatorConfig) -> None:
     """
     head = ur10_head(config.head)
     made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
-    with urgent(), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         whiskers = maze_whiskers(config, made.surroundings.walls, _place(config, made.path, stack))
+        stack.enter_context(urgent())  # not before: building takes a core
         asyncio.run(_run_server(config, EmulatedHead(config, whiskers, time.monotonic())))
 
 

@@ -58,14 +58,15 @@ def wait_for_steps(process, directory, size=400):
         time.sleep(0.005)
 
 
-def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path, number, code):
     config, whole = corridor
     process = start(config, tmp_path / "first")
     wait_for_steps(process, tmp_path / "first")
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, messages = process.communicate()
     first = tmp_path / "first"
-    assert process.returncode == 130, messages
+    assert process.returncode == code, messages
     assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
     # No closure yet, and so no views of one.
     assert {path.name for path in first.iterdir()} == FILES - {"closure_views.npz"}
@@ -129,3 +130,51 @@ def test_fifty_killed_runs_are_readable(corridor, tmp_path):
         rows.append(check_killed_run(corridor, tmp_path / str(k)))
     print("rows left by each kill:", rows)
     assert sum(count > 1 for count in rows) > 10
+
+
+def kill_and_continue(config, whole, directory, moment):
+    """Kills a run at a share of its steps, or so many s after its last step, and compares the continued one.
+
+    Args:
+        moment: share of the final size of steps.csv; above 1: one more than a time, s.
+    """
+    killed, rest = directory / "killed", directory / "rest"
+    process = start(config, killed)
+    size = (whole / "steps.csv").stat().st_size
+    wait_for_steps(process, killed, min(moment, 1.0) * size - 1)
+    if moment > 1:
+        time.sleep(moment - 1)
+    process.kill()
+    process.communicate()
+    (killed / ".1.map.npz").write_text("cut")  # as of a kill while a checkpoint is written
+    status = json.loads((killed / "manifest.json").read_text())["status"]
+    code = main(["run", str(config), "--continue", str(killed), "-o", str(rest)])
+    if status == "complete":  # the kill came too late
+        assert code == 2
+        rest = killed
+    else:
+        assert not list(killed.glob(".*.npz"))
+    with np.load(whole / "map.npz") as expected, np.load(rest / "map.npz") as found:
+        assert expected.files == found.files
+        assert [name for name in found.files if expected[name].tobytes() != found[name].tobytes()] == []
+    assert (whole / "trajectory.tum").read_text().endswith((rest / "trajectory.tum").read_text())
+    return json.loads((rest / "manifest.json").read_text()).get("first_step", 0)
+
+
+@pytest.mark.parametrize(("moment", "begins"), [(0.0, "anew"), (0.6, "amid"), (1.0, "amid")])
+def test_a_killed_run_continues_to_the_same_bits(corridor, tmp_path, moment, begins, capsys):
+    """Before its first checkpoint, amid its steps, and while its results are written."""
+    first = kill_and_continue(*corridor, tmp_path, moment)
+    assert ("killed before its first checkpoint" in capsys.readouterr().err) == (begins == "anew")
+    assert (first > 0) == (begins == "amid")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("number", range(30))
+def test_thirty_killed_runs_of_the_maze_continue_to_the_same_bits(number, tmp_path, tmp_path_factory):
+    whole = tmp_path_factory.getbasetemp() / "maze"
+    if not whole.exists():
+        assert main(["run", "whisker_maze", "-o", str(whole)]) == 0
+    moment = 1.15 * np.random.default_rng(0).random(30)[number]  # with the writing of the results
+    moment = moment if moment < 1 else 1 + 20 * (moment - 1)
+    print("continued after step", kill_and_continue("whisker_maze", whole, tmp_path, moment))

@@ -76,6 +76,13 @@ def killed(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def running(tmp_path):
+    """A run that makes no steps."""
+    with run_in_progress(tmp_path / "run"):
+        yield tmp_path / "run"
+
+
 def test_a_run_in_progress_is_watched_to_its_end_and_is_not_changed(alone, tmp_path):
     folder = tmp_path / "run"
     lines, pictures = [], []
@@ -117,21 +124,25 @@ def test_a_finished_run_is_seen_as_it_is_read(alone, tmp_path, capsys):
     assert np.isfinite(seen.sd).all()
 
 
-def test_a_killed_run_is_given_up_after_a_long_silence(killed, tmp_path, capsys):
+def test_a_killed_run_is_given_up_at_once(killed, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(killed, folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert main(["watch", str(folder), "--once"]) == 0
-    assert "the run was killed" not in capsys.readouterr().out
-    for path in folder.iterdir():
-        os.utime(path, (0, time.time() - 100))
-    assert main(["watch", str(folder), "--patience", "50"]) == 0
+    assert main(["watch", str(folder)]) == 0
     output = capsys.readouterr().out
-    assert "run: running" in output
-    assert "silent for 100 s\n" in output
-    assert "the run was killed" in output
+    assert "run: killed" in output
+    assert f"the run was killed; `run --continue {folder}` continues" in output
     assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
     assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
+
+
+def test_a_run_that_hangs_is_given_up_after_a_long_silence(running, capsys):
+    for path in running.iterdir():
+        os.utime(path, (0, time.time() - 100))
+    assert main(["watch", str(running), "--patience", "50"]) == 0
+    output = capsys.readouterr().out
+    assert "run: running" in output
+    assert "silent for 100 s\nno output for 100 s: the run was killed" in output
 
 
 def test_the_picture_beside_a_session_shows_its_end(alone, tmp_path):
@@ -149,7 +160,7 @@ def test_the_picture_beside_a_session_shows_its_end(alone, tmp_path):
 def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(killed, folder)
-    assert RunMonitor(folder).read().status == RUNNING
+    assert RunMonitor(folder).read().status == "killed"
     (folder / SESSION_REPORT).write_text(json.dumps({"outcome": "mapper_gone"}))
     assert main(["watch", str(folder)]) == 0  # ends, without patience
     said = capsys.readouterr().out
@@ -160,12 +171,12 @@ def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_
         RunMonitor(folder).read()
 
 
-def test_ctrl_c_ends_it_and_no_engine_is_loaded(killed):
+def test_ctrl_c_ends_it_and_no_engine_is_loaded(running):
     code = (
         "import signal, sys\n"
         "from ratslam.__main__ import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it\n"
-        f"code = main(['watch', {str(killed)!r}, '--every', '0.05', '--patience', '1e6'])\n"
+        f"code = main(['watch', {str(running)!r}, '--every', '0.05', '--patience', '1e6'])\n"
         "print('jax' in sys.modules, code)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)

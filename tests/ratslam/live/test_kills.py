@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ratslam.cli import main
 from robot.recordings.mcap_reader import Recording, recover
+from robot.recordings.mcap_scanner import UNCLOSED
 from tactile.base.random_streams import stream
 from tests.helpers.live import PATIENCE, until
 from tests.ratslam.live.bench import Bench
@@ -60,38 +62,74 @@ def test_the_parent_is_killed_in_motion(bench: Bench) -> None:
     until(lambda: bench.head.state()["resting"], "the whiskers are retracted")
 
 
+@pytest.mark.parametrize(("sent", "code_of"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("number", NUMBERS)
-def test_an_interrupt_ends_the_session(bench: Bench, number: int) -> None:
-    """At any moment: a controlled stop, and a complete recording up to then."""
+def test_an_interrupt_ends_the_session(bench: Bench, number: int, sent: int, code_of: int) -> None:
+    """At any moment, sent to all of its processes: a controlled stop, and a complete recording up to then."""
     with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
         session.wait_for("disk:")
         time.sleep(float(stream(number, "interrupted").uniform(0.0, 5.0)))
         at = bench.moment()
-        session.process.send_signal(signal.SIGINT)
+        os.killpg(session.process.pid, sent)
         code = session.code()
         stands(bench)
+        until(lambda: not session.lives(), "nothing of it stays")
         assert "Traceback" not in session.output()
         if session.directory.exists() and (session.directory / "session.mcap").exists():
             outcome = session.report()["outcome"]
-            assert (outcome, code) in {("interrupted", 130), ("complete", 0)}
+            assert (outcome, code) in {("interrupted", code_of), ("complete", 0)}
             if outcome == "interrupted":
                 ended(bench, session, outcome, at)
         else:
-            assert code == 130
+            assert code == code_of
             assert "interrupted" in session.output()
+            assert "recording" not in session.output()
         assert bench.arm.state()["watchdog_stops"] == bench.starved
 
 
 def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None:
     """The second interrupt waits for the arm only."""
     with bench.in_motion() as session:
-        session.process.send_signal(signal.SIGINT)
-        time.sleep(0.005)
-        session.process.send_signal(signal.SIGINT)
+        for _ in range(3):  # the third is ignored
+            session.process.send_signal(signal.SIGINT)
+            time.sleep(0.005)
         assert session.code() == 130
+        assert "Traceback" not in session.output()
         stands(bench)
         until(lambda: bench.arm.state()["runtime"] == "STOPPED", "its program is ended")
         recovered(session.directory / "session.mcap")
+
+
+def test_interrupts_while_it_finishes_leave_the_report(bench: Bench) -> None:
+    with bench.session(mapper=None, whisks=4) as session:
+        session.wait_for("4/4")
+        for _ in range(3):
+            session.process.send_signal(signal.SIGINT)
+            time.sleep(0.1)
+        assert session.code() in (0, 130)
+        assert session.report()["outcome"] in ("complete", "interrupted")
+        assert "Traceback" not in session.output()
+        assert "nothing to do" not in session.output()
+        until(lambda: not session.lives(), "nothing of it stays")
+
+
+@pytest.mark.parametrize("number", [*FEW, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, 31))])
+def test_a_killed_session_is_mapped_again_to_the_same_bits(bench: Bench, number: int, tmp_path: Path) -> None:
+    """With its mapper, or alone: the mapper then completes the run."""
+    with bench.session(mapper=None, waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
+        session.wait_for("armed")
+        time.sleep(float(stream(number, "mapped").uniform(1.0, 8.0)))
+        (os.kill if number % 2 else os.killpg)(session.process.pid, signal.SIGKILL)
+        until(lambda: not session.lives(), "nothing of it stays")
+        live = session.directory
+        recorded, mapped = session.recorded(), (live / "online.tum").read_text()
+        assert recorded.broken in ("", UNCLOSED)  # "": it was complete
+        assert len(recorded.samples) >= mapped.count("\n")
+        if recorded.samples:
+            assert main(["run", str(live / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
+            for name in ("online.tum", "odometry.tum", "steps.csv"):
+                assert (tmp_path / "again" / name).read_text().startswith((live / name).read_text())
+        print(f"{len(recorded.samples)} samples recorded, {mapped.count(chr(10))} mapped live")
 
 
 def test_the_disk_is_full(bench: Bench) -> None:

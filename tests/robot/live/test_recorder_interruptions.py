@@ -20,7 +20,7 @@ from robot.drivers.head.cycle_assembly import (
 from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import SessionOutcome
 from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_scanner import UNCLOSED, McapScanner
 from robot.recordings.mcap_writer import WholeChunkFile
 from tests.robot.live.live_recordings import (
     RATE,
@@ -92,7 +92,7 @@ def check_loss(folder: Path, seconds: float) -> None:
     assert blocks > 20
     assert blocks - (newest + 1) / 20 <= 20  # 0.2 s of the session
     assert whisks <= scanner.count <= whisks + 1
-    assert scanner.broken == "it ends too early"
+    assert scanner.broken == UNCLOSED
 
 
 def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:

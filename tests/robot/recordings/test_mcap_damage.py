@@ -124,4 +124,7 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Pat
     source = Recording(path)
     assert 20 <= source.length <= 25
     assert source.truncated
-    assert f"{source.length} samples are readable, the rest is lost: it ends too early" in source.warning
+    ends = f"it ends without its closing record; all {source.length} samples are there that were written"
+    assert source.warning == f"{path}: {ends}"
+    path.write_bytes(path.read_bytes()[:-1])  # cut in the middle of a message
+    assert "the rest is lost: it ends too early" in Recording(path).warning

@@ -112,6 +112,15 @@ def test_planned_speeds_are_within_the_settings(speed: float, target: np.ndarray
     np.testing.assert_array_equal(check_command(CONFIG, move.target, start, move.speed), target)
 
 
+@pytest.mark.parametrize("way", [0.0, 0.0031, 0.0063, 0.02, 0.1])
+def test_a_turn_on_a_short_way_takes_no_longer_than_one_on_a_long_way(way: float) -> None:
+    start = tcp_from_pose(CONFIG.placing, np.array([0.6, 0.45, 0.0]))
+    target = tcp_from_pose(CONFIG.placing, np.array([0.6 + way, 0.45, np.radians(176)]))
+    move = plan_move(CONFIG, target, start, 0.03)
+    assert rotation_angle(start, target) / move.seconds > 0.1  # rad/s
+    assert move.most < 120
+
+
 @given(st.one_of(anything, st.floats(0.0501, 0.3)), down, down)
 def test_the_last_check_refuses_faster_commands(speed: float, target: np.ndarray, start: np.ndarray) -> None:
     assume(np.linalg.norm(target[:3] - start[:3]) > 0.01)
