@@ -32,7 +32,7 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     if len(seen.path):
         _paint(axes, seen, walls)
     axes.apply_aspect()
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.TRUTH if np.isfinite(seen.truth).any() else style.MAP)
     _paint_counts(figure, seen, style.LEFT + inner + 0.25)
     if len(seen.path):
         style.add_legend(figure, axes)
