@@ -56,9 +56,10 @@ def draw_map(
     """Draws the map over truth and raw odometry with equal axes.
 
     All is in the frame of the map, in which commands take places: truth and walls are aligned to the map, and
-    odometry to the truth, as for ATE; without truth, odometry starts at the first pose of the map. Of a map of
-    several pieces it is the frame of `run.main`. The plot shows all of truth, walls and map, and odometry near them. In a maze laps
-    overlap, so the trajectory and the loop closures are drawn instead of experiences and links.
+    odometry to the truth, as for ATE; without truth, odometry starts at the first pose of the map. Of a map
+    of several pieces it is the frame of `run.main`. The plot shows all of truth, walls and map, and odometry
+    near them. In a maze laps overlap, so the trajectory and the loop closures are drawn instead of
+    experiences and links.
 
     Args:
         run: the run. card: its scorecard, for the subtitle.
