@@ -46,6 +46,7 @@ def find_map_way(
     """
     motion = MotionConfig()
     graph = travel_graph(made.graph(), Travel(motion.speed, motion.turn_rate))
+    last = experience_at(graph, goal, FARTHEST, "--to")
     if start is None:
         first = (
             nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
@@ -57,7 +58,6 @@ def find_map_way(
             raise InputError("--from", found, "a robot on driven ground", "give X,Y or an experience")
     else:
         first = experience_at(graph, start, FARTHEST, "--from")
-    last = experience_at(graph, goal, FARTHEST, "--to")
     return find_way(graph, first, experiences_near(graph, last, TOLERANCE), mode)
 
 
