@@ -12,9 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from ratslam.cli import build_parser
-from ratslam.config.run_config import RunConfig
+from ratslam.cli import build_parser, main
+from ratslam.config.packaged import find_config, packaged_configs
+from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import override, parse, validate
+from ratslam.experiments.studies.study import check_study, read_study
 
 ROOT = Path(__file__).parents[1]
 READMES = sorted(
@@ -31,12 +33,15 @@ def blocks(text: str, *languages: str) -> list[str]:
     return [body for language, body in found if language in languages]
 
 
+PROGRAMS = ("python -m ", "make ", "pip ")
+
+
 def commands(path: Path) -> Iterator[str]:
-    """Commands of the program in a README, comments removed."""
+    """Commands in a README, a continued one as one line, comments removed."""
     for block in blocks(path.read_text(encoding="utf-8"), "", "sh", "bash"):
-        for line in block.splitlines():
-            if line.startswith("python -m ratslam "):
-                yield line.split("  #")[0].strip()
+        for line in block.replace("\\\n", "").splitlines():
+            if line.startswith(PROGRAMS):
+                yield re.split(r"\s+#", line)[0]
 
 
 def name(path: Path) -> str:
@@ -45,13 +50,38 @@ def name(path: Path) -> str:
 
 PYTHON = [path for path in READMES if blocks(path.read_text(encoding="utf-8"), "python")]
 COMMANDS = [(name(path), command) for path in READMES for command in commands(path)]
+MARKED = {
+    "robot": (
+        "live ", "emulate ", "robot.emulators", "doctor --live", "run runs/", "run square -o runs/shown",
+    ),
+    "data": (
+        "doctor ", "fit ", "run mine", "run tuesday", "localise runs/monday", "merge runs/monday",
+        "tools recover", "tools convert", "pip ",
+    ),
+    "hours": ("study ", "size ", "reproduce ", "check ", "make "),
+}  # fmt: skip
+"""The only commands that no test types, by their beginnings: they need a robot (or a screen), data of one's
+own, or minutes to hours. They are parsed, and their configurations validated; most have tests elsewhere."""
+REFUSED = {"python -m ratslam run square --continue runs/square/map.npz": "already holds all 349 samples"}
+"""What is refused, as its README says: that run was not interrupted."""
+SLOW = (
+    "run create_arena", "run rat_box", "run whisker_maze", "simulate ", "export runs/rat", "timeit ",
+    "run square -o runs/seen",
+)  # fmt: skip
+"""Commands that take longest: for `make soak`."""
+
+
+def begins(command: str, starts: tuple[str, ...]) -> bool:
+    return command.removeprefix("python -m ").removeprefix("ratslam ").startswith(starts)
+
+
+def is_marked(command: str) -> bool:
+    return any(begins(command, starts) for starts in MARKED.values())
 
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the repository's root, in which blocks may write files."""
-    for part in ("configs", "tests"):
-        (tmp_path / part).symlink_to(ROOT / part)
+    """A new folder, in which blocks may write files."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -78,26 +108,78 @@ def test_python_blocks_run(readme: Path) -> None:
         exec(compile(block, name(readme), "exec"), {"__name__": "__main__"})
 
 
-@pytest.mark.parametrize(("readme", "command"), COMMANDS)
+@pytest.mark.parametrize(("readme", "command"), [given for given in COMMANDS if "ratslam" in given[1]])
 def test_commands_are_valid(readme: str, command: str) -> None:
-    words = shlex.split(command)[3:]
+    """Options and names, and of a packaged configuration also what `--set` sets."""
+    words = shlex.split(command.partition(" ratslam ")[2])
+    if not command.startswith("python -m ratslam "):
+        return
     if "--list" in words:
         with pytest.raises(SystemExit, match=r"^0$"):
             build_parser().parse_args(words)
+        return
+    given = build_parser().parse_args(words)
+    assert callable(given.command)
+    config = getattr(given, "config", getattr(given, "recording", None))
+    if words[0] == "study" and not given.preset:
+        read_study(find_config(config), given.set)
+    elif str(config) in packaged_configs() and getattr(given, "preset", None) != "cells":
+        load_config(config, given.set)
+
+
+TYPED = {path: [command for command in commands(path) if not is_marked(command)] for path in READMES}
+
+
+@pytest.mark.parametrize(
+    ("readme", "slow"),
+    [
+        pytest.param(path, slow, marks=pytest.mark.soak if slow else (), id=f"{name(path)}{'-all' * slow}")
+        for path, typed in TYPED.items()
+        for slow in (False, True)
+        if any(begins(command, SLOW) == slow for command in typed)
+    ],
+)
+def test_commands_run(readme: Path, slow: bool, tmp_path: Path, monkeypatch, capsys) -> None:
+    """In a new folder, one after another, as a reader would type them."""
+    monkeypatch.chdir(tmp_path)
+    for command in TYPED[readme]:
+        if begins(command, SLOW) and not slow:
+            continue
+        words = shlex.split(command)
+        if words[2] != "ratslam":
+            assert subprocess.run([sys.executable, *words[1:]], cwd=ROOT).returncode == 0, command
+            continue
+        try:
+            code = main(words[3:])
+        except SystemExit as ended:  # of --list
+            code = ended.code
+        error = capsys.readouterr().err
+        assert code == (2 if command in REFUSED else 0), f"{command}\n{error}"
+        assert REFUSED.get(command, "") in error
+
+
+YAML = [(name(path), text) for path in READMES for text in blocks(path.read_text(encoding="utf-8"), "yaml")]
+
+
+@pytest.mark.parametrize(("readme", "text"), YAML)
+def test_settings_are_valid(readme: str, text: str) -> None:
+    if "studies" in readme:
+        check_study("study", parse(text.replace("whisker_maze.yaml", "whisker_maze"), readme), ROOT)
     else:
-        assert callable(build_parser().parse_args(words).command)
+        validate(parse(text, readme), LoopConfig)
 
 
-@pytest.mark.soak
-def test_commands_of_the_root_readme_run(tmp_path: Path) -> None:
-    """In a fresh copy of the repository, one after another, as a reader would type them."""
-    clone = tmp_path / "clone"
-    subprocess.run(["git", "clone", "--quiet", "--depth=1", ROOT.as_uri(), str(clone)], check=True)
-    environment = os.environ | {"PYTHONPATH": str(clone)}
-    for command in commands(clone / "README.md"):
-        arguments = [sys.executable, *shlex.split(command)[1:]]
-        done = subprocess.run(arguments, cwd=clone, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, f"{command}\n{done.stderr}"
+def test_every_block_is_tried() -> None:
+    """Prose (text), a table of numbers and an entry point are the only blocks of other kinds."""
+    known = {"", "sh", "bash", "python", "yaml", "text", "toml"}
+    for path in READMES:
+        text = path.read_text(encoding="utf-8")
+        assert set(re.findall(r"^```(\w+)$", text, re.MULTILINE)) <= known, path
+        for block in blocks(text, "", "sh", "bash"):
+            lines = [line for line in block.splitlines() if line.startswith(PROGRAMS)]
+            assert lines or block.startswith("t,vx"), block
+    every = [start for starts in MARKED.values() for start in starts]
+    assert all(any(begins(command, (start,)) for _, command in COMMANDS) for start in every)
 
 
 @pytest.mark.parametrize("readme", READMES, ids=name)

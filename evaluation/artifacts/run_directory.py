@@ -55,23 +55,42 @@ def read_run(path: Path) -> RunArrays:
     true[known] = truth[row[known]]
     final = _tum(path / "trajectory.tum")[1] if (path / "trajectory.tum").exists() else online
     errors = path / "online_error.csv"
-    nodes, links = _map(path / "map.json")
+    nodes, links, node_piece = _map(path / "map.json")
     place = np.where(place[:steps] < len(nodes), place[:steps], -1)
-    created = np.array([int(np.argmax(place == node)) for node in range(len(nodes))], int)
-    return RunArrays(
+    run = RunArrays(
         time=time,
         truth=true if known.any() else None,
         online=online[:steps],
         final=final[:steps],
         odometry=odometry[:steps],
         experience=place,
-        created=created,
+        created=first_visits(place, len(nodes)),
         nodes=nodes,
         links=links,
         online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
         doubt=_doubt(path / "health.json"),
         piece=read_pieces(path / NAME, steps),
+        node_piece=node_piece,
+        state=_states(path / "localisation.csv", steps),
     )
+    return run._replace(node_piece=_localised_nodes(run)) if len(run.state) else run
+
+
+def first_visits(place: np.ndarray, nodes: int) -> np.ndarray:
+    """[nodes] the first step at each node by the node of each step [T]; -1 without one."""
+    first = np.full(nodes, -1)
+    known, step = np.unique(place, return_index=True)
+    first[known[known >= 0]] = step[known >= 0]
+    return first
+
+
+def _localised_nodes(run: RunArrays) -> np.ndarray:
+    """[M] the piece of the session in which each experience of its map is; below 0: in none."""
+    in_map, found = -1 - run.node_piece, np.flatnonzero(run.found)
+    if not len(found) or not len(run.nodes):
+        return in_map
+    nearest = np.hypot(*(run.nodes - run.final[found[-1]])[:, :2].T).argmin()
+    return np.where(in_map == in_map[nearest], run.main, in_map)
 
 
 def read_scorecard(path: Path) -> Scorecard:
@@ -170,15 +189,29 @@ def _doubt(path: Path) -> float:
         raise InputError(str(path), f"malformed ({error})", "the health.json of a run directory") from None
 
 
-def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [M, 3] and links [L, 2] of a node-link file; empty without the file."""
+def _states(path: Path, steps: int) -> np.ndarray:
+    """[N] the state of each step of a localised session; empty without the file."""
     if not path.exists():
-        return np.zeros((0, 3)), np.zeros((0, 2), int)
+        return np.zeros(0, str)
+    try:
+        states = [line.split(",")[1] for line in path.read_text(encoding="utf-8").splitlines()[1 : steps + 1]]
+    except IndexError:
+        states = []
+    if len(states) < steps:
+        raise InputError(str(path), "not a state for each step", f"{steps} lines step,state,...")
+    return np.array(states, str)
+
+
+def _map(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes [M, 3], links [L, 2] and pieces [M] of a node-link file; empty without the file."""
+    if not path.exists():
+        return np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0, int)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         nodes = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
+        piece = np.array([node.get("piece", 0) for node in content["nodes"]], int)
         links = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
     except (ValueError, KeyError, TypeError) as error:
         expected = "the map.json of a run directory"
         raise InputError(str(path), f"not a node-link map ({error})", expected) from None
-    return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2)
+    return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2), piece

@@ -46,24 +46,37 @@ def ate_within_pieces(estimate: np.ndarray, truth: np.ndarray, piece: np.ndarray
 
 
 def arrange_pieces(run: RunArrays) -> RunArrays:
-    """The run with its pieces where a picture shows them: each aligned to the truth by itself or, where that
-    is unknown, beside the one before. Within a piece nothing changes; a run of one piece is left as it is.
-    Online poses are moved with the pieces in which their steps end up."""
-    if not run.has_pieces:
+    """The run with its pieces where a picture shows them: `run.main` stays, in the frame of the map; the
+    others are aligned to the truth as that one is or, where that is unknown, stand beside the one before.
+    Within a piece nothing changes; a run of one piece is left as it is. Experiences and online poses move
+    with their pieces."""
+    of_node = run.node_piece
+    if not len(run.piece):
+        return run
+    if not len(of_node):
+        of_node = np.where(run.created < 0, run.main, run.piece[run.created])
+    numbers, sizes = np.unique(run.piece, return_counts=True)
+    order = [run.main, *numbers[np.argsort(-sizes, kind="stable")], *np.unique(of_node)]
+    pieces = [one for one in dict.fromkeys(map(int, order)) if one in run.piece or one in of_node]
+    if len(pieces) < 2:
         return run
     final, online, nodes = run.final.copy(), run.online.copy(), run.nodes.copy()
-    of_node = run.piece[run.created]
-    rows, right = truth_rows(run), 0.0
-    for one in np.unique(run.piece):
-        steps = run.piece == one
-        known = rows[steps[rows]]
-        moved = np.array([right, 0.0, 0.0]) - [*final[steps, :2].min(axis=0), 0.0]
-        if run.truth is not None and len(known):
-            moved = align(final[known], run.truth[known])
-        final[steps], online[steps] = compose(moved, final[steps]), compose(moved, online[steps])
-        nodes[of_node == one] = compose(moved, nodes[of_node == one])
-        right = final[steps, 0].max() + GAP * np.ptp(final[:, 0][run.piece == run.piece[0]])
-    return run._replace(final=final, online=online, nodes=nodes)
+    rows, to_map, shown = truth_rows(run), None, list[np.ndarray]()
+    for one in pieces:
+        steps, placed = run.piece == one, of_node == one
+        known, moved = rows[steps[rows]], np.zeros(3)
+        inside = np.concatenate([final[steps], nodes[placed]])
+        if to_map is not None and run.truth is not None and len(known):
+            moved = compose(to_map, align(final[known], run.truth[known]))
+        elif shown:
+            right = max(part[:, 0].max() for part in shown) + GAP * np.ptp(shown[0][:, 0])
+            moved[:2] = [right, shown[0][:, 1].min()] - inside[:, :2].min(axis=0)
+        for poses, own in ((final, steps), (online, steps), (nodes, placed)):
+            poses[own] = compose(moved, poses[own])
+        shown.append(compose(moved, inside))
+        if to_map is None and run.truth is not None and len(known):
+            to_map = align(run.truth[known], final[known])
+    return run._replace(final=final, online=online, nodes=nodes, node_piece=of_node)
 
 
 def tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:

@@ -8,7 +8,7 @@ from evaluation.metrics.trajectory import align
 from evaluation.monitor.progress import RunProgress, step_count
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
+from evaluation.plots.style import BLUE, GREY, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
 from tactile.base.se2 import between, compose
 
 _HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: total height, below the map, and width of the counts
@@ -32,7 +32,7 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     if len(seen.path):
         _paint(axes, seen, walls)
     axes.apply_aspect()
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.TRUTH if np.isfinite(seen.truth).any() else style.MAP)
     _paint_counts(figure, seen, style.LEFT + inner + 0.25)
     if len(seen.path):
         style.add_legend(figure, axes)
@@ -86,6 +86,6 @@ def _paint_counts(figure: style.Figure, seen: RunProgress, left: float) -> None:
     for row, (name, count) in enumerate(counts):
         low = _HEIGHT - style.TOP - 0.45 * (row + 1)
         bar = style.add_axes(figure, left, low, _COUNTS - 0.3, 0.1)
-        bar.barh([0, 0], [1, count / steps], color=[LINE_GREY, INK if name == "ok" else BLUE])
+        bar.barh([0, 0], [1, count / steps], color=[LINE_GREY, GREY if name == "ok" else BLUE])
         bar.set(xlim=(0, 1), ylim=(-0.4, 0.4), xticks=[], yticks=[])
-        bar.set_title(f"{name}  {count}", fontsize=8.5, color=LABEL_GREY, loc="left", pad=2)
+        bar.set_title(f"{name}  {count} steps", fontsize=8.5, color=LABEL_GREY, loc="left", pad=2)

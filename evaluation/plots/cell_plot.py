@@ -80,7 +80,9 @@ def draw_cells(title: str, maps: CellMaps) -> style.Figure:
     over heading."""
     cells, step = len(maps.rates), _LABEL + _SIDE + _DIAL + 0.1
     height = style.TOP + -(-cells // _COLUMNS) * step + 0.1
-    line = "activity at each true place and, below it, true heading; peak: share of the activity of all cells"
+    wide = float(maps.x_edges[-1] - maps.x_edges[0])
+    line = f"activity over {wide:.3g} m of true places, dark 0 to yellow its own peak, and over true heading"
+    line += "; peak: share of all"
     figure = style.new_figure(height, title, line)
     bits = information(maps.rates, maps.seconds)
     for k in range(cells):

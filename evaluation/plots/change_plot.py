@@ -10,9 +10,8 @@ from evaluation.artifacts.change_table import ChangeRow
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
-from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, wall_corners
-from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
-from tactile.base.se2 import compose
+from evaluation.plots.map_plot import IN_PLACE, NO_WALLS, bounds, draw_walls, wall_corners
+from evaluation.plots.style import BLUE, GREEN, GREY, PURPLE, VERMILLION
 
 _BOTTOM = 1.0  # inches below the axes
 _MARGIN = 0.06  # m around all
@@ -33,25 +32,28 @@ def draw_changes(
             surest first. walls: [B, 5] west, south, east, north, height, m, as the session found them; drawn
             with truth, in whose frame they are.
     """
-    found = run.piece == 0 if (run.piece == 0).any() else np.ones(len(run.final), bool)
-    rows = truth_rows(run)[found[truth_rows(run)]]
+    rows = truth_rows(run)[run.found[truth_rows(run)]]
     known = run.truth is not None and len(rows) > 0
-    move = align(run.final[rows], run.truth[rows]) if known and run.truth is not None else np.zeros(3)
-    path = np.where(found[:, None], compose(move, run.final)[:, :2], np.nan)
-    places = np.array([[change.x, change.y, 0.0] for change in changes]).reshape(-1, 3)
-    places = compose(move, places)[:, :2]
+    to_map = align(run.truth[rows], run.final[rows]) if known and run.truth is not None else IN_PLACE
+    path = np.where(run.found[:, None], run.final[:, :2], np.nan)
+    ground = run.nodes[run.node_piece == run.main]
+    places = np.array([[change.x, change.y] for change in changes]).reshape(-1, 2)
     shown = walls if known else NO_WALLS
-    low, high = bounds(path, places, wall_corners(shown))
+    seen = path if run.found.any() or len(ground) else np.zeros((1, 2))
+    low, high = bounds(seen, ground[:, :2], places, wall_corners(shown, to_map))
     low, high = low - _MARGIN, high + _MARGIN
     inner = style.WIDTH - style.LEFT - style.RIGHT
     tall = inner * (high - low)[1] / (high - low)[0]
-    figure = style.new_figure(tall + style.TOP + _BOTTOM, name, _headline(changes))
+    figure = style.new_figure(tall + style.TOP + _BOTTOM, name, _headline(run, changes))
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.MAP)
     if len(shown):
-        draw_walls(axes, shown)
-    axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label="path in the map")
+        draw_walls(axes, shown, to_map)
+    if len(ground):
+        axes.plot(*ground[:, :2].T, ".", color=GREY, ms=4, mew=0, zorder=2, label="experience of the map")
+    name = "path where found" if run.found.any() else "_"
+    axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label=name)
     _mark(axes, changes, places, (high - low).max())
     style.add_legend(figure, axes)
     return figure
@@ -78,9 +80,13 @@ def _rgb(color: str) -> tuple[float, float, float]:
     return to_rgb(color)
 
 
-def _headline(changes: Sequence[ChangeRow]) -> str:
+def _headline(run: RunArrays, changes: Sequence[ChangeRow]) -> str:
     if not changes:
-        return "the session agrees with the map"
+        known = run.found.sum()
+        where = f"in the {known:,} of {len(run.time):,} steps that were found"
+        return (
+            f"the session agrees with the map {where}" if known else "not found in the map: nothing compared"
+        )
     places = "place has" if len(changes) == 1 else "places have"
     surest = changes[0]
     return f"{len(changes)} {places} changed  ·  surest: {surest.evidence:.0f} nat in {surest.passes} passes"

@@ -133,7 +133,7 @@ def _paint(axes: style.Axes, panel: GridPanel) -> None:
         interpolation="nearest", zorder=0.5,
     )  # fmt: skip
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", autoscale_on=False)
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.MAP)
     axes.grid(visible=False)
     axes.tick_params(axis="x", pad=6)  # clear of the lowest tick label of the other axis
     if len(panel.segments):
@@ -147,12 +147,12 @@ def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) ->
 
     def name(word: str, path: np.ndarray) -> str:
         off = mean_position_error(path, truth) if errors else np.nan
-        return word if np.isnan(off) else f"{word}, error {off:.3f} m"
+        return word if np.isnan(off) else f"{word}, mean error {off:.3f} m"
 
     dashed = (0, (4, 2))
-    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("dead reckoning", odometry))
-    axes.plot(*truth.T, color=YELLOW, lw=2.4, alpha=0.8, zorder=4, label="true path")
-    axes.plot(*estimate.T, color=_SKY, lw=1.0, zorder=5, label=name("estimated path", estimate))
+    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("raw odometry", odometry))
+    axes.plot(*truth.T, color=YELLOW, lw=2.4, alpha=0.8, zorder=4, label="truth")
+    axes.plot(*estimate.T, color=_SKY, lw=1.0, zorder=5, label=name("online path", estimate))
     start = truth[np.isfinite(truth).all(axis=1)]
     if len(start):
         axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")

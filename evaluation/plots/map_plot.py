@@ -32,17 +32,22 @@ NAMED = 5
 """Number of pieces of a map with a colour of their own."""
 PIECES = (BLUE, ORANGE, GREEN, PURPLE, SKY, INK)
 """Colours of the largest pieces, and of all others."""
+IN_PLACE = np.zeros(3)
 NO_WALLS = np.zeros((0, 5))
 NO_CLOSURES = np.zeros((0, 2), int)
 
 
 class Layers(NamedTuple):
-    """Positions [.., 2] (m) to draw, in the frame of the truth if there is one."""
+    """Positions [.., 2] (m) to draw, in the frame of the map.
+
+    `to_map` [3] moves true poses there.
+    """
 
     truth: np.ndarray | None
     odometry: np.ndarray
     final: np.ndarray
     nodes: np.ndarray
+    to_map: np.ndarray = IN_PLACE
 
 
 def draw_map(
@@ -50,27 +55,32 @@ def draw_map(
 ) -> style.Figure:
     """Draws the map over truth and raw odometry with equal axes.
 
-    With truth, map and odometry are each aligned to it as for ATE; without, odometry starts at the first
-    pose of the map. The plot shows all of truth, walls and map, and odometry near them. In a maze laps
-    overlap, so the trajectory and the loop closures are drawn instead of experiences and links.
+    All is in the frame of the map, in which commands take places: truth and walls are aligned to the map, and
+    odometry to the truth, as for ATE; without truth, odometry starts at the first pose of the map. Of a map
+    of several pieces it is the frame of `run.main`. The plot shows all of truth, walls and map, and odometry
+    near them. In a maze laps overlap, so the trajectory and the loop closures are drawn instead of
+    experiences and links.
 
     Args:
         run: the run. card: its scorecard, for the subtitle.
         walls: [B, 5] west, south, east, north, height, m, in the frame of the truth; needs truth.
         closures: [n, 2] steps joined by loop closures; drawn with walls.
     """
+    known, localised = run.found.sum(), len(run.state) > 0
+    of = f"piece {run.main + 1}, the largest" if run.has_pieces and not localised else style.MAP
+    line = map_headline(card, f"found in {known:,} of {len(run.time):,} steps" if localised else "")
     run = arrange_pieces(run)
     layers = align_layers(run)
     shown = walls if layers.truth is not None else NO_WALLS
     box = _frame(layers, shown)
     width, height = box[1] - box[0]
     inner = style.WIDTH - style.LEFT - style.RIGHT
-    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, card.name, map_headline(card))
+    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, card.name, line)
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes)
+    style.metre_grid(axes, of)
     if len(shown):
-        draw_walls(axes, shown)
+        draw_walls(axes, shown, layers.to_map)
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
@@ -79,13 +89,13 @@ def draw_map(
     return figure
 
 
-def map_headline(card: Scorecard) -> str:
-    """The main quantities in one line."""
+def map_headline(card: Scorecard, found: str = "") -> str:
+    """The main quantities in one line, of a localised session what was `found` first."""
     within = card.quantities.get("ate_within_pieces")
     ate, online = card.quantities["ate_final"], card.quantities["ate_online"]
     count = card.quantities["experiences"].value
-    parts = [f"{count} experiences"] if count else []
-    if "pieces" in card.quantities:
+    parts = [found] * bool(found) + [f"{count} experiences{' of the map' * bool(found)}"] * bool(count)
+    if "pieces" in card.quantities and not found:
         count, share = (card.quantities[name].value for name in ("pieces", "unjoined_share"))
         parts.append(f"{count} pieces, {share:.0%} of the steps unjoined")
     if within is not None and within.value is not None:
@@ -101,51 +111,51 @@ def map_headline(card: Scorecard) -> str:
     return "  ·  ".join(parts)
 
 
-def draw_walls(axes: style.Axes, walls: np.ndarray) -> None:
-    """Draws walls [B, 5] in grey, tall ones darker."""
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Rectangle
+def draw_walls(axes: style.Axes, walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> None:
+    """Draws walls [B, 5], moved by `to_map` [3], in grey, tall ones darker."""
+    from matplotlib.collections import PolyCollection
 
     height = walls[:, 4]
     shade = _PALE + (_DARK - _PALE) * height / height.max()
-    boxes = [Rectangle((wall[0], wall[1]), wall[2] - wall[0], wall[3] - wall[1]) for wall in walls]
     greys = np.repeat(shade[:, None], 3, axis=1)
-    axes.add_collection(PatchCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
+    boxes = list(wall_corners(walls, to_map))
+    axes.add_collection(PolyCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
 
 
 def bounds(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The minimum and maximum coordinates [2] of points [.., 2]."""
-    every = np.concatenate(points)
+    every = np.concatenate([part.reshape(-1, 2) for part in points])
     return np.nanmin(every, axis=0), np.nanmax(every, axis=0)
 
 
-def wall_corners(walls: np.ndarray) -> np.ndarray:
-    """Two opposite corners [2 B, 2] of each wall."""
-    return np.concatenate([walls[:, :2], walls[:, 2:4]])
+def wall_corners(walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> np.ndarray:
+    """The four corners [B, 4, 2] of each wall [B, 5], moved by `to_map` [3]."""
+    corners = walls[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
+    return _xy(compose(to_map, np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=-1)))
 
 
 def align_layers(run: RunArrays) -> Layers:
-    """The layers of a run: map and odometry each aligned to the truth, as for ATE; without truth, odometry
-    starts at the first pose of the map."""
+    """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without truth,
+    odometry starts at the first pose of the map."""
     rows = truth_rows(run)
     if run.truth is None or len(rows) == 0:
         to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
         return Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
     true = run.truth[rows]
-    to_truth = align(run.final[rows], true)
-    odometry = compose(align(run.odometry[rows], true), run.odometry)
-    final, nodes = compose(to_truth, run.final), compose(to_truth, run.nodes)
-    return Layers(_xy(run.truth), _xy(odometry), _xy(final), _xy(nodes))
+    to_map = align(true, run.final[rows])
+    odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
+    truth = compose(to_map, run.truth)
+    return Layers(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
 
 
 def _xy(pose: np.ndarray) -> np.ndarray:
-    return np.asarray(pose)[:, :2]
+    return np.asarray(pose)[..., :2]
 
 
 def _frame(layers: Layers, walls: np.ndarray) -> np.ndarray:
     """Corners [[left, bottom], [right, top]] (m) around truth, walls, map and odometry near them."""
     truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(walls), *truth)
+    low, high = bounds(layers.final, layers.nodes, wall_corners(walls, layers.to_map), *truth)
     if len(walls) == 0:
         room = _ROOM * (high - low).max()
         far_low, far_high = bounds(layers.odometry)
@@ -159,14 +169,14 @@ def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
     from matplotlib.collections import LineCollection
 
     crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # thinner strokes for many experiences
-    truth, odometry, final, nodes = layers
+    truth, odometry, final, nodes, _ = layers
     if truth is not None:
         axes.plot(*truth.T, color=INK, lw=0.8, zorder=5, label="truth")
     axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="raw odometry")
-    _paint_path(axes, run.piece, final, lw=0.8, alpha=0.4, zorder=2)
+    _paint_path(axes, run, final, lw=0.8, alpha=0.4, zorder=2)
     if len(nodes):
         dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
-        axes.scatter(*nodes.T, zorder=4, label="experience", **dot)
+        axes.scatter(*nodes.T, zorder=4, label=f"experience{' of the map' * bool(len(run.state))}", **dot)
     older, lw = _older(run.links), 1.6 * crowd
     for links, color, label in (
         (run.links[~older], BLUE, "link"),
@@ -180,13 +190,18 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
     """Draws a run in a maze; a closure is wrong if its places are more than `apart` m apart in truth."""
     from matplotlib.collections import LineCollection
 
-    truth, odometry, final, nodes = layers
+    truth, odometry, final, nodes, _ = layers
     assert truth is not None
     line = split_at_jumps(truth, truth)
     axes.plot(*line.T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
-    _paint_path(axes, run.piece, final, truth, lw=0.7, zorder=3)
+    _paint_path(axes, run, final, truth, lw=0.7, zorder=3)
     axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
-    joined, place = (pairs, final) if len(pairs) else (run.links[_older(run.links)], nodes)
+    own = (run.created[run.links] >= 0).all(axis=1)
+    if not own.all():
+        name = "map" if len(run.state) else "map before"
+        lines = LineCollection(nodes[run.links[~own]], colors=INK, lw=2.2, alpha=0.35, zorder=1.5, label=name)
+        axes.add_collection(lines)
+    joined, place = (pairs, final) if len(pairs) else (run.links[own & _older(run.links)], nodes)
     steps = joined if len(pairs) else run.created[joined]
     with np.errstate(invalid="ignore"):
         wrong = np.hypot(*(truth[steps[:, 0]] - truth[steps[:, 1]]).T) > apart
@@ -200,20 +215,20 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
 
 
 def _paint_path(
-    axes: style.Axes, piece: np.ndarray, path: np.ndarray, truth: np.ndarray | None = None, **line: Any
+    axes: style.Axes, run: RunArrays, path: np.ndarray, truth: np.ndarray | None = None, **line: Any
 ) -> None:
-    """Draws the mapped path [N, 2], each piece of the map in a colour of its own, the largest in blue."""
+    """Draws the mapped path [N, 2], each piece of the map in a colour of its own, `run.main` in blue."""
 
     def drawn(rows: np.ndarray) -> np.ndarray:
         return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
 
-    numbers, sizes = np.unique(piece, return_counts=True)
-    if len(numbers) < 2:
+    numbers, sizes = np.unique(run.piece, return_counts=True)
+    if len(numbers) < 2 and not len(run.state):
         axes.plot(*drawn(np.arange(len(path))).T, color=BLUE, label="mapped path", **line)
         return
-    for rank, number in enumerate(numbers[np.argsort(-sizes, kind="stable")].tolist()):
-        rows = np.flatnonzero(piece == number)
-        name = f"piece {number + 1}, {len(rows)} steps"
+    ranks = np.argsort(-sizes - len(path) * (numbers == run.main), kind="stable")
+    for rank, number in enumerate(numbers[ranks].tolist(), start=run.main < 0):
+        rows, name = np.flatnonzero(run.piece == number), run.name_piece(number)
         if rank >= NAMED:
             name = "_" if rank > NAMED else f"{len(numbers) - NAMED} smaller pieces"
         axes.plot(*drawn(rows).T, color=PIECES[min(rank, NAMED)], label=name, **line)

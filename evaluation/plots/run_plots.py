@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from evaluation.artifacts import change_table
 from evaluation.artifacts.closure_table import read_closures
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
@@ -14,12 +16,13 @@ from evaluation.artifacts.run_directory import read_run, read_scorecard, read_wa
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.cells import recording
 from evaluation.metrics.grid_score import GridScore
+from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.change_plot import draw_changes
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
-from evaluation.plots.map_plot import draw_map
+from evaluation.plots.map_plot import align_layers, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.se2 import between
 
@@ -74,6 +77,12 @@ def _save(draw: Callable[[], Figure], path: Path) -> None:
 def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     """The grid map of a run with its truth, if known."""
     grid = read_grid(directory / "grid.npz")
+    if len(run.state):
+        shown, layers = arrange_pieces(run), align_layers(arrange_pieces(run))
+        truth = np.full((1, 2), np.nan) if layers.truth is None else layers.truth
+        known = np.where(run.found[:, None], shown.final[:, :2], np.nan)
+        line = f"found in {run.found.sum():,} of {len(run.time):,} steps"
+        return GridPanel(directory.name, line, grid, paths=GridPaths(truth, known, layers.odometry))
     if run.truth is None or not (directory / "arena.npz").exists():
         return GridPanel(directory.name, "", grid)
     truth, start = read_grid_truth(directory / "arena.npz")

@@ -30,6 +30,8 @@ WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Width and margins of every plot, inches."""
 MARGIN, FLATTEST, TALLEST = 0.08, 0.4, 1.15
 """Share of a map's size kept free around it; least and largest height / width of its axes."""
+MAP, TRUTH = "the map", "the truth"
+"""Frames that axes are in: commands take places of a map."""
 ROOM = 0.12
 """Share of logarithmic axes kept free on each side."""
 
@@ -96,15 +98,16 @@ def frame(points: np.ndarray) -> np.ndarray:
     return np.stack([middle - size / 2, middle + size / 2])
 
 
-def metre_grid(axes: Axes) -> None:
-    """Sets equal tick steps on both axes (m) and a light grid."""
+def metre_grid(axes: Axes, of: str = "") -> None:
+    """Sets equal tick steps on both axes (m), a light grid, and labels that say whose frame it is (`of`)."""
     from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-    step = MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(*axes.get_xlim())
+    step = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(*axes.get_xlim())
     axes.xaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
     axes.yaxis.set_major_locator(MultipleLocator(step[1] - step[0]))
     axes.grid(color=LINE_GREY, lw=0.7)
-    name_axes(axes, "x (m)", "y (m)")
+    frame = f" in the frame of {of}" * bool(of)
+    name_axes(axes, f"x{frame} (m)", f"y{frame} (m)")
 
 
 def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:

@@ -27,7 +27,7 @@ def draw_way(
     figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.MAP)
     if len(felt):
         axes.plot(*felt.T, ".", color=GREY, ms=2.2, mew=0, zorder=1, label="contact felt")
     if len(links):

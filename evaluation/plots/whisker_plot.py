@@ -67,7 +67,7 @@ def draw_whiskers(
 
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner - _KEY, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes)
+    style.metre_grid(axes, style.TRUTH if len(rows) else style.MAP)
     if len(shown):
         draw_walls(axes, shown)
     axes.plot(*split_at_jumps(pose[steps, :2], pose[steps, :2]).T, color=LINE_GREY, lw=0.8, zorder=0.8)

@@ -21,7 +21,7 @@ from evaluation.report.palette import GRID_SCALES, RUN_ROLES
 from evaluation.report.run_report import RunReport
 
 _DASHES = ("solid", "dash", "dot", "dashdot")
-_CLOSURES = {ACCEPTED: ("accepted", "circle", "solid"), "open": ("refused", "x", "dash")}
+_CLOSURES = {ACCEPTED: ("accepted", "circle", "solid"), "open": ("refused", "x", "dot")}
 _OTHER = ("refused", "square-open", "dot")  # verdicts of other names
 _MARK, _CROWD = 7.0, 300  # pixels of a closure's mark, and the number above which marks shrink
 _DRAWN = 500  # most marks of a kind at a time, evenly chosen from those in view, so that the page opens fast
@@ -45,7 +45,7 @@ def map_chart(report: RunReport) -> Any:
     layers, traces = report.layers, []
     if report.grid is not None:
         traces.append(_grid_trace(report))
-    traces += [] if not len(report.walls) else [_wall_trace(report.walls)]
+    traces += [] if not len(report.walls) else [_wall_trace(wall_corners(report.walls, layers.to_map))]
     if len(report.truth_lines):
         lines = _gapped(report.truth_lines.reshape(-1, 2, 2))
         traces.append(_line(lines, "walls, true", "ink", width=1.5))
@@ -64,16 +64,17 @@ def map_chart(report: RunReport) -> Any:
 
 
 def _path_traces(report: RunReport) -> list[Any]:
-    """The final trajectory, each piece of the map by itself, the largest as the trajectory of one piece."""
-    final, truth, piece = report.layers.final, report.layers.truth, report.run.piece
-    if not report.run.has_pieces:
+    """The final trajectory, each piece of the map by itself, `run.main` as the trajectory of one piece."""
+    final, truth, piece, main = report.layers.final, report.layers.truth, report.run.piece, report.run.main
+    if not report.run.has_pieces and not len(report.run.state):
         path = final if truth is None else split_at_jumps(final, truth)
         return [_line(path, "trajectory", "final", width=1.6)]
     traces, (numbers, sizes) = [], np.unique(piece, return_counts=True)
-    for rank, number in enumerate(numbers[np.argsort(-sizes, kind="stable")].tolist()):
+    ranks = np.argsort(-sizes - len(final) * (numbers == main), kind="stable")
+    for rank, number in enumerate(numbers[ranks].tolist(), start=main < 0):
         rows = np.flatnonzero(piece == number)
         path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])
-        name = f"piece {number + 1}, {len(rows):,} steps"
+        name = report.run.name_piece(number)
         traces.append(_line(path, name, f"run{rank % RUN_ROLES}" if rank else "final", width=1.6))
     return traces
 
@@ -164,6 +165,7 @@ def _closure_traces(report: RunReport) -> list[Any]:
         x, y = _columns(ends.mean(axis=1))
         name = f"closure, {_text(WORDS.get(verdict, verdict))} ({len(rows):,})"
         mark = {"size": size, "symbol": symbol, "line": {"width": 1}, "maxdisplayed": _DRAWN}
+        mark["opacity"] = 0.35 if role == "refused" else 1
         text = [f"steps {earlier} and {later}" for earlier, later in table.steps[rows].tolist()]
         trace = graph_objects.Scatter(x=x, y=y, mode="markers", name=name, meta=role, marker=mark, text=text)
         trace.update(customdata=rows.astype(np.int32), hovertemplate="%{text}<extra></extra>")
@@ -201,7 +203,7 @@ def _line_shape(lines: np.ndarray, role: str, dash: str, group: str) -> dict[str
         "line": line,
         "layer": "below",
         "legendgroup": group,
-        "opacity": 0.6,
+        "opacity": 0.15 if role == "refused" else 0.6,
     }
 
 
@@ -220,11 +222,9 @@ def _grid_trace(report: RunReport) -> Any:
     )  # fmt: skip
 
 
-def _wall_trace(walls: np.ndarray) -> Any:
+def _wall_trace(corners: np.ndarray) -> Any:
     from plotly import graph_objects
 
-    west, south, east, north = walls[:, :4].T
-    corners = np.stack([west, south, east, south, east, north, west, north], axis=1).reshape(-1, 4, 2)
     x, y = _columns(_gapped(corners))
     return graph_objects.Scatter(
         x=x, y=y, fill="toself", mode="lines", line_width=0, name="wall", meta="wall", hoverinfo="skip"
@@ -246,7 +246,7 @@ def _line(
 
 def _map_figure(traces: list[Any], frame: np.ndarray) -> Any:
     """A figure with equal scales that shows a frame [[left, bottom], [right, top]], m."""
-    figure = _figure(traces, "x, m", "y, m")
+    figure = _figure(traces, "x in the frame of the map, m", "y in the frame of the map, m")
     figure.update_layout(dragmode="pan")
     figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
     figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
@@ -257,7 +257,7 @@ def _frame(report: RunReport) -> np.ndarray:
     """Corners [[left, bottom], [right, top]] (m) around the map, and around odometry near it."""
     layers, lines = report.layers, report.truth_lines.reshape(-1, 2)
     truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(report.walls), lines, *truth)
+    low, high = bounds(layers.final, layers.nodes, wall_corners(report.walls, layers.to_map), lines, *truth)
     room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
     low = np.minimum(low, np.maximum(far_low, low - room))
     high = np.maximum(high, np.minimum(far_high, high + room))

@@ -25,11 +25,11 @@ from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, score_run
-from evaluation.metrics.trajectory import align, read_tum
+from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers, align_layers
 from evaluation.report.run_files import RunFile, list_run_files
 from evaluation.report.verdict import Verdict, judge_map
-from tactile.base.se2 import between, compose
+from tactile.base.se2 import between
 
 SOURCES = {
     "recording": "a recording",
@@ -58,7 +58,7 @@ class RunReport(NamedTuple):
         spread: [N] standard deviation of the position at each step, m.
         online_error: error of the current pose. cost: computing time a step, s, against the number of steps.
         run: its arrays, pieces of the map as `arrange_pieces` draws them.
-        layers: paths of the map in the frame of `walls` and `truth_lines`.
+        layers: paths in the frame of the map, to which `layers.to_map` moves `walls`.
         map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
         truth_lines: [S, 4] true walls of a grid's arena, m. grid: in the frame of the layers.
     """
@@ -155,7 +155,7 @@ def _method(directory: Path) -> dict[str, str]:
 
 
 def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, OccupancyGrid | None]:
-    """Paths, true walls [S, 4] and grid in one frame: that of the truth, or of the grid."""
+    """Paths, true walls [S, 4] and grid in one frame: that of the map."""
     nothing = np.zeros((0, 4))
     if not (directory / "grid.npz").exists():
         return align_layers(run), nothing, None
@@ -164,10 +164,9 @@ def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, Occupa
         arena, start = read_grid_truth(directory / "arena.npz")
         lines = arena.segments
         truth = None if run.truth is None else between(start, run.truth)
-    elif run.truth is not None:
-        known = np.isfinite(run.truth).all(axis=1)
-        truth = compose(align(run.truth[known], run.final[known]), run.truth)
-    paths = (None if truth is None else truth[:, :2], run.odometry[:, :2], run.final[:, :2], run.nodes[:, :2])
+    if truth is None:
+        return align_layers(run), lines, grid
+    paths = (truth[:, :2], run.odometry[:, :2], run.final[:, :2], run.nodes[:, :2])
     return Layers(*paths), lines, grid
 
 
@@ -179,7 +178,7 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     path = read_tum(file)[1][: len(run.time)]
     if len(path) < len(run.time) or np.array_equal(path, run.final):
         return None
-    return align_layers(arrange_pieces(run._replace(final=path))).final
+    return arrange_pieces(run._replace(final=path)).final[:, :2]
 
 
 def _online_error(directory: Path) -> Series:

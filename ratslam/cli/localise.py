@@ -54,7 +54,7 @@ def _localise(arguments: argparse.Namespace) -> int:
     print(render_scorecard(card))
     print(f"\n{summary.describe()}")
     print(f"{directory}/localisation.csv holds the state and the probability of every step,")
-    print(f"{directory}/trajectory.tum the poses in the frame of the map")
+    print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
     return INTERRUPTED if interrupted else 0
 
 

@@ -29,7 +29,7 @@ def add_commands(commands: Commands) -> None:
     diff.add_argument("other", type=Path, metavar="MAP", help="the map to compare with it")
     _add_json(diff)
     undo = kinds.add(
-        "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 3 -o runs/undone.npz"
+        "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 0 -o runs/undone.npz"
     )
     _add_map(undo)
     undo.add_argument(

@@ -25,7 +25,7 @@ NO_WAY = 1
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     path = commands.add(
-        "path", _path, "find the way on a saved map", "path runs/maze --from here --to -0.5,0.2", "maps"
+        "path", _path, "find the way on a saved map", "path runs/square --from here --to -0.1,0.8", "maps"
     )
     path.add_argument("map", type=Path, metavar="MAP", help="run directory, or its map.npz")
     path.add_argument(

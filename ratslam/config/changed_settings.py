@@ -24,7 +24,8 @@ class ChangedSetting(NamedTuple):
 def changed_settings(path: Path) -> list[ChangedSetting]:
     """The settings in a configuration file that differ from the defaults, in the order of the file.
 
-    The file of a run directory is completed: values of its source and of presets are among them.
+    Of a path only the name is given. The file of a run directory is completed: values of its source and of
+    presets are among them.
 
     Raises:
         InputErrors: the configuration has errors.
@@ -42,9 +43,8 @@ def _changes(section: BaseModel, default: BaseModel | None, prefix: str) -> Iter
             same = isinstance(usual, type(value))
             yield from _changes(value, usual if same else _default_of(type(value)), f"{prefix}{name}.")
         elif field.is_required() or value != usual:
-            yield ChangedSetting(
-                prefix + name, _text(values[name]), "" if field.is_required() else _text(usual)
-            )
+            shown = value.name if isinstance(value, Path) else values[name]  # its folder is private
+            yield ChangedSetting(prefix + name, _text(shown), "" if field.is_required() else _text(usual))
 
 
 def _default_of(section: type[BaseModel]) -> BaseModel | None:

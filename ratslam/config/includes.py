@@ -19,7 +19,7 @@ def merge_includes(document: Document, folder: Path) -> Document:
     are merged; lists are not. The key stays, without files.
 
     Args:
-        folder: in which relative paths start.
+        folder: in which relative paths start, if not given by `--set`.
 
     Raises:
         InputError: a file cannot be read, is not strict YAML, or includes others.
@@ -28,9 +28,10 @@ def merge_includes(document: Document, folder: Path) -> Document:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return document  # nothing, or an error that validation reports
     merged = Document({**document.data, KEY: []}, document.places)
+    folder = Path() if document.places[KEY,].value.startswith("--set") else folder
     for name in reversed(names):
         if not (folder / name).is_file():
-            where, cure = document.at_key((KEY,)), "paths start at the folder of this configuration"
+            where, cure = document.at_key((KEY,)), f"paths start at {folder.resolve()}"
             raise InputError(where, f"no file {folder / name}", "an existing file", cure)
         below = load(folder / name)
         if KEY in below.data:

@@ -140,7 +140,8 @@ class LoopConfig(RunConfig):
 def load_config(
     path: str | os.PathLike[str], assignments: Sequence[str] = (), *, source_required: bool = True
 ) -> RunConfig:
-    """Reads a configuration file; its relative paths start at its folder.
+    """Reads a configuration file; its relative paths start at its folder, those of `assignments` at the
+    working folder.
 
     Args:
         path: of the file, or the name of a packaged configuration.
@@ -150,12 +151,24 @@ def load_config(
     Raises:
         InputErrors: all errors in it, each with file, line and column.
     """
-    path = find_config(path)
+    path, model = find_config(path), RunConfig if source_required else LoopConfig
     document = merge_includes(load(path, assignments), path.parent)
     _check_sources(document, assignments)
-    config = validate(document, RunConfig if source_required else LoopConfig)
+    config = validate(document, model)
     check_plugins(document, config)
-    return config.with_absolute_paths(path.parent.resolve())
+    here = config.with_absolute_paths(Path.cwd())
+    for keys in [keys for keys, place in document.places.items() if place.value.startswith("--set")]:
+        text = document.value(keys)
+        if isinstance(text, str) and (full := str(_value_at(here, keys))) != text:  # a relative path
+            document.value(keys[:-1])[keys[-1]] = full
+    return validate(document, model).with_absolute_paths(path.parent.resolve())
+
+
+def _value_at(value: Any, keys: Sequence[str | int]) -> Any:
+    """The value at a path of keys through settings, mappings and lists."""
+    for key in keys:
+        value = getattr(value, str(key)) if isinstance(value, Settings) else value[key]
+    return value
 
 
 def _check_sources(document: Document, assignments: Sequence[str]) -> None:

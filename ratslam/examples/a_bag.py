@@ -35,6 +35,7 @@ def main() -> None:
     result = ratslam.run(folder / "robot.yaml", folder / "a bag")
     error = result.scorecard.quantities["ate_final"]
     print(f"{len(result.time)} samples: {error.value:.1g} m off, odometry {error.odometry:.1g} m")
+    print(f"{folder / 'a bag'} holds the run")
     result.plot().savefig("a_bag.png")
 
 

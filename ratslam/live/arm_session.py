@@ -44,11 +44,10 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
         InputError: a target is rejected.
     """
     assert config.live is not None
+    config, goals = (config, None) if config.live.plan.goal is None else plan_goals(config)
+    assert config.live is not None
     path = plan_path(config.live, ur10_head(config.touch.head))
     check_targets(config.live, path)
-    if config.live.plan.goal is None:
-        return lambda stopped: ArmSession(config, path, directory, stopped)
-    config, goals = plan_goals(config)
     return lambda stopped: ArmSession(config, path, directory, stopped, goals)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.metrics.trajectory import read_tum
 from ratslam.config.run_config import RunConfig
 from ratslam.live.mapper_process import Mapper
 from ratslam.pipeline.goal_planner import GoalPlanner, contact_map
@@ -28,7 +29,8 @@ ENDS = {DriveState.BLOCKED: SessionOutcome.BLOCKED, DriveState.LOST: SessionOutc
 
 
 def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
-    """The configuration of a session with goals, which localises in the map of the goals, and its route.
+    """The configuration of a session with goals, which localises in the map of the goals and begins where
+    that one ended, and its route.
 
     Raises:
         InputError: the map cannot be read, or a goal is not on it.
@@ -37,6 +39,13 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
     goal = config.live.plan.goal
     assert goal is not None
     saved = read_map(goal.map)
+    truth = (goal.map if goal.map.is_dir() else goal.map.parent) / "truth.tum"
+    if goal.at is None and truth.exists() and truth.stat().st_size:
+        x, y, heading = read_tum(truth)[1][-1].tolist()
+        goal = goal.model_copy(update={"at": (x, y, float(np.degrees(heading)))})
+        plan = config.live.plan.model_copy(update={"goal": goal})
+        config = config.model_copy(update={"live": config.live.model_copy(update={"plan": plan})})
+        assert config.live is not None
     made = saved.open_session().map
     planner = GoalPlanner(made.graph(), goal, config.live.plan.motion)
     drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))

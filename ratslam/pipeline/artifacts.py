@@ -69,14 +69,14 @@ def save_closure_views(images: Sequence[np.ndarray | None], directory: RunDirect
 
 
 def save_grid_map(directory: RunDirectory) -> None:
-    """Writes map.pgm and map.yaml if the map is a grid; if the arena is known also arena.npz (the true grid)
-    and gridscore.json."""
+    """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in the grid are
+    known, which they are not of a localised session, also arena.npz (the true grid) and gridscore.json."""
     file = directory.path / "grid.npz"
     if not file.exists():
         return
     grid = read_grid(file)
     write_nav2(directory.path, grid)
-    if not (directory.path / "arena.txt").exists():
+    if not (directory.path / "arena.txt").exists() or (directory.path / "localisation.csv").exists():
         return
     arena = read_arena(directory.path / "arena.txt")
     truth = true_grid(arena, grid)

@@ -136,4 +136,5 @@ def experience_at(
     x, y = position(graph, nearest)
     away = float(np.hypot(x - place[0], y - place[1]))
     text = f"({place[0]:g}, {place[1]:g}), {away:.2f} m from experience {nearest} at ({x:.2f}, {y:.2f})"
-    raise InputError(where, text, f"a point within {farthest:g} m of an experience")
+    cure = f"the nearest possible place is {x:.2f},{y:.2f}; map.png shows all, in the frame of the map"
+    raise InputError(where, text, f"a point within {farthest:g} m of an experience", cure)

@@ -49,6 +49,7 @@ def find_map_way(
     if not len(graph):
         found = f"a map of `backend: {saved.config.backend}` without experiences, which a way leads along"
         raise InputError(str(saved.path), found, "a map of `backend: recall` or `backend: classic`")
+    last = experience_at(graph, goal, FARTHEST, "--to")
     if start is None:
         first = (
             nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
@@ -60,7 +61,6 @@ def find_map_way(
             raise InputError("--from", found, "a robot on driven ground", "give X,Y or an experience")
     else:
         first = experience_at(graph, start, FARTHEST, "--from")
-    last = experience_at(graph, goal, FARTHEST, "--to")
     return find_way(graph, first, experiences_near(graph, last, TOLERANCE), mode)
 
 

@@ -23,8 +23,7 @@ class LivePlanConfig(SimulationConfig):
     """Plan of a session on the arm: as of a simulated session, or goals on a saved map."""
 
     goal: GoalConfig | None = None
-    """Goals to drive to on a saved map, instead of the path. The robot stands where the map ended: at the
-    end of the path, or of `waypoints`."""
+    """Goals to drive to on a saved map, instead of the path."""
 
     def resolved(self, folder: Path) -> LivePlanConfig:
         plan = super().resolved(folder)

@@ -22,6 +22,9 @@ class GoalConfig(Settings):
     start: Literal["here", "unknown"] = "here"
     """Where the robot stands at first: where the map ended, or anywhere: then the head rests until its
     place is found, and if it is not, the session ends as lost."""
+    at: tuple[float, float, float] | None = None
+    """Where the arm begins: x, y (m) and heading (degrees), as `live.waypoints`. null: where the session of
+    the map ended by the truth.tum beside it; without one, at the end of the path or of `live.waypoints`."""
     mode: Literal["time", "temporal"] = "time"
     """The way: `time` by least expected time, `temporal` by RatSLAM's goal temporal map."""
     farthest: PositiveFloat = 0.1

@@ -80,10 +80,11 @@ def plan_path(config: LiveConfig, head: Head) -> HeadPath:
     Raises:
         InputError: the path cannot be planned or is empty.
     """
+    goal = config.plan.goal
+    if goal is not None and goal.at is not None:
+        return HeadPath(np.zeros(1), np.array([[*goal.at[:2], np.radians(goal.at[2])]]))
     path = whole_path(config, head)
-    if config.plan.goal is not None:  # the arm starts at the end
-        return HeadPath(np.zeros(1), path.pose[-1:])
-    return path
+    return path if goal is None else HeadPath(np.zeros(1), path.pose[-1:])  # the arm starts at the end
 
 
 def whole_path(config: LiveConfig, head: Head) -> HeadPath:

@@ -198,7 +198,7 @@
         part(`.${name}-caption`).textContent = `step ${step}${when === null ? "" : `, ${number(when)} s`}`;
       }
       const reduced = views && (views.rows !== views.shape[0] || views.columns !== views.shape[1]);
-      const shownAs = [reduced ? `at ${views.rows} × ${views.columns}` : "", views?.gain > 1 ? `${number(views.gain)} times as bright` : ""].filter(Boolean);
+      const shownAs = [reduced ? `at ${views.rows} × ${views.columns}` : "", views?.gain > 1.05 ? `${number(views.gain)} times as bright` : ""].filter(Boolean);
       part(".views-note").textContent = views ? `Views of ${views.shape.join(" × ")} pixels${shownAs.length ? `, shown ${shownAs.join(", ")}` : ""}.` : "The run kept no views.";
       const facts = closures.evidence.map((each) => [each.label, number(each.values[k])]);
       if (truth) facts.push(["apart in truth, m", number(closures.apart[k])]);
@@ -250,6 +250,9 @@
     showPage();
     const start = closures.verdicts.indexOf("accepted");
     select(start < 0 ? 0 : start);
+    first = 0; // the table opens at its beginning, wherever the closure shown is
+    showPage();
+    part(".closures .scroll").scrollTop = 0;
     return () => {
       map.on("plotly_click", (event) => {
         const point = event.points.find((each) => each.customdata !== undefined);

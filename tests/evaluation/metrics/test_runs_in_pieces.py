@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from evaluation.artifacts.pieces_table import read_pieces, write_pieces
+from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.map_pieces import arrange_pieces, ate_within_pieces
 from evaluation.metrics.run_metrics import PIECES
 from evaluation.metrics.scorecard import score_run, scorecard_lines
-from evaluation.metrics.trajectory import ate
-from evaluation.plots.map_plot import draw_map, map_headline
+from evaluation.metrics.trajectory import ate, write_tum
+from evaluation.plots.change_plot import draw_changes
+from evaluation.plots.map_plot import align_layers, draw_map, map_headline
 from evaluation.report.verdict import describe_score
+from ratslam.core.localisation import Localisation, pieces_of, write_course
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose
 
@@ -76,7 +81,7 @@ def test_each_piece_is_aligned_by_itself(circle, parted):
 
 def test_a_picture_shows_pieces_where_they_are_true(circle, parted):
     shown = arrange_pieces(parted)
-    assert np.abs(shown.final[:, :2] - circle.truth[:, :2]).max() < 1e-6
+    assert np.abs(shown.final[:, :2] - circle.final[:, :2]).max() < 1e-6  # in the frame of the largest piece
     draw_map(parted, score_run(parted))  # draws nothing outside of its frame
     assert "2 pieces, 33% of the steps unjoined" in map_headline(score_run(parted))
     assert "within the pieces of the map" in describe_score(score_run(parted))
@@ -86,6 +91,55 @@ def test_online_poses_are_moved_with_their_pieces(parted):
     run = parted._replace(truth=None, online=parted.final)
     shown = arrange_pieces(run)
     assert np.array_equal(shown.online, shown.final)
+
+
+LOCALISED = {
+    "found at once": "f" * 108,
+    "found late": "s" * 30 + "f" * 78,
+    "carried away": "s" * 9 + "f" * 40 + "l" * 20 + "f" * 39,
+    "lost at the end": "f" * 40 + "l" * 68,
+    "another map": "s" * 60 + "n" * 48,
+}
+"""The first letters of the states of a session."""
+
+
+@pytest.mark.parametrize("seen", [True, False], ids=["truth", "no truth"])
+@pytest.mark.parametrize("case", LOCALISED)
+def test_the_saved_map_of_a_localised_session_stays_where_it_is(circle, tmp_path, case, seen):
+    names = {state.name[0].lower(): state for state in Localisation}
+    states = np.array([names[letter] for letter in LOCALISED[case]])
+    found, piece = states == Localisation.FOUND, pieces_of(states)
+    final = circle.final.copy()
+    for one in np.unique(piece[~found]):
+        final[piece == one] = compose(AWAY / (1 + one), final[piece == one])
+    paths = {"online": final, "trajectory": final, "odometry": circle.odometry, "truth": circle.truth}
+    (tmp_path / "truth.tum").touch()
+    for name, path in [*paths.items()][: 3 + seen]:
+        write_tum(tmp_path / f"{name}.tum", circle.time, path)
+    (tmp_path / "steps.csv").write_text("place\n" + "-1\n" * len(states))
+    nodes = [{"x": x, "y": y, "heading": turn, "piece": 0} for x, y, turn in circle.nodes.tolist()]
+    links = [{"source": a, "target": b} for a, b in circle.links.tolist()]
+    (tmp_path / "map.json").write_text(json.dumps({"nodes": nodes, "links": links}))
+    write_course(tmp_path / "localisation.csv", states, np.zeros((len(states), 3)))
+    write_pieces(tmp_path / "pieces.csv", circle.time, piece)
+
+    run = read_run(tmp_path)
+    shown = arrange_pieces(run)
+    assert np.array_equal(run.found, found)
+    assert shown.nodes == pytest.approx(circle.nodes)
+    assert shown.final[found] == pytest.approx(circle.final[found], abs=1e-9)
+    if seen and found.any():
+        assert shown.final[:, :2] == pytest.approx(circle.final[:, :2], abs=1e-6)
+        assert align_layers(shown).truth == pytest.approx(circle.final[:, :2], abs=1e-6)
+    elif not found.any():
+        assert shown.final[:, 0].min() > circle.nodes[:, 0].max()
+    (path,) = (line for line in draw_changes("", run, []).axes[0].lines if line.get_zorder() == 3)
+    assert np.array_equal(np.isfinite(path.get_xydata()[:, 0]), found)
+    labels = [text.get_text() for text in draw_map(run, score_run(run)).legends[0].get_texts()]
+    words = {run.name_piece(one).split(",")[0] for one in piece}
+    assert words <= {"found", "searching", "lost", "not this map"}
+    assert {label.split(",")[0] for label in labels} >= words
+    assert ("found" in words) == found.any()
 
 
 def test_without_truth_a_picture_shows_pieces_side_by_side(parted):

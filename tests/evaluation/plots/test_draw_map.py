@@ -10,6 +10,7 @@ import pytest
 
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.map_plot import draw_map, map_headline, split_at_jumps
+from tactile.base.se2 import compose, inverse
 
 
 def labels(figure):
@@ -21,10 +22,13 @@ def test_the_plot_shows_map_truth_and_odometry(circle):
     assert labels(figure)[:4] == ["truth", "raw odometry", "mapped path", "experience"]
     assert "link to an older experience" in labels(figure)
     axes = figure.axes[0]
-    assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x (m)", "y (m)", 1.0)
+    assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == (
+        "x in the frame of the map (m)", "y in the frame of the map (m)", 1.0
+    )  # fmt: skip
     (truth,) = (line for line in axes.lines if line.get_label() == "truth")
     (drawn,) = (line for line in axes.lines if line.get_label() == "mapped path")
     assert np.array(drawn.get_data()) == pytest.approx(np.array(truth.get_data()), abs=1e-9)
+    assert drawn.get_xydata() == pytest.approx(circle.final[:, :2])  # a place read off is one of the map
 
 
 def test_equal_runs_give_equal_bytes(circle, tmp_path):
@@ -84,17 +88,21 @@ def drawn(figure, label):
     return np.array([segment for lines in found for segment in lines.get_segments()])
 
 
-def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
+def test_walls_are_drawn_where_the_map_says_they_are(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     axes = figure.axes[0]
     assert labels(figure)[:3] == ["truth", "mapped path", "raw odometry"]
     (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
-    for box, path in zip(WALLS, boxes.get_paths(), strict=True):
-        assert path.get_extents().extents == pytest.approx(box[:4])
+    to_map = compose(circle.final[0], inverse(circle.truth[0]))
+    for (west, south, _, north, _), path in zip(WALLS, boxes.get_paths(), strict=True):
+        ends = compose(to_map, np.array([[west, south, 0.0], [west, north, 0.0]]))
+        assert path.vertices[[0, 3]] == pytest.approx(ends[:, :2])
     tall, low = boxes.get_facecolor()[:, 0]
     assert tall < low < 1
-    assert axes.get_xlim()[0] < -1
-    assert axes.get_ylim()[1] > 4.1
+    corners = np.concatenate([path.vertices for path in boxes.get_paths()])
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    assert (low < corners.min(axis=0)).all()
+    assert (high > corners.max(axis=0)).all()
 
 
 def test_a_closure_of_distant_places_is_drawn_as_false(circle):
@@ -102,7 +110,7 @@ def test_a_closure_of_distant_places_is_drawn_as_false(circle):
     figure = draw_map(circle, score_run(circle), WALLS, np.array(right + wrong))
     for joined, label in ((right, "loop closure"), (wrong, "false loop closure (over 0.1 m)")):
         ends = drawn(figure, label)
-        assert ends == pytest.approx(circle.truth[np.array(joined)][..., :2], abs=1e-9)
+        assert ends == pytest.approx(circle.final[np.array(joined)][..., :2], abs=1e-9)
 
 
 def test_without_closures_the_links_to_older_experiences_are_drawn(circle):

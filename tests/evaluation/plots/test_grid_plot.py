@@ -129,9 +129,9 @@ def test_walls_and_paths_are_drawn_at_their_position():
     assert np.allclose([path.vertices for path in walls.get_paths()], SIDE.reshape(-1, 2, 2))
     lines = {line.get_label(): line for line in axes.lines}
     assert list(lines) == [
-        f"dead reckoning, error {0.8:.3f} m",
-        "true path",
-        "estimated path, error 0.050 m",
+        f"raw odometry, mean error {0.8:.3f} m",
+        "truth",
+        "online path, mean error 0.050 m",
         "start",
     ]
     for line, path in zip(
@@ -139,7 +139,7 @@ def test_walls_and_paths_are_drawn_at_their_position():
     ):
         assert np.allclose(line.get_xydata(), path)
     assert axes.get_xlim() == pytest.approx((-1.25, 1.25))  # dead reckoning may leave, the map stays
-    assert lines["true path"].get_color() == YELLOW
+    assert lines["truth"].get_color() == YELLOW
     assert VERMILLION not in {line.get_color() for line in axes.lines}
 
 
@@ -147,9 +147,9 @@ def test_rows_without_truth_are_not_drawn():
     truth = WAY.copy()
     truth[::2] = np.nan
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
-    assert [line.get_label() for line in axes.lines][2] == "estimated path, error 0.050 m"
+    assert [line.get_label() for line in axes.lines][2] == "online path, mean error 0.050 m"
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
-    assert [line.get_label() for line in axes.lines] == ["dead reckoning", "true path", "estimated path"]
+    assert [line.get_label() for line in axes.lines] == ["raw odometry", "truth", "online path"]
     poses = np.column_stack([WAY, TURN])
     assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 

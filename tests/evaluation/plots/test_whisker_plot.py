@@ -29,7 +29,7 @@ def random_images(steps=108, seed=0, dead=()):
 
 def heads(figure):
     """The rings of the map's heads: each as its 18 wedges and their colours, in order of drawing."""
-    (axes,) = (axes for axes in figure.axes if axes.get_xlabel() == "x (m)")
+    (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith("x in the frame of the "))
     found = [c for c in axes.collections if isinstance(c, PatchCollection) and len(c.get_paths()) == 18]
     return [(c.get_paths(), c.get_facecolor()[:, :3]) for c in found]
 
@@ -156,7 +156,7 @@ def test_without_truth_heads_are_drawn_at_map_poses(circle):
     for paths, _ in heads(figure):
         centre = np.mean([path.vertices.mean(axis=0) for path in paths], axis=0)
         assert np.hypot(*(circle.final[:, :2] - centre).T).min() < 0.02
-    (axes,) = (axes for axes in figure.axes if axes.get_xlabel() == "x (m)")
+    (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith("x in the frame of the "))
     assert axes.get_xlim()[1] < 9
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -41,10 +42,28 @@ def test_included_settings_fill_those_left_open(folder: Path) -> None:
     assert config.keyframes.calibration.heading_bias == 0.375  # of the later file
 
 
-def test_set_comes_before_all_files(folder: Path) -> None:
+def test_set_comes_before_all_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
     config = load_config(folder / "main.yaml", ["touch.head.dead=[3]", "include=[rig.yaml]"])
     assert config.touch.head.dead == (3,)
     assert config.keyframes.calibration.heading_bias == 0.125
+
+
+@pytest.mark.parametrize(
+    ("name", "assignment", "at"),
+    [
+        ("square", "recording.file=runs/a.npz", "recording.file"),
+        ("square", "recording={file: runs/a.npz}", "recording.file"),
+        ("whisker_maze", "simulation.maze.file=runs/a.npz", "simulation.maze.file"),
+        ("live_maze", "live.plan.goal={map: runs/a.npz, to: [0]}", "live.plan.goal.map"),
+        ("square", "score.relations=runs/a.npz", "score.relations"),
+        ("square", "localise.map=runs/a.npz", "localise.map"),
+    ],
+)
+def test_paths_of_set_start_at_the_working_folder(name, assignment, at, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert attrgetter(at)(load_config(name, [assignment])) == tmp_path / "runs" / "a.npz"
+    assert load_config("square").recording.file.is_file()  # those of a file start at its folder
 
 
 def test_the_loaded_configuration_stands_alone(folder: Path) -> None:

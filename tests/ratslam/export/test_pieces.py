@@ -13,7 +13,7 @@ from tests.ratslam.export.export_cases import messages, path_of
 
 def test_pieces_stand_beside_each_other(copy, tmp_path):
     run = read_run(copy)
-    later = np.arange(len(run.time)) >= len(run.time) // 2
+    later = np.arange(len(run.time)) >= (len(run.time) + 1) // 2
     for name, path in (("trajectory.tum", run.final), ("online.tum", run.online)):
         write_tum(copy / name, run.time, np.where(later[:, None], path + [1000.0, 0.0, 0.0], path))
     (copy / "truth.tum").write_text("")

@@ -3,19 +3,43 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from evaluation.metrics.trajectory import write_tum
+from ratslam.config.run_config import load_config
 from ratslam.experiments.atlas.sessions import Recipe, touch_config
 from ratslam.experiments.atlas.stored_maps import store_map
 from ratslam.experiments.tables.touch import MAIN
+from ratslam.live.goal_steering import plan_goals
+from robot.live.route import plan_path
+from tactile.whiskers.head_geometry import ur10_head
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS
 from tests.ratslam.live.test_complete_session import CONFIG, PATIENT, emulated
+from tests.ratslam.pipeline.test_map_formats import FILES
 
 MAZE, CIRCUITS = 31002, "CCC"
+
+
+def test_the_arm_begins_where_the_session_of_the_map_ended(tmp_path: Path) -> None:
+    shutil.copy(FILES[-1], tmp_path / "map.npz")
+    goals = ["live.plan.goal.to=[0]", f"live.plan.goal.map={tmp_path}"]
+    ends = []
+    for settings in (goals, [*goals, "live.plan.goal.at=[0.3, 0.1, 90]"]):
+        config, _ = plan_goals(load_config("live_maze", settings))
+        ends.append(plan_path(config.live, ur10_head(config.touch.head)).pose.tolist())
+        write_tum(tmp_path / "truth.tum", np.arange(2.0), np.array([[0.5, 0.1, 0.0], [0.4, 0.2, 1.0]]))
+    config, _ = plan_goals(load_config("live_maze", goals))
+    ends.append(plan_path(config.live, ur10_head(config.touch.head)).pose.tolist())
+    plain = load_config("live_maze")
+    assert ends[0] == plan_path(plain.live, ur10_head(plain.touch.head)).pose[-1:].tolist()
+    assert ends[1] == [[0.3, 0.1, pytest.approx(np.pi / 2)]]
+    assert ends[2] == [pytest.approx([0.4, 0.2, 1.0])]
 
 
 @pytest.mark.soak
