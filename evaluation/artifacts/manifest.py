@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from evaluation.artifacts.run_directory import SESSION_REPORT
 from tactile.base.errors import InputError
 
+SESSION_REPORT = "live.json"
+"""Report of a live session, written when it has ended."""
 RUNNING = "running"
 """Status of a run that has not ended, or was killed."""
 
@@ -21,7 +22,7 @@ class Manifest(NamedTuple):
         status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
             finished, the outcome from its report. source: name of the recording or simulation.
         total: final number of steps, if known. seed: of the session, if known.
-        versions: of the program, its libraries and Python.
+        versions: of the program, its libraries and Python. warnings: about the input, a sentence each.
     """
 
     status: str = RUNNING
@@ -29,6 +30,7 @@ class Manifest(NamedTuple):
     total: int | None = None
     seed: int | None = None
     versions: Mapping[str, str] = {}
+    warnings: tuple[str, ...] = ()
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -47,6 +49,7 @@ def read_manifest(directory: Path) -> Manifest:
             total=None if content["continued"] else recording["samples"],
             seed=content.get("seeds", {}).get("session"),
             versions={str(name): str(version) for name, version in versions.items()},
+            warnings=tuple(map(str, content.get("input", {}).get("warnings", ()))),
         )
     except FileNotFoundError:
         found = Manifest()

@@ -8,6 +8,10 @@ import numpy as np
 
 from tactile.base.errors import InputError
 
+NOT_JUDGED = "not judged by this method"
+UNFINISHED = "not judged before the end of the run"
+"""Why a map is not judged; another reason is given in its run directory."""
+
 
 class RunArrays(NamedTuple):
     """Poses, experiences and truth of a run with N steps, M experiences and L links.
@@ -21,7 +25,8 @@ class RunArrays(NamedTuple):
         created: [M] step at which each experience was created.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
         links: [L, 2] linked experiences.
-        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if unknown.
+        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if there is none.
+        unjudged: why there is none. warnings: about the input, a sentence each.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
         piece: [N] the piece of the map in which each step is, see `evaluation.metrics.map_pieces`; empty: all
             steps are in one.
@@ -38,6 +43,8 @@ class RunArrays(NamedTuple):
     links: np.ndarray
     online_error: np.ndarray = np.zeros(0)
     doubt: float = np.nan
+    unjudged: str = NOT_JUDGED
+    warnings: tuple[str, ...] = ()
     piece: np.ndarray = np.zeros(0, int)
 
     @property

@@ -147,10 +147,10 @@ def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) ->
 
     def name(word: str, path: np.ndarray) -> str:
         off = mean_position_error(path, truth) if errors else np.nan
-        return word if np.isnan(off) else f"{word}, error {off:.3f} m"
+        return word if np.isnan(off) else f"{word}, mean error {off:.3f} m"
 
     dashed = (0, (4, 2))
-    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("dead reckoning", odometry))
+    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("odometry", odometry))
     axes.plot(*truth.T, color=YELLOW, lw=2.4, alpha=0.8, zorder=4, label="true path")
     axes.plot(*estimate.T, color=_SKY, lw=1.0, zorder=5, label=name("estimated path", estimate))
     start = truth[np.isfinite(truth).all(axis=1)]
