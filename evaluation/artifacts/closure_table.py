@@ -77,3 +77,24 @@ def write_closure_pairs(path: Path, pairs: np.ndarray) -> None:
     """Writes accepted closures without evidence: pairs [n, 2] of steps, the later and the earlier."""
     lines = (f"{later},{earlier},{ACCEPTED}\n" for later, earlier in pairs.tolist())
     Path(path).write_text("".join([",".join(KEYS) + "\n", *lines]), encoding="utf-8")
+
+
+class Closures(NamedTuple):
+    """Loop closures of a run: proposed and accepted ones, and sequences of both."""
+
+    proposed: int
+    accepted: int
+    sequences: int
+    accepted_sequences: int
+
+
+def count_closures(path: Path) -> Closures | None:
+    """The loop closures in closures.csv; None if there are none, as of a method that proposes none."""
+    if not (path / "closures.csv").exists():
+        return None
+    table = read_closure_table(path)
+    accepted = table.accepted()
+    sequence = table.evidence.get("sequence", np.arange(len(accepted)))
+    return Closures(
+        len(accepted), int(accepted.sum()), len(np.unique(sequence)), len(np.unique(sequence[accepted]))
+    )

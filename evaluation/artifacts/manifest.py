@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from evaluation.artifacts.run_directory import SESSION_REPORT
 from tactile.base.errors import InputError
 
+SESSION_REPORT = "live.json"
+"""Report of a live session, written when it has ended."""
 RUNNING = "running"
 """Status of a run that has not ended, or was killed."""
 
@@ -24,7 +25,7 @@ class Manifest(NamedTuple):
         total: final number of steps, if known. seed: of the session, if known.
         versions: of the program, its libraries and Python. continued: whether it went on from a map.
         killed: it has not ended, and no process writes it. digest: sha256 of its recording or simulation,
-            '' of a live session.
+            '' of a live session. warnings: about the input, a sentence each.
     """
 
     status: str = RUNNING
@@ -35,6 +36,7 @@ class Manifest(NamedTuple):
     continued: bool = False
     killed: bool = False
     digest: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -56,6 +58,7 @@ def read_manifest(directory: Path) -> Manifest:
             continued=bool(content["continued"]),
             killed=content["status"] == RUNNING and _is_left(directory / "steps.csv"),
             digest=str(recording.get("sha256", "")),
+            warnings=tuple(map(str, content.get("input", {}).get("warnings", ()))),
         )
     except FileNotFoundError:
         found = Manifest()

@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from evaluation.artifacts.manifest import SESSION_REPORT as SESSION_REPORT
+from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
-
-SESSION_REPORT = "live.json"
-"""Report of a live session, written when it has ended."""
 
 
 def check_run_directory(path: Path) -> None:
@@ -57,6 +56,7 @@ def read_run(path: Path) -> RunArrays:
     errors = path / "online_error.csv"
     nodes, links, node_piece = _map(path / "map.json")
     place = np.where(place[:steps] < len(nodes), place[:steps], -1)
+    doubt, unjudged = _doubt(path)
     run = RunArrays(
         time=time,
         truth=true if known.any() else None,
@@ -68,7 +68,9 @@ def read_run(path: Path) -> RunArrays:
         nodes=nodes,
         links=links,
         online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
-        doubt=_doubt(path / "health.json"),
+        doubt=doubt,
+        unjudged=unjudged,
+        warnings=read_manifest(path).warnings,
         piece=read_pieces(path / NAME, steps),
         node_piece=node_piece,
         state=_states(path / "localisation.csv", steps),
@@ -179,12 +181,15 @@ def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
 
 
-def _doubt(path: Path) -> float:
-    """Probability that the map is worse than odometry; NaN without the file."""
+def _doubt(folder: Path) -> tuple[float, str]:
+    """Probability that the map of a run is worse than odometry; or NaN, and why there is none."""
+    path = folder / "health.json"
     if not path.exists():
-        return np.nan
+        return np.nan, NOT_JUDGED if (folder / "trajectory.tum").exists() else UNFINISHED
     try:
-        return float(json.loads(path.read_text(encoding="utf-8"))["worse_than_odometry"])
+        content = json.loads(path.read_text(encoding="utf-8"))
+        doubt = content["worse_than_odometry"]
+        return (np.nan, str(content["reason"])) if doubt is None else (float(doubt), "")
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(str(path), f"malformed ({error})", "the health.json of a run directory") from None
 

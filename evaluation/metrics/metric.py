@@ -24,13 +24,13 @@ class Quantity(Settings):
     unit: str
     """SI, or degrees as `deg`; '' for a ratio or a count."""
     odometry: float | int | None = None
-    """The value for raw odometry, if defined."""
+    """The value for odometry, if defined."""
     note: str = ""
     """Reason for a missing value, or a remark on the value."""
 
 
 class Finding(NamedTuple):
-    """A computed value, the value for raw odometry and a note; a value may be NaN."""
+    """A computed value, the value for odometry and a note; a value may be NaN."""
 
     value: float | int
     odometry: float | int | None = None

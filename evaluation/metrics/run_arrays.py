@@ -10,6 +10,9 @@ from tactile.base.errors import InputError
 
 FOUND = "found"
 """State of a step whose pose in the map is known."""
+NOT_JUDGED = "not judged by this method"
+UNFINISHED = "not judged before the end of the run"
+"""Why a map is not judged; another reason is given in its run directory."""
 
 
 class RunArrays(NamedTuple):
@@ -24,7 +27,8 @@ class RunArrays(NamedTuple):
         created: [M] step at which each experience was first visited, -1: not in this run.
         nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
         links: [L, 2] linked experiences.
-        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if unknown.
+        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if there is none.
+        unjudged: why there is none. warnings: about the input, a sentence each.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
         piece: [N] the piece of the map in which each step is, see `evaluation.metrics.map_pieces`; empty: all
             steps are in one.
@@ -43,6 +47,8 @@ class RunArrays(NamedTuple):
     links: np.ndarray
     online_error: np.ndarray = np.zeros(0)
     doubt: float = np.nan
+    unjudged: str = NOT_JUDGED
+    warnings: tuple[str, ...] = ()
     piece: np.ndarray = np.zeros(0, int)
     node_piece: np.ndarray = np.zeros(0, int)
     state: np.ndarray = np.zeros(0, str)

@@ -103,7 +103,7 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         "duration": Finding(float(run.time[-1] - run.time[0])),
         "experiences": Finding(len(run.nodes)),
         "links": Finding(len(run.links)),
-        "map_doubt": _doubt(run.doubt),
+        "map_doubt": _doubt(run),
     }
     if run.has_pieces:
         findings |= piece_findings(run, rows)
@@ -179,10 +179,10 @@ def _undefined_across_pieces(findings: dict[str, Finding]) -> dict[str, Finding]
     }
 
 
-def _doubt(doubt: float) -> Finding:
-    if not np.isfinite(doubt):
-        return Finding(np.nan, note="not judged by this method")
-    return Finding(doubt, note="map_doubted: the trajectory is odometry" if doubt > DOUBTED else "")
+def _doubt(run: RunArrays) -> Finding:
+    if not np.isfinite(run.doubt):
+        return Finding(np.nan, note=run.unjudged)
+    return Finding(run.doubt, note="map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else "")
 
 
 def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,25 @@ REGISTERED = "Registered metrics"
 """Heading of the metrics that are not ours."""
 
 
+MOST_WARNINGS = 10
+"""Largest number of warnings that are printed."""
+WORSE = 1.01
+"""Ratio to the error of odometry above which a map is called worse."""
+
+
+class HealthCard(Settings):
+    """How far the result of a run can be believed, judged without truth: its input, and its map."""
+
+    input: Literal["clean", "warned"] = "clean"
+    """The verdict on the input; one that is refused makes no run."""
+    warnings: tuple[str, ...] = ()
+    """About the input, a sentence each."""
+    worse_than_odometry: float | None = None
+    """Probability that the map's error is worse than odometry's, whatever the input; None if unknown."""
+    reason: str = ""
+    """Why it is None."""
+
+
 class Scorecard(Settings):
     """All quantities of one run by name; `model_dump_json` gives `scorecard.json`."""
 
@@ -36,6 +55,8 @@ class Scorecard(Settings):
     """Thresholds and base set of the Experience Metric (all modes and kinds of log are scored)."""
     quantities: dict[str, Quantity]
     """In the order of the table."""
+    health: HealthCard | None = None
+    """Of a run; None (null) for the log of another system."""
 
 
 def score_run(
@@ -63,7 +84,18 @@ def score_run(
         unused = metric.section == PIECES and not run.has_pieces
         if not unused and (relations is not None or not metric.name.startswith("relations_")):
             quantities[metric.name] = metric.quantity(metric.compute(data) or MISSING_TRUTH)
-    return Scorecard(name=name, exm=exm, quantities=quantities)
+    return Scorecard(name=name, exm=exm, quantities=quantities, health=health_card(run))
+
+
+def health_card(run: RunArrays) -> HealthCard:
+    """The health of a run."""
+    doubt = float(run.doubt) if np.isfinite(run.doubt) else None
+    return HealthCard(
+        input="warned" if run.warnings else "clean",
+        warnings=run.warnings,
+        worse_than_odometry=doubt,
+        reason=run.unjudged if doubt is None else "",
+    )
 
 
 def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT_EXM) -> Scorecard:
@@ -84,7 +116,7 @@ class Line(NamedTuple):
     """One line of a table of quantities, as text.
 
     Attributes:
-        label, value, unit, note: of the quantity; "as above" for a note that repeats. odometry: value of raw
+        label, value, unit, note: of the quantity; "as above" for a note that repeats. odometry: value of
             odometry, "" without one.
     """
 
@@ -106,7 +138,7 @@ def scorecard_lines(card: Scorecard) -> dict[str, list[Line]]:
 
 
 def render_scorecard(card: Scorecard) -> str:
-    """The scorecard as a text table: quantity, value, unit, value of raw odometry, note."""
+    """The scorecard as a text table: quantity, value, unit, value of odometry, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
     lines = [f"{card.name:<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
     for section, shown in scorecard_lines(card).items():
@@ -125,15 +157,49 @@ def scorecard_html(card: Scorecard) -> str:
 
 
 def render_health(card: Scorecard) -> str:
-    """The health of the map in one line; "" if it is not judged."""
-    found = card.quantities.get("map_doubt")
-    if found is None or found.value is None:
+    """The health of input and map in one line; "" for the log of another system."""
+    health = card.health
+    if health is None:
         return ""
-    if found.value > DOUBTED:
-        return f"health: map_doubted, {found.value:.0%} likely worse than odometry, which is given instead"
-    if found.value == 0:
-        return "health: no loop closure was accepted, the map is the odometry"
-    return f"health: map {1 - found.value:.0%} likely no worse than odometry"
+    count, doubt = len(health.warnings), health.worse_than_odometry
+    given = f"input {health.input}" + (f" ({count} warning{'s' * (count > 1)})" if count else "")
+    if doubt is None:
+        reason = health.reason
+        found = f"map {reason}" if reason.startswith("not judged") else reason
+    elif doubt > DOUBTED:
+        found = f"map_doubted, {doubt:.0%} likely worse than odometry, which is given instead"
+    else:
+        found = f"map {1 - doubt:.0%} likely no worse than odometry"
+    return f"health: {given}; {found}"
+
+
+def render_warnings(card: Scorecard) -> list[str]:
+    """The warnings about the input, a line each; the number of further ones if they are many."""
+    warnings = () if card.health is None else card.health.warnings
+    lines = [f"warning: {sentence}" for sentence in warnings[:MOST_WARNINGS]]
+    more = len(warnings) - MOST_WARNINGS
+    return lines + ([f"and {more} more, which scorecard.json lists"] if more > 0 else [])
+
+
+def position_error(card: Scorecard) -> Quantity:
+    """The ATE of the final trajectory, within its pieces if there are several."""
+    return card.quantities.get("ate_within_pieces", card.quantities["ate_final"])
+
+
+def is_worse(card: Scorecard) -> bool:
+    """Whether the map is farther from the truth than odometry, whatever its health says."""
+    error = position_error(card)
+    return error.value is not None and error.odometry is not None and error.value > WORSE * error.odometry
+
+
+def render_error(card: Scorecard) -> str:
+    """The position error beside that of odometry in one line, with a word where the map is worse."""
+    error = position_error(card)
+    if error.value is None:
+        return "ATE (RMS): unknown, no truth"
+    raw = "" if error.odometry is None else f", odometry {error.odometry:.3g} {error.unit}"
+    worse = "; against the truth the map is worse than odometry" if is_worse(card) else ""
+    return f"{error.label} (RMS): {error.value:.3g} {error.unit}{raw}{worse}"
 
 
 def _line(quantity: Quantity, above: Quantity | None) -> Line:

@@ -65,7 +65,7 @@ def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:
     axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim(), adjustable="box")  # odometry may leave the plot
     reckoned = compose(compose(path[0], between(seen.odometry[0], np.zeros(3))), seen.odometry[rows])
     dashed = (0, (5, 3))
-    axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="raw odometry")
+    axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="odometry")
 
 
 def _paint_now(axes: style.Axes, seen: RunProgress, to_truth: np.ndarray) -> None:

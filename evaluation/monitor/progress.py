@@ -36,7 +36,7 @@ class RunProgress(NamedTuple):
         outcomes: number of steps by outcome. lost: number of steps lost. online_error: position error at the
             last comparison with the truth, after alignment of the path, m.
         checkpoint: steps of the last checkpoint. rate: mean steps per second, by file dates.
-        silence: time since the last write of the run, s.
+        silence: time since the last write of the run, s. warnings: about the input.
     """
 
     name: str
@@ -53,6 +53,7 @@ class RunProgress(NamedTuple):
     rate: float | None
     silence: float
     doubt: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def step_count(seen: RunProgress) -> str:
@@ -107,6 +108,7 @@ class RunMonitor:
             lost=int(rows[:, 7].sum()),
             online_error=self._online_error,
             doubt=self._doubt,
+            warnings=manifest.warnings,
             checkpoint=checkpoint_steps(self.directory),
             rate=count / (last - began) if 0 < began < last else None,
             silence=max(0.0, time.time() - self._date(*self._files())),

@@ -72,6 +72,7 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
     parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
     parts += [f"{seen.lost} lost"] if seen.lost else []
     parts += [f"map_doubted ({seen.doubt:.0%})"] if (seen.doubt or 0.0) > DOUBTED else []
+    parts += [f"input warned ({len(seen.warnings)})"] if seen.warnings else []
     parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []
     if seen.status == RUNNING and seen.silence > SILENCE_SHOWN:
         parts.append(f"silent for {seen.silence:.0f} s")

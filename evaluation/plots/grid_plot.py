@@ -150,7 +150,7 @@ def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) ->
         return word if np.isnan(off) else f"{word}, mean error {off:.3f} m"
 
     dashed = (0, (4, 2))
-    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("raw odometry", odometry))
+    axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("odometry", odometry))
     axes.plot(*truth.T, color=YELLOW, lw=2.4, alpha=0.8, zorder=4, label="truth")
     axes.plot(*estimate.T, color=_SKY, lw=1.0, zorder=5, label=name("online path", estimate))
     start = truth[np.isfinite(truth).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Plot of the map of a run with truth, raw odometry and walls."""
+"""Plot of the map of a run with truth, odometry and walls."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Layers(NamedTuple):
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
 ) -> style.Figure:
-    """Draws the map over truth and raw odometry with equal axes.
+    """Draws the map over truth and odometry with equal axes.
 
     All is in the frame of the map, in which commands take places: truth and walls are aligned to the map, and
     odometry to the truth, as for ATE; without truth, odometry starts at the first pose of the map. Of a map
@@ -103,8 +103,8 @@ def map_headline(card: Scorecard, found: str = "") -> str:
     elif ate.value is None:
         parts.append("no ground truth")
     else:
-        raw = f"{ate.odometry:.3g} m raw odometry"
-        parts.append(f"ATE {ate.value:.3g} m final, {online.value:.3g} m online, {raw}")
+        raw = f"{ate.odometry:.3g} m odometry"
+        parts.append(f"ATE (RMS) {ate.value:.3g} m final, {online.value:.3g} m online, {raw}")
     arr, arcr = card.quantities["exm_arr"].value, card.quantities["exm_arcr_strict"].value
     parts += [] if arr is None else [f"ARR {arr:.2f}"]
     parts += [] if arcr is None else [f"ARCR {arcr:.2f}"]
@@ -172,7 +172,7 @@ def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
     truth, odometry, final, nodes, _ = layers
     if truth is not None:
         axes.plot(*truth.T, color=INK, lw=0.8, zorder=5, label="truth")
-    axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="raw odometry")
+    axes.plot(*odometry.T, color=GREY, lw=0.9, ls=(0, (5, 3)), zorder=1, label="odometry")
     _paint_path(axes, run, final, lw=0.8, alpha=0.4, zorder=2)
     if len(nodes):
         dot = {"s": 26 * crowd**2, "color": BLUE, "edgecolors": "white", "linewidths": 0.6 * (crowd == 1)}
@@ -195,7 +195,7 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
     line = split_at_jumps(truth, truth)
     axes.plot(*line.T, color=YELLOW, lw=5, solid_capstyle="butt", zorder=0.8, label="truth")
     _paint_path(axes, run, final, truth, lw=0.7, zorder=3)
-    axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="raw odometry")
+    axes.plot(*odometry.T, color=GREY, lw=0.7, alpha=0.7, zorder=1, label="odometry")
     own = (run.created[run.links] >= 0).all(axis=1)
     if not own.all():
         name = "map" if len(run.state) else "map before"

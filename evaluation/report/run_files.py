@@ -22,7 +22,7 @@ FILES = {
     "steps.csv": "a line for each step: place, action, pose, spread, doubt, outcome, evidence",
     "online_error.csv": "error of the current pose while the run went on, m",
     "timing.csv": "computing time of each chunk of steps, s; differs from run to run",
-    "health.json": "probability that the map is worse than odometry",
+    "health.json": "probability that the map is worse than odometry; null with its reason",
     "closures.csv": "loop closures that the map considered, with evidence and verdicts",
     "closure_views.npz": "the views that loop closures join, as 8-bit images",
     "views.npz": "whisker images of all steps",

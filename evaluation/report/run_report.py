@@ -23,7 +23,7 @@ from evaluation.artifacts.run_directory import (
 from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_arrays import UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers, align_layers
@@ -97,8 +97,8 @@ def read_run_report(directory: Path) -> RunReport:
     run = arrange_pieces(measured)
     count = len(run.time)
     doubt = read_column(steps, "doubt", np.nan)[:count]
-    verdict = judge_map(run.doubt)
-    if np.isnan(run.doubt) and np.isfinite(doubt).any():
+    verdict = judge_map(run.doubt, run.unjudged)
+    if run.unjudged == UNFINISHED and np.isfinite(doubt).any():
         run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]))
         verdict = judge_map(run.doubt)
         verdict = verdict._replace(

@@ -6,8 +6,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED
 from evaluation.metrics.run_metrics import DOUBTED
-from evaluation.metrics.scorecard import Scorecard
+from evaluation.metrics.scorecard import Scorecard, is_worse, position_error
 
 CAUTION = 1 - DOUBTED
 """Probability of being worse than odometry above which a map is to be taken with care."""
@@ -25,18 +26,19 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def judge_map(doubt: float) -> Verdict:
+def judge_map(doubt: float, unjudged: str = NOT_JUDGED) -> Verdict:
     """The verdict on a map.
 
     Args:
-        doubt: probability that its error is worse than odometry's; exactly 0 if no loop closure was accepted,
-            because the map is then the odometry; NaN if the method does not judge its map.
+        doubt: probability that its error is worse than odometry's; NaN if there is none. unjudged: why.
     """
-    if np.isnan(doubt):
+    if np.isnan(doubt) and unjudged == NOT_JUDGED:
         reason = "This method does not say how far its map can be trusted."
         return Verdict("unjudged", "The map is not judged", reason)
-    if doubt == 0:
-        reason = "No loop closure was accepted, so nothing corrects the drift of the odometry."
+    if np.isnan(doubt) and unjudged == UNFINISHED:
+        return Verdict("unjudged", "The map is not judged yet", "It is judged when the run has ended.")
+    if np.isnan(doubt):
+        reason = f"{unjudged[:1].upper()}{unjudged[1:]}: nothing corrects its drift."
         return Verdict("unjudged", "This map is the odometry", reason)
     worse, better = _percent(doubt), _percent(1 - doubt)
     if doubt > DOUBTED:
@@ -50,15 +52,14 @@ def judge_map(doubt: float) -> Verdict:
 
 def describe_score(card: Scorecard) -> str:
     """The position error in a sentence, or that the truth is unknown."""
-    within = card.quantities.get("ate_within_pieces")
-    error = card.quantities["ate_final"] if within is None else within
+    error = position_error(card)
     if error.value is None:
         return "The truth is unknown, so there is no score."
-    of = "" if within is None else " within the pieces of the map"
+    of = " within the pieces of the map" * ("ate_within_pieces" in card.quantities)
     text = f"Against the truth, the root mean square position error{of} is {error.value:.3g} {error.unit}"
     if error.odometry is None:
         return f"{text}."
-    factor = _factor(error.value, error.odometry)
+    factor = _factor(error.value, error.odometry) + ", worse than odometry" * is_worse(card)
     return f"{text}; that of odometry is {error.odometry:.3g} {error.unit}{factor}."
 
 

@@ -177,6 +177,7 @@ def _steps(a: Arrays, b: Arrays, ever: int, bend: Bend) -> Arrays:
     return {
         "steps/frame": np.concatenate([settled(a["steps/frame"], ever), number]),
         "steps/motion": np.concatenate([a["steps/motion"], motion]),
+        "steps/odometry": np.concatenate([a["steps/odometry"], b["steps/odometry"]]),
     }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
-from ratslam.core.backend import Evidence, Map
+from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action, Estimate
@@ -116,6 +116,7 @@ class ExperienceMap(Checkpointed, Map):
         self._closure = GrowableArray((), np.bool_)
         self._step_node = GrowableArray((), np.int64)
         self._step_motion = GrowableArray((3,), np.float64)
+        self._odometry = GrowableArray((3,), np.float64)  # of each step, NaN where it is not known
         self._reached = GrowableArray((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
@@ -124,6 +125,8 @@ class ExperienceMap(Checkpointed, Map):
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the current node's pose and the motion since; before the first node, dead reckoning."""
         del estimate
+        if self._is_odometry() and len(self._odometry.rows):
+            return self._odometry.rows[-1].copy()
         return compose(self._origin(), self._travel.motion)
 
     def nodes(self) -> np.ndarray:
@@ -138,12 +141,21 @@ class ExperienceMap(Checkpointed, Map):
         )
 
     def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all steps: present pose of the step's node, and the motion since."""
+        """[T, 3] poses of all steps: present pose of the step's node, and the motion since; the odometry to
+        the bit before a known node is reached."""
+        if self._is_odometry():
+            return self._odometry.rows.copy()
         node, motion = self._step_node.rows, self._step_motion.rows
         if not len(self._pose.rows):
             return motion.copy()
         origin = np.where(node[:, None] >= 0, self._pose.rows[np.maximum(node, 0)], 0.0)
         return compose(origin, motion)
+
+    def unjudged(self) -> str:
+        return "" if len(self._reached.rows) else NO_CLOSURE
+
+    def _is_odometry(self) -> bool:
+        return not len(self._reached.rows) and bool(np.isfinite(self._odometry.rows[-1:]).all())
 
     def closures(self) -> np.ndarray:
         """[M, 2] steps at which a known node was reached, and the step at which it was created."""
@@ -188,6 +200,8 @@ class ExperienceMap(Checkpointed, Map):
 
     def _advance(self, odometry) -> None:
         moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
+        before = self._odometry.rows[-1] if len(self._odometry.rows) else np.zeros(3)
+        self._odometry.append(compose(before, moved) if np.isfinite(moved).all() else before.copy())
         if not np.isfinite(moved).all():
             return  # the kernel reports NOT_FINITE
         noise, length = self.config.noise, float(np.hypot(moved[0], moved[1]))

@@ -60,7 +60,7 @@ def add_commands(commands: Commands) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.metrics.scorecard import render_health, render_scorecard
+    from evaluation.report.summary import summarise
     from ratslam.live.session import run_live_session
     from ratslam.pipeline.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
@@ -77,8 +77,7 @@ def _live(arguments: argparse.Namespace) -> int:
     with catch_interrupt("stopping the robot"), monitor() as start_monitor:
         ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
     if card is not None:
-        print(render_scorecard(card))
-        print(f"\n{render_health(card)}".rstrip())
+        print(summarise(directory, card, config.backend))
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
     tell(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:

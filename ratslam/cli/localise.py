@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
 
 def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.metrics.scorecard import render_scorecard
+    from evaluation.report.summary import summarise
     from ratslam.pipeline.localise import localise
     from ratslam.pipeline.run import print_status
     from ratslam.pipeline.saved_map import read_map
@@ -51,8 +51,8 @@ def _localise(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"
     with open_viewer(target) as observers:
         card, summary, interrupted = localise(saved, config, directory, observers)
-    print(render_scorecard(card))
-    print(f"\n{summary.describe()}")
+    print(summary.describe())
+    print(summarise(directory, card, f"localising in {arguments.map}"))
     print(f"{directory}/localisation.csv holds the state and the probability of every step,")
     print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
     return INTERRUPTED if interrupted else 0

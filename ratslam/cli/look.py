@@ -6,10 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 from shutil import get_terminal_size
+from typing import TYPE_CHECKING
 
 from ratslam.cli.common import Commands
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
+
+if TYPE_CHECKING:
+    from evaluation.metrics.scorecard import Scorecard
 
 
 def add_commands(commands: Commands) -> None:
@@ -88,7 +92,7 @@ def _score(arguments: argparse.Namespace) -> int:
     from evaluation.metrics.experience_log import read_experience_log
     from evaluation.metrics.experience_metric import ExmConfig
     from evaluation.metrics.registry import build_metrics
-    from evaluation.metrics.scorecard import render_scorecard, score_log, score_run
+    from evaluation.metrics.scorecard import score_log, score_run
     from tactile.base.plugins import PluginConfig
 
     if arguments.base is not None and arguments.base < 0:
@@ -102,7 +106,7 @@ def _score(arguments: argparse.Namespace) -> int:
         )
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
-    print(card.model_dump_json(indent=2) if arguments.json else render_scorecard(card))
+    print(card.model_dump_json(indent=2) if arguments.json else render_scores(arguments.log, card))
     return 0
 
 
@@ -110,6 +114,19 @@ def _require_page(path: Path) -> None:
     from evaluation.report.page import PAGE_START
 
     require_new_file(path, replaces=PAGE_START)
+
+
+def render_scores(path: Path, card: Scorecard) -> str:
+    """All figures as text: the table, that of the grid in a run directory with one, warnings and health."""
+    from evaluation.metrics import grid_score
+    from evaluation.metrics.scorecard import render_health, render_scorecard, render_warnings
+
+    parts, grid = [render_scorecard(card)], path / "gridscore.json"
+    if grid.exists():
+        score = grid_score.GridScore.model_validate_json(grid.read_text(encoding="utf-8"))
+        parts.append(grid_score.render_grid_scores([score]))
+    parts.append("\n".join([*render_warnings(card), render_health(card)]))
+    return "\n\n".join(part for part in parts if part)
 
 
 def _report(arguments: argparse.Namespace) -> int:

@@ -173,12 +173,16 @@ def render_info(info: dict) -> str:
             f" ({undone} undone)",
             "calibration heading bias {:.4f} ± {:.4f} rad/m, turn error {:.4f} ± {:.4f} rad/rad".format(
                 *calibration
-            ),
+            )
+            if accepted
+            else "calibration none learned, for want of a closure",
         ]
     else:
         lines.append(f"closures    {info['closures']}")
     if info["doubt"] is not None:
         lines.append(f"doubt       {info['doubt']:.2f}, probability that the map is worse than odometry")
+    elif info["unjudged"]:
+        lines.append(f"doubt       none: {info['unjudged']}")
     return "\n".join(lines)
 
 

@@ -14,6 +14,7 @@ from ratslam.cli.common import (
     read_config,
     require_new_folder,
 )
+from ratslam.cli.look import render_scores
 
 
 def add_commands(commands: Commands) -> None:
@@ -30,6 +31,7 @@ def add_commands(commands: Commands) -> None:
         "last sample mapped; another begins a separate piece, joined once its views place it in the map, and "
         "is refused in maps of methods other than `backend: recall`, which are one piece",
     )  # fmt: skip
+    run.add_argument("--full", action="store_true", help="print all figures, as `score` does")
     run.add_argument("--report", action="store_true", help="write report.html, a page, to the run directory")
     add_rerun(run)
 
@@ -79,8 +81,7 @@ def run_directory(arguments: argparse.Namespace) -> Path:
 
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.metrics import grid_score
-    from evaluation.metrics.scorecard import render_health, render_scorecard
+    from evaluation.report.summary import summarise
     from ratslam.pipeline import report
     from ratslam.pipeline.run import run
     from ratslam.viewer.observer import open_viewer
@@ -90,12 +91,12 @@ def _run(arguments: argparse.Namespace) -> int:
     directory, config, target = run_directory(arguments), read_config(arguments), open_target(arguments)
     with open_viewer(target) as observers:
         card, interrupted = run(config, directory, arguments.resume, observers)
-    print(render_scorecard(card))
-    if (directory / "gridscore.json").exists():
-        text = (directory / "gridscore.json").read_text(encoding="utf-8")
-        print("\n" + grid_score.render_grid_scores([grid_score.GridScore.model_validate_json(text)]))
-    print(f"\n{render_health(card)}".rstrip())
+    if arguments.full:
+        print(f"{render_scores(directory, card)}\n")
+    print(summarise(directory, card, config.backend))
     print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
+    if not arguments.full:
+        print(f"python -m ratslam score {directory} prints all figures")
     if arguments.report:
         report.write_report([directory], directory / report.NAME)
         print(f"{directory / report.NAME} is a page about the run")

@@ -26,6 +26,8 @@ State = Any
 Evidence = Any
 """The backend's own record of one step: a NamedTuple of arrays of fixed shapes with at least `outcome`.
 Fields annotated `ratslam.core.types.Scalar` are columns of `steps.csv`."""
+NO_CLOSURE = "no loop closure was accepted, the map is the odometry"
+"""Why a map of a method that closes loops is not judged."""
 Feedback = Any
 """A record of host arrays that the map gives to the kernel, or None."""
 
@@ -80,12 +82,16 @@ class Map(Protocol):
 
     def doubt(self) -> float:
         """Probability that the present map's error is worse than odometry's, as judged some steps ago; NaN
-        for maps that do not judge themselves."""
+        for maps that do not judge themselves, and where no loop closure is accepted."""
         return np.nan
 
     def final_doubt(self) -> float:
         """The same probability of the final map."""
         return self.doubt()
+
+    def unjudged(self) -> str:
+        """`NO_CLOSURE`, with an addition perhaps, if that is why there is no such probability; else ''."""
+        return ""
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps in the online map, before the final optimisation."""

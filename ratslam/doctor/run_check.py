@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.closure_table import Closures, count_closures
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.run_directory import check_run_directory, read_run
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
@@ -24,15 +23,6 @@ SAME = 0.99
 """Share of the odometry's error above which the map's is no better."""
 FAST = 2.0
 """Median motion of a step, cells, above which the views of successive steps differ too much."""
-
-
-class Closures(NamedTuple):
-    """Loop closures of a run: proposed and accepted ones, and sequences of both."""
-
-    proposed: int
-    accepted: int
-    sequences: int
-    accepted_sequences: int
 
 
 def diagnose_run(path: Path) -> Diagnosis:
@@ -52,11 +42,12 @@ def diagnose_run(path: Path) -> Diagnosis:
     closures, outcomes = count_closures(path), count_outcomes(path)
     status = "killed" if manifest.killed else manifest.status
     what = f"{path}: a run of {len(run.time)} steps ({status}), backend {config.backend}"
-    verdict = judge_map(run.doubt)
+    verdict = judge_map(run.doubt, run.unjudged)
     judgement = f"{verdict.headline}. {verdict.reason}"
     if manifest.killed:
         judgement = "It was killed, or ended by an error: the poses are those found on the way, not judged"
-    notes = [judgement, *error_notes(run)]
+    given = [f"warning about the input: {sentence}" for sentence in run.warnings] or ["input: clean"]
+    notes = [judgement, *given, *error_notes(run)]
     if closures is not None:
         notes.append(
             f"loop closures: {closures.accepted} of {closures.proposed} accepted, "
@@ -87,19 +78,8 @@ def error_notes(run: RunArrays) -> list[str]:
         return ["truth: unknown, so nothing but the health tells how good the map is"]
     final, odometry = ate(run.final[rows], run.truth[rows]), ate(run.odometry[rows], run.truth[rows])
     better = "better" if final < SAME * odometry else "no better"
+    better = "worse" if SAME * final > odometry else better
     return [f"truth: map {final:.3g} m off, odometry {odometry:.3g} m (ATE): {better} than odometry"]
-
-
-def count_closures(path: Path) -> Closures | None:
-    """The loop closures in closures.csv; None if there are none, as of a method that proposes none."""
-    if not (path / "closures.csv").exists():
-        return None
-    table = read_closure_table(path)
-    accepted = table.accepted()
-    sequence = table.evidence.get("sequence", np.arange(len(accepted)))
-    return Closures(
-        len(accepted), int(accepted.sum()), len(np.unique(sequence)), len(np.unique(sequence[accepted]))
-    )
 
 
 def count_outcomes(path: Path) -> Counter[str]:

@@ -156,7 +156,13 @@ class KeyframeGraph(Checkpointed):
 
     def reckoned_after(self, motion: np.ndarray, length: float) -> np.ndarray:
         """The same by odometry with the calibration of the start."""
-        return compose(self.reckoned, correct_heading(motion, length, self.start.bias, self.start.turn_error))
+        return compose(self.reckoned, self.calibrated(motion, length))
+
+    def calibrated(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
+        """Motions [..., 3] over distances [...] with the calibration of the start; to the bit the same
+        without one."""
+        bias, turn_error = self.start.bias, self.start.turn_error
+        return correct_heading(motion, length, bias, turn_error) if bias or turn_error else motion
 
     def correct(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
         """Motions [..., 3] over distances [...] without the systematic errors of the odometry."""
@@ -322,17 +328,20 @@ class KeyframeGraph(Checkpointed):
         return self.map_covariance(log).relative(first, self.count - 1, 0.0)
 
     def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
-        """Edges of a solution: odometry corrected by its bias, none where it is broken, and closures with
-        their robust weights."""
+        """Edges of a solution: odometry, corrected by its bias in pieces with a closure, none where it is
+        broken, and closures with their robust weights."""
         chain, closures, _, links = self.problem(log, cut)
-        steps = np.flatnonzero(~self.is_broken(cut)[1:])
+        broken, pairs = self.is_broken(cut), log.accepted_pairs()
+        steps, piece = np.flatnonzero(~broken[1:]), number_pieces(broken, pairs)
+        closed = np.isin(piece[1:], piece[pairs[:, 0]])[:, None]
+        moved = np.where(closed, fit.corrected(chain), self.calibrated(chain.motion, chain.length))
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)
         trust = log.weights()[:, None] / closures.variance
         return Edges(
             np.concatenate([steps, links.i, closures.i]),
             np.concatenate([steps + 1, links.j, closures.j]),
-            np.concatenate([fit.corrected(chain)[steps], fit.corrected_links(links), turned]),
+            np.concatenate([moved[steps], fit.corrected_links(links), turned]),
             np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]),
         )
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ratslam.alignment.learned_odds import LearnedOdds
-from ratslam.core.backend import Evidence, Map
+from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.types import Estimate
 from ratslam.keyframes.acceptance import Acceptance
@@ -98,7 +98,7 @@ class KeyframeMap(Checkpointed, Map):
         self._solution: MapSolution | None = None
         self._kept: MapSolution | None = None  # the same without merged keyframes
         self._worse: float | None = None  # of that solution
-        self._doubt = 0.0  # of the map some keyframes ago
+        self._doubt = np.nan  # of the map some keyframes ago
 
     def feedback(self) -> MapFeedback:
         """The poses, heading bias and view metric for the recall filter."""
@@ -112,28 +112,42 @@ class KeyframeMap(Checkpointed, Map):
         del estimate
         confirmed = (self.log.verdicts() == Verdict.ACCEPTED).any()
         graph, (motion, length, _) = self._graph, self._travel
-        return graph.pose_after(motion, length) if confirmed else graph.reckoned_after(motion, length)
+        if confirmed:
+            return graph.pose_after(motion, length)
+        reckoned = self._steps.odometry[-1:]
+        if len(reckoned) and np.isfinite(reckoned).all() and not (self._begins or graph.begins.rows.any()):
+            return reckoned[0].copy()
+        return graph.reckoned_after(motion, length)
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
-        return self._steps.poses(self._best())
+        return self._steps.poses(self._best()) if self.final_doubt() > DOUBTED else self.map_trajectory()
 
     def map_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map."""
-        return self._steps.poses(self.solution().fit)
+        return self._steps.poses(self.solution().fit, self.solution().open_pieces(self.keyframes()))
+
+    def unjudged(self) -> str:
+        if len(self.solution().log.accepted_rows()):
+            return ""
+        start = self._graph.start
+        return NO_CLOSURE + ", as calibrated by the configuration" * bool(start.bias or start.turn_error)
 
     def doubt(self) -> float:
         return self._doubt
 
     def final_doubt(self) -> float:
         if self._worse is None:
-            self._worse = worse_than_odometry(self.keyframes(), self.solution()) if self.closes_loops else 0.0
+            self._worse = worse_than_odometry(self.keyframes(), self.solution())
         return self._worse
 
     def online_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the online map, before the final optimisation."""
-        fit = self._graph.fit()
-        return self._steps.poses(fit._replace(poses=self.archive.poses(fit.poses)))
+        graph = self._graph
+        fit, _, _ = present = self._by_odometry(MapSolution(graph.fit(), self.log, graph.cut), graph)
+        open_ = present.open_pieces(graph)
+        open_ = open_[self.archive.row.rows] if self.archive.begun else open_
+        return self._steps.poses(fit._replace(poses=self.archive.poses(fit.poses)), open_)
 
     def closures(self) -> np.ndarray:
         """[M, 2] steps of the keyframes joined by accepted loop closures."""
@@ -164,17 +178,19 @@ class KeyframeMap(Checkpointed, Map):
         """The final map of all keyframes, as it would be if the session ended now."""
         if self._solution is None:
             kept = self.kept_solution()
-            self._solution = self._solution or self.archive.solve(kept, self._graph)
+            whole = self._solution or self.archive.solve(kept, self._graph)
+            self._solution = self._by_odometry(whole, self.keyframes())
         return self._solution
 
     def kept_solution(self) -> MapSolution:
         """The final map of the keyframes that are not merged."""
         if self._kept is None:
-            self._kept = self._solve_finally().placed(self._graph)
+            kept = self._solve_finally().placed(self._graph)
             if self.closes_loops and is_retraced(self.keyframes()):
-                whole = self.archive.solve(self._kept, self._graph)
+                whole = self.archive.solve(kept, self._graph)
                 self._solution = retraced_solution(self.keyframes(), whole)
-                self._kept = kept_part(self._solution, self._kept, self._graph.taken.rows)
+                kept = kept_part(self._solution, kept, self._graph.taken.rows)
+            self._kept = self._by_odometry(kept, self._graph)
         return self._kept
 
     def graph(self) -> networkx.DiGraph:
@@ -233,7 +249,10 @@ class KeyframeMap(Checkpointed, Map):
             self._judge()
             change = self._arrive(matched)
         ever = self._graph.ever
-        self._steps.append(leading_to(ever) if self._begins or not ever else ever - 1, self._travel)
+        moved = np.array(observation.odometry[:3], float)
+        moved = self._graph.calibrated(moved, float(np.hypot(*moved[:2])))
+        frame = leading_to(ever) if self._begins or not ever else ever - 1
+        self._steps.append(frame, self._travel, moved if np.isfinite(moved).all() else np.zeros(3))
         self._forget_solution()
         return estimate._replace(place=change.place, previous=change.previous, action=change.action)
 
@@ -334,9 +353,13 @@ class KeyframeMap(Checkpointed, Map):
 
     def _best(self) -> MapFit:
         """The map's poses, or those of raw odometry where the map is doubted."""
-        if self.final_doubt() <= DOUBTED:
+        if not self.final_doubt() > DOUBTED:
             return self.solution().fit
         return MapFit(self.keyframes().dead_reckoned(), 0.0, np.zeros(0))
+
+    def _by_odometry(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
+        """See `MapSolution.by_odometry`; graph: the keyframes of the solution."""
+        return solution.by_odometry(graph, self._steps.odometry[self.keyframe_steps()[graph.taken.rows]])
 
     def _forget_solution(self) -> None:
         self._solution = self._kept = self._worse = None

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import expit
 
 from ratslam.keyframes.claimed_revisits import claimed_revisits
-from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution
@@ -58,9 +57,9 @@ class HealthFeatures(NamedTuple):
 
 
 def worse_than_odometry(graph: KeyframeGraph, solution: MapSolution) -> float:
-    """Probability that the map's error is worse than odometry's; 0 without closures: the map is odometry."""
-    if not (solution.log.weights() > ACCEPTED_WEIGHT).any():
-        return 0.0
+    """Probability that the map's error is worse than odometry's; NaN without closures."""
+    if not len(solution.log.accepted_rows()):
+        return np.nan
     return float(expit(INTERCEPT + WEIGHTS @ np.array(health_features(graph, solution))))
 
 

@@ -30,6 +30,7 @@ from ratslam.keyframes.odometry_breaks import find_break
 from ratslam.keyframes.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.keyframes.piece_joining import spans_pieces
 from ratslam.keyframes.pieces import number_pieces
+from tactile.base.se2 import compose, inverse
 
 Place = Callable[[np.ndarray], np.ndarray]
 """Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
@@ -63,6 +64,31 @@ class MapSolution(NamedTuple):
         if doubted:
             return number_pieces(graph.begins.rows, np.zeros((0, 2), int))
         return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
+
+    def open_pieces(self, graph: KeyframeGraph) -> np.ndarray:
+        """[N] bool, keyframes of a piece without an accepted closure."""
+        piece = self.pieces(graph)
+        return ~np.isin(piece, piece[self.log.accepted_pairs()[:, 0]])
+
+    def by_odometry(self, graph: KeyframeGraph, odometry: np.ndarray) -> MapSolution:
+        """The map whose pieces without an accepted closure are their odometry, from where each begins: what
+        views alone show of its bias may be wrong. The one place for this rule.
+
+        Args:
+            odometry: [N, 3] of the keyframes; NaN where it is not known, which leaves a piece as it is.
+        """
+        fit, piece, open_ = self.fit, self.pieces(graph), self.open_pieces(graph)
+        poses = fit.poses.copy()
+        for number in np.unique(piece[open_]).tolist():
+            rows = np.flatnonzero(piece == number)
+            own = odometry[rows]
+            if rows[0]:
+                own = compose(compose(poses[rows[0]], inverse(own[0])), own)
+            poses[rows] = np.where(np.isfinite(own).all(), own, poses[rows])
+        fit = fit._replace(poses=poses)
+        if open_.all() and np.isfinite(odometry).all():
+            fit = fit._replace(bias=graph.start.bias, turn_error=graph.start.turn_error)
+        return self._replace(fit=fit)
 
     def obstacle(self, sequence: int, log: ClosureLog) -> Obstacle | None:
         """Why a sequence cannot be undone; None if it can.

@@ -17,21 +17,29 @@ class StepRecord(Checkpointed):
     """The keyframe of each of T steps and the motion from there; keyframes are numbered as they were taken.
 
     The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from it
-    back to them. Number -1: from the origin, before any keyframe.
+    back to them. Number -1: from the origin, before any keyframe. The odometry is kept as it adds up from
+    step to step, so that a map without closures gives it to the bit.
     """
 
     def __init__(self) -> None:
         self._frame = GrowableArray((), np.int64)
         self._motion = GrowableArray((4,), np.float64)  # from that keyframe, and its length
+        self._odometry = GrowableArray((3,), np.float64)
 
-    def append(self, frame: int, travel: Travel) -> None:
+    @property
+    def odometry(self) -> np.ndarray:
+        """[T, 3] the odometry of all steps from the first one; NaN where it is not known."""
+        return self._odometry.rows
+
+    def append(self, frame: int, travel: Travel, moved: np.ndarray) -> None:
         """Adds a step.
 
         Args:
-            frame: see the class. travel: since that keyframe, or since the piece begins.
+            frame, travel: see the class. moved: [3] in the step.
         """
         self._frame.append(frame)
         self._motion.append([*travel.motion, travel.length])
+        self._odometry.append(compose(self.odometry[-1] if len(self.odometry) else np.zeros(3), moved))
 
     def arrive(self, frame: int, travel: Travel) -> None:
         """The steps that lead to a keyframe are known from it, once it is taken after `travel`."""
@@ -59,6 +67,8 @@ class StepRecord(Checkpointed):
         led = np.where(frame < -1, leading_to(owner), -1)
         self._frame.replace(np.where(frame >= 0, owner, led)[steps])
         self._motion.replace(self._motion.rows[steps])
+        # What remains keeps its shape, which closures that are gone may have given it.
+        self._odometry.replace(np.full((len(steps), 3), np.nan))
         return steps
 
     def first_steps(self, count: int) -> np.ndarray:
@@ -69,14 +79,20 @@ class StepRecord(Checkpointed):
         """[T] the value of each step's keyframe, of values [E]; zeros without keyframes."""
         return values[self._owners(len(values))] if len(values) else np.zeros_like(self._frame.rows)
 
-    def poses(self, fit: MapFit) -> np.ndarray:
-        """[T, 3] of all steps by a fit of the keyframes."""
+    def poses(self, fit: MapFit, open_: np.ndarray | None = None) -> np.ndarray:
+        """[T, 3] of all steps by a fit of the keyframes; from `open_` ones [E] on, by odometry alone."""
         frame, motion = self._frame.rows, self._motion.rows
         moved = correct_heading(motion[:, :3], motion[:, 3], fit.bias, fit.turn_error)
         if not len(fit.poses):
-            return moved
-        origin = np.where(frame[:, None] == -1, 0.0, fit.poses[self._owners(len(fit.poses))])
-        return compose(origin, moved)
+            return np.where(np.isfinite(self.odometry), self.odometry, moved)
+        owner = self._owners(len(fit.poses))
+        poses = compose(np.where(frame[:, None] == -1, 0.0, fit.poses[owner]), moved)
+        if open_ is not None and open_.any():
+            at = self.odometry[self.first_steps(len(fit.poses))][owner]
+            onwards = compose(fit.poses[owner], between(at, self.odometry))
+            onwards = np.where((at == fit.poses[owner]).all(axis=1)[:, None], self.odometry, onwards)
+            poses = np.where(open_[owner, None] & np.isfinite(onwards), onwards, poses)
+        return poses
 
     def _owners(self, count: int) -> np.ndarray:
         """[T] the keyframe of each step, of `count` keyframes taken."""

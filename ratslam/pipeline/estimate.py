@@ -12,13 +12,22 @@ from ratslam.core.session import Step
 
 
 class Health(NamedTuple):
-    """How far a map can be believed, judged without truth.
+    """How far input and map can be believed, judged without truth.
 
     Attributes:
-        doubt: probability that the map's error is worse than odometry's; NaN if the method does not judge it.
+        doubt: probability that the map's error is worse than odometry's, which no warning changes; NaN if the
+            method does not judge it, or no loop closure is accepted.
+        reason: of a run, why it is NaN; else ''. warnings: about the input, a sentence each.
     """
 
     doubt: float = np.nan
+    reason: str = ""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def input(self) -> str:
+        """The verdict on the input, `clean` or `warned`; one that is refused makes no result."""
+        return "warned" if self.warnings else "clean"
 
     @property
     def doubted(self) -> bool:
@@ -52,11 +61,11 @@ START = PoseEstimate(np.zeros(3), np.zeros((3, 3)), -1, "", Health(), False)
 """The estimate before the first step."""
 
 
-def pose_estimate(step: Step, outcome: str) -> PoseEstimate:
+def pose_estimate(step: Step, outcome: str, warnings: tuple[str, ...] = ()) -> PoseEstimate:
     """The estimate of a session's step.
 
     Args:
-        outcome: name of the outcome in the step's evidence.
+        outcome: name of the outcome in the step's evidence. warnings: about the input.
     """
     estimate = step.estimate
     pose = np.array(step.pose, np.float64)
@@ -65,9 +74,8 @@ def pose_estimate(step: Step, outcome: str) -> PoseEstimate:
     cos, sin = np.cos(turn), np.sin(turn)
     rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     spread = rotation * np.asarray(estimate.spread, np.float64)
-    return PoseEstimate(
-        pose, spread @ spread.T, int(estimate.place), outcome, Health(float(step.doubt)), bool(estimate.lost)
-    )
+    health = Health(float(step.doubt), warnings=warnings)
+    return PoseEstimate(pose, spread @ spread.T, int(estimate.place), outcome, health, bool(estimate.lost))
 
 
 def estimate_arrays(estimate: PoseEstimate) -> dict[str, np.ndarray]:

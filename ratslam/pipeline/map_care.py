@@ -62,6 +62,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
         "closures": len(made.closures()) if saved.steps else 0,
         "box_m": _box(path),
         "doubt": float(doubt) if np.isfinite(doubt) else None,
+        "unjudged": made.unjudged() if saved.steps else "",
     }
     return info | (_keyframe_info(made) if isinstance(made, KeyframeMap) and saved.steps else {})
 

@@ -44,9 +44,9 @@ def write_map_results(folder: Path, made: Map, time: np.ndarray) -> None:
     files = dict(made.files())
     if made.pieces().any():
         files[PIECES] = lambda path: write_pieces(path, time, piece)
-    doubt, pairs = made.final_doubt(), made.closures()
-    if np.isfinite(doubt):
-        files["health.json"] = lambda path: _write_health(path, doubt)
+    doubt, reason, pairs = made.final_doubt(), made.unjudged(), made.closures()
+    if np.isfinite(doubt) or reason:
+        files["health.json"] = lambda path: _write_health(path, doubt, reason)
     if len(pairs):
         files.setdefault("closures.csv", lambda path: write_closure_pairs(path, pairs))
     for name, write in files.items():
@@ -117,5 +117,6 @@ def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:
     return card
 
 
-def _write_health(path: Path, doubt: float) -> None:
-    path.write_text(json.dumps({"worse_than_odometry": doubt}) + "\n", encoding="utf-8")
+def _write_health(path: Path, doubt: float, reason: str) -> None:
+    known = {"worse_than_odometry": doubt} if np.isfinite(doubt) else {"worse_than_odometry": None}
+    path.write_text(json.dumps(known | ({"reason": reason} if reason else {})) + "\n", encoding="utf-8")

@@ -18,7 +18,7 @@ from evaluation.artifacts.run_directory import read_run, read_scorecard
 from evaluation.cells.recording import NAME as CELLS
 from evaluation.cells.recording import CellRecording, read_recording
 from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.scorecard import Scorecard, render_health, scorecard_html
+from evaluation.metrics.scorecard import Scorecard, render_health, render_warnings, scorecard_html
 from evaluation.plots.run_plots import run_plots
 from evaluation.report.verdict import describe_score, judge_map
 from ratslam.config.run_config import RunConfig
@@ -122,8 +122,13 @@ class Result:
 
     @property
     def health(self) -> Health:
-        """How far the map can be believed."""
-        return Health(self._run.doubt)
+        """How far input and map can be believed."""
+        return Health(self._run.doubt, self._run.unjudged, self.warnings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """About the input, a sentence each; () if it is clean."""
+        return self._run.warnings
 
     @cached_property
     def interrupted(self) -> bool:
@@ -170,9 +175,10 @@ class Result:
         self.plot().savefig(picture, format="png")
         source = f"data:image/png;base64,{b64encode(picture.getvalue()).decode()}"
         image = f'<img src="{source}" alt="map of {escape(self.scorecard.name)}" style="max-width: 100%">'
-        verdict = judge_map(self._run.doubt)
-        words = f"{verdict.headline}. {verdict.reason} {describe_score(self.scorecard)}"
-        return f"<div>{image}<p>{escape(words)}</p>{scorecard_html(self.scorecard)}</div>"
+        verdict = judge_map(self._run.doubt, self._run.unjudged)
+        words = [f"{verdict.headline}. {verdict.reason} {describe_score(self.scorecard)}"]
+        text = "".join(f"<p>{escape(line)}</p>" for line in words + render_warnings(self.scorecard))
+        return f"<div>{image}{text}{scorecard_html(self.scorecard)}</div>"
 
     def _summary(self) -> str:
         """Position error and health in one line, as far as they are known."""

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.closure_views import eight_bit
+from evaluation.artifacts.manifest import read_manifest
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard
+from evaluation.metrics.trajectory import read_tum
 from ratslam.backends.registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump
@@ -40,12 +42,13 @@ from ratslam.pipeline.map_results import score_and_plot, write_map_results
 from ratslam.pipeline.online_error import OnlineErrorLog
 from ratslam.pipeline.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
 from ratslam.pipeline.run_directory import RunDirectory
-from ratslam.pipeline.saved_map import NAME, describe_readings, read_map, write_map
+from ratslam.pipeline.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
+from robot.recordings.input_judge import judge_motion
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of
 from tactile.base.atomic_write import temporary_path
-from tactile.base.se2 import compose, tum_line
+from tactile.base.se2 import between, compose, tum_line
 from tactile.base.types import Observation
 from tactile.whiskers.head_geometry import ur10_head
 
@@ -60,7 +63,8 @@ class Runner:
     """Processes the samples of a source; `open_runner` makes one.
 
     Args:
-        estimate: of the last step of a resumed session.
+        estimate: of the last step of a resumed session. warnings: about the input; more may come until the
+            end.
 
     Attributes:
         session: the backend's session. skipped: samples that a resumed session has processed before.
@@ -76,8 +80,10 @@ class Runner:
         skipped: int = 0,
         observers: Sequence[Observer] = (),
         estimate: PoseEstimate = START,
+        warnings: Sequence[str] = (),
     ) -> None:
         self.session, self.skipped = session, skipped
+        self._warnings = warnings
         self._config, self._source, self._directory, self._manifest = config, source, directory, manifest
         self._views: list[WhiskerView] = []
         self._images: list[np.ndarray | None] = []  # of the views, for those that closures join
@@ -169,7 +175,19 @@ class Runner:
         save_closure_views(self._images, directory)
         save_grid_map(directory)
         save_changes(self.session.map, config.touch, directory)
+        self._judge_input()
         return score_and_plot(directory.path, config.score)
+
+    def _judge_input(self) -> None:
+        """Writes the verdict on the input to the manifest; judges the motion of what is no recording."""
+        found = list(self._warnings)
+        if self._config.recording is None:
+            time, poses = read_tum(self._directory.path / "odometry.tum")
+            moved = np.concatenate([poses[:1], between(poses[:-1], poses[1:])])
+            motion = np.column_stack([moved, np.diff(time, prepend=time[0])])
+            found += judge_motion(time, motion, self._source.name)
+        self._manifest |= {"input": _input(found)}
+        self._directory.text("manifest.json", _manifest_text(self._manifest | {"status": "running"}))
 
     def _report(
         self,
@@ -204,6 +222,7 @@ def open_runner(
     resume: Path | None = None,
     session: Session | None = None,
     observers: Sequence[Observer] = (),
+    warnings: list[str] | None = None,
 ) -> Iterator[Runner]:
     """A runner with a new run directory.
 
@@ -211,7 +230,8 @@ def open_runner(
         config: completed for the source. source: of observations. directory: its path.
         resume: map to restore the session from, a run directory or a file.
         session: one that `build_session` has made for them before; None makes it.
-        observers: are told of the progress; results are the same with and without.
+        observers: are told of the progress; results are the same with and without. warnings: about the
+            input; more may come until the end.
 
     Raises:
         InputError: the relations, the map or the run directory cannot be used.
@@ -225,11 +245,15 @@ def open_runner(
     skip, estimate = (0, START) if begun is None else resume_session(session, begun, config, source)
     text = dump(config)
     manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
-    running = _manifest_text(manifest | {"status": "running"})
+    warnings = [] if warnings is None else warnings  # a reader goes on to add to it
+    if begun is not None:
+        earlier = read_manifest(map_file(begun).parent).warnings
+        warnings[:0] = [sentence for sentence in earlier if sentence not in warnings]
+    running = _manifest_text(manifest | {"status": "running", "input": _input(warnings)})
     with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns(), running) as files:
         files.text("config.yaml", text)
         save_world(source.info, files)
-        runner = Runner(config, source, files, manifest, session, skip, observers, estimate)
+        runner = Runner(config, source, files, manifest, session, skip, observers, estimate, warnings)
         if begun is not None:
             runner.checkpoint()  # nothing else of this folder holds the map before
         yield runner
@@ -305,6 +329,10 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
 
 def _manifest_text(content: dict[str, Any]) -> str:
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def _input(warnings: Sequence[str]) -> dict[str, Any]:
+    return {"verdict": "warned" if warnings else "clean", "warnings": list(dict.fromkeys(warnings))}
 
 
 def _manifest(config: RunConfig, text: str, source: Source) -> dict[str, Any]:

@@ -46,6 +46,8 @@ TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND = "estimate/", "frontend/"
+ODOMETRY = {"map/steps/odometry": "map/steps/frame", "map/odometry": "map/step_node"}
+"""Odometry of the steps, which files did not always hold, and an array with as many rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +236,9 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
         raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
+    for name, like in ODOMETRY.items():
+        if like in session:
+            session.setdefault(name, np.full((len(session[like]), 3), np.nan))
     return SavedMap(
         file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
         with_prefix(arrays, FRONTEND),

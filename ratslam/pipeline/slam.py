@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.localise import localising
 from ratslam.pipeline.saved_map import describe_readings, is_map, read_map, write_map
-from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
+from ratslam.pipeline.source import ConfigLike, WarningLog, open_source, resolve_config
 from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
@@ -45,7 +46,7 @@ class Slam:
 
     Attributes:
         config: completed for the source. source: description of the readings. session: the backend's session.
-        estimate: of the last step.
+        estimate: of the last step. warnings: about the source of the configuration, a sentence each.
 
     Raises:
         InputErrors: the configuration has errors.
@@ -55,16 +56,17 @@ class Slam:
     def __init__(self, config: ConfigLike, info: Source | SourceInfo | None = None) -> None:
         config = resolve_config(config, source_required=False)
         if info is None:
-            with open_source(config) as source:
-                self._build(complete(config, source), source)
+            with open_source(config, log := WarningLog()) as source:
+                self._build(complete(config, source), source, log.found)
         else:
             source = describe_whiskers(info, config.touch) if isinstance(info, SourceInfo) else info
             self._build(complete(config, source), source)
         self.session.warm(self._blank)
 
-    def _build(self, config: RunConfig, source: Source) -> None:
+    def _build(self, config: RunConfig, source: Source, warnings: Sequence[str] = ()) -> None:
         observed = open_touch_source(source, config.touch)
         self.config, self.source = config, describe_readings(observed)
+        self.warnings = tuple(dict.fromkeys(warnings))
         # Sums of the cells need the true poses, which a loop does not use.
         cells = config.cells and config.cells.model_copy(update={"sums": None})
         self.session = build_session(config.model_copy(update={"cells": cells}), observed)
@@ -109,7 +111,7 @@ class Slam:
         if observed is not None:
             step = self.session.step(match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
-            self.estimate = pose_estimate(step, entry.outcome(step.evidence))
+            self.estimate = pose_estimate(step, entry.outcome(step.evidence), self.warnings)
             self._cells = step.probed
         return self.estimate
 

@@ -22,6 +22,28 @@ from tactile.base.types import Observation
 
 ConfigLike = str | os.PathLike[str] | RunConfig
 """A configuration, its file, or its name."""
+WARNING = "warning: "
+"""Beginning of the sentences about a source that are warnings."""
+
+
+class WarningLog:
+    """Passes sentences about a source on, and keeps the warnings among them.
+
+    Args:
+        report: called with each sentence.
+
+    Attributes:
+        found: the warnings.
+    """
+
+    def __init__(self, report: Callable[[str], None] = lambda sentence: None) -> None:
+        self.found: list[str] = []
+        self._report = report
+
+    def __call__(self, sentence: str) -> None:
+        self._report(sentence)
+        if sentence.startswith(WARNING):
+            self.found.append(sentence.removeprefix(WARNING))
 
 
 def resolve_config(config: ConfigLike, *, source_required: bool = True) -> RunConfig:
@@ -72,7 +94,7 @@ def open_source(config: ConfigLike, report: Callable[[str], None] | None = None)
 
 
 def _warning(report: Callable[[str], None] | None) -> Callable[[str], None] | None:
-    return report and (lambda sentence: report(f"warning: {sentence}"))
+    return report and (lambda sentence: report(WARNING + sentence))
 
 
 @contextmanager

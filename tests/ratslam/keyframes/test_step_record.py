@@ -30,13 +30,13 @@ def record(taken: bool = True) -> StepRecord:
     """Two keyframes, each followed by a step; three steps of a new piece, the third being its keyframe."""
     steps = StepRecord()
     for frame in (0, 1):
-        steps.append(frame, HALT)
-        steps.append(frame, travelled(1))
+        steps.append(frame, HALT, MOTION)
+        steps.append(frame, travelled(1), MOTION)
     for k in (1, 2):
-        steps.append(leading_to(2), travelled(k))
+        steps.append(leading_to(2), travelled(k), MOTION)
     if taken:
         steps.arrive(2, travelled(3))
-        steps.append(2, HALT)
+        steps.append(2, HALT, MOTION)
     return steps
 
 
