@@ -110,6 +110,8 @@ def _odometry_rows(
     names, turn = position_columns(part) if isinstance(part, columns.PoseColumns) else ([], [])
     names = names or [name for name in part.model_dump().values() if name is not None]
     bad, errors = base.judge([config.time, *names] if config.rate is None else names, turn)
+    if config.rate is None:
+        bad, errors = add_late(base, config.time, bad, errors)
     if not leave_out(bad, errors, "rows are", warn):
         return np.arange(len(bad)), errors
     kept = np.flatnonzero(~bad)
@@ -219,6 +221,19 @@ def leave_out(bad: np.ndarray, errors: list[InputError], what: str, warn: Warn) 
     return True
 
 
+def add_late(
+    file: CsvFile, name: str, bad: np.ndarray, errors: list[InputError]
+) -> tuple[np.ndarray, list[InputError]]:
+    """The bad ones of the rows [N] bool with those whose time is not later than all before, and the errors of
+    both, if they are few enough to be left out."""
+    time = file.column(name)
+    latest = np.maximum.accumulate(np.where(bad, -np.inf, time))
+    late = bad | np.append(False, time[1:] <= latest[:-1])
+    if not bad.sum() < late.sum() <= max(1, LEAVE_OUT * len(bad)):
+        return bad, errors
+    return late, errors + clock_errors(time, name, file.place)
+
+
 def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
     """Rows per second if rows share times because those are rounded, else None.
 
@@ -256,6 +271,8 @@ def align_views(
     seen = file.rows(there)
     names = beams if file is base else [part.time, *beams]
     bad, errors = seen.judge(names, far=part.max_range is not None)
+    if file is not base:
+        bad, errors = add_late(seen, part.time, bad, errors)
     if not leave_out(bad, errors, "views are", warn):
         return there, file.values, errors
     there, seen = there[~bad], seen.rows(~bad)
@@ -386,6 +403,8 @@ def align_truth(
     """
     names, turn = position_columns(part)
     bad, errors = file.judge(names if same_rows else [part.time, *names], turn)
+    if not same_rows:
+        bad, errors = add_late(file, part.time, bad, errors)
     if not leave_out(bad, errors, "true poses are", warn):
         return np.full((len(time), 3), np.nan), errors
     if same_rows:
