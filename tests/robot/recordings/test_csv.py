@@ -245,7 +245,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "rounded": ("t,vx,w\n" + "".join(f"{k // 4},1,{k}\n" for k in range(16)), {},
                 [":3: t is rounded: 4 rows share each time", "set recording.table.rate=4,"]),
     "hole": ("t,vx,w\n" + "".join(f"{k},1,{'x' if 9 < k < 15 else 0}\n" for k in range(200)), {},
-             [":12: 5 rows one after another lack odometry (w is 'x'"]),
+             [":12: w is 'x' (and so in 4 more rows)"]),
     "quaternion": ("t,x,y,a,b,c,d\n0,0,0,0,0,0,1\n1,0,0,0,0,0,0\n2,0,0,1,1,0,1\n", TURNED,
                    [":3: (a, b, c, d) is [0.0, 0.0, 0.0, 0.0] (and so in 1 more row)", "of length 1"]),
     "plane": ("t,x,y,z,heading\n0,0,0,0,0\n1,1,0,1,0\n2,2,.01,3,0\n", POSE,
