@@ -62,12 +62,10 @@ def read_csv_recording(
 
     whole, part = files[path], config.pose or config.velocity or config.motion
     assert part is not None  # checked by `_absences`
-    names, clock_name = (
-        [name for name, _ in column_keys(part, "")],
-        config.time if config.rate is None else "",
-    )
+    names = [name for name, _ in column_keys(part, "")]
+    stamps = config.time if config.rate is None else ""
     turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, HOLE)
-    kept, errors = sound_rows(whole, names, "rows are", warn, clock_name, turn or (), hole=hole)
+    kept, errors = sound_rows(whole, names, "rows are", warn, stamps, turn or (), hole=hole)
     base = files[path] = whole.rows(kept)
     time, faults = _times(base, config, kept)
     motion, others = _motion(base, time, part, config.units, kept, limits)
