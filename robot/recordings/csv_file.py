@@ -265,7 +265,9 @@ def _is_skipped(line: str) -> bool:
 
 def _header(path: Path, lines: list[str]) -> Header:
     """The header: the first line that is no comment, or the comment above the numbers that names as many."""
-    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 2))
+    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 9))
+    while len(rows) > 1 and _width(lines[rows[0]]) == 1 < _width(lines[rows[1]]):
+        del rows[0]  # a title
     number, row = rows[0] if rows else len(lines) - 1, lines[rows[1]] if len(rows) > 1 else ""
     above = [comment for comment in range(number) if lines[comment].strip()]
     if not rows or any(map(_is_number, _names(lines[number], lines[number])[1])):
@@ -290,6 +292,10 @@ def _header(path: Path, lines: list[str]) -> Header:
         short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
     ]
     return Header(number + 1, mark, tuple(full), tuple(names), tuple(units))
+
+
+def _width(line: str) -> int:
+    return len(_names(line, line)[1]) if any(mark in line for mark in ",;\t") else 1
 
 
 def _names(line: str, row: str) -> tuple[str, list[str]]:

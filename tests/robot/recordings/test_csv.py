@@ -394,6 +394,7 @@ AS_USERS_HAVE_THEM: dict[str, tuple[str, list[Any]]] = {
     "text": ("t,frame_id,x,y,heading,note", [TIME, NAME, X, Y, H, np.full(24, "")]),
     "quoted text": ("t,x,y,heading,note", [TIME, X, Y, H, np.full(24, '"a, b"')]),
     "comments": ("# robot 7, Monday\n\n# of 3, 4, 5, 6\nt,x,y,heading", [TIME, X, Y, H]),
+    "title": ("Log of robot 7\nt,x,y,heading", [TIME, X, Y, H]),
     "comment as header": ("# robot, 7, of, Monday\n#t, x, y, heading", [TIME, X, Y, H]),
     "units": ("t [s], x [m], y [m], heading [rad]", [TIME, X, Y, H]),
     "other units": ("t (ms),x [mm],y [mm],heading [°]", [TIME * 1e3, X * 1e3, Y * 1e3, RADS]),
