@@ -214,9 +214,12 @@ def sound_rows(
     if time:
         moments = file.column(time)
         latest = np.maximum.accumulate(np.where(bad, -np.inf, moments))
-        late = bad | np.append(False, moments[1:] <= latest[:-1])
-        if bad.sum() < late.sum() <= most:  # more are errors of the clock
-            bad, errors = late, errors + clock_errors(moments, time, file.place)
+        late = ~bad & np.append(False, moments[1:] <= latest[:-1])
+        stepped = (
+            hole < np.inf and (late[1:] & late[:-1]).any()
+        )  # the clock was set back: motion would be lost
+        if late.any() and (bad | late).sum() <= most and not stepped:
+            bad, errors = bad | late, errors + clock_errors(moments, time, file.place)
     kept = np.flatnonzero(~bad)
     if bad.any() and (bad.sum() > most or bad.all() or np.diff(kept).max(initial=0) > hole + 1):
         return np.arange(len(bad)), errors

@@ -251,6 +251,7 @@ FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
     "plane": ("t,x,y,z,heading\n0,0,0,0,0\n1,1,0,1,0\n2,2,.01,3,0\n", POSE,
               ["the path lies in x-z: y hardly changes, z does", "name z as table.pose.y"]),
     "backwards": ("t,vx,w\n0,1,0\n2,1,0\n1,1,0\n0,1,0\n", {}, [":4: t goes back from 2.0 to 1.0 s", "sort"]),
+    "set back": ("t,vx,w\n" + "".join(f"{k - 2 * (k > 50)},1,0\n" for k in range(99)), {}, [":53: t goes"]),
     "repeated": ("t,vx,w\n0,1,0\n2,1,0\n2,1,0\n2,1,0\n", {}, [":4: t repeats 2.0 s", "drop the repeated"]),
     "no rows": ("t,vx,w\n", {}, ["no rows under its header", "at least one row"]),
     "no header": ("0,1,2\n1,1,2\n", {}, [":1: the first line is '0,1,2'", "a header row"]),
