@@ -215,10 +215,8 @@ def sound_rows(
         moments = file.column(time)
         latest = np.maximum.accumulate(np.where(bad, -np.inf, moments))
         late = ~bad & np.append(False, moments[1:] <= latest[:-1])
-        stepped = (
-            hole < np.inf and (late[1:] & late[:-1]).any()
-        )  # the clock was set back: motion would be lost
-        if late.any() and (bad | late).sum() <= most and not stepped:
+        set_back = (late[1:] & late[:-1]).any() and hole < np.inf  # without its rows their motion is lost
+        if late.any() and (bad | late).sum() <= most and not set_back:
             bad, errors = bad | late, errors + clock_errors(moments, time, file.place)
     kept = np.flatnonzero(~bad)
     if bad.any() and (bad.sum() > most or bad.all() or np.diff(kept).max(initial=0) > hole + 1):
