@@ -122,14 +122,14 @@ class CsvFile:
         """[N] bool, rows in which a named column has no finite number, and an error for each kind of fault.
 
         Args:
-            quaternion: columns of one, whose length must be 1. far: inf is a value, nothing in range.
+            quaternion: those of them whose length must be 1. far: inf is a value, nothing in range.
         """
-        places = [self.at(name) for name in (*names, *quaternion)]
+        places = [self.at(name) for name in names]
         fault, values = self.fault[:, places], self.values[:, places]
         endless = ~np.isfinite(values) & ~(far & (values == np.inf))
         kinds = [fault == CUT, fault == WORD, fault == EMPTY, (fault == 0) & endless]
         bad = np.any(kinds, axis=(0, 2)) if places else np.zeros(len(values), bool)
-        turn = self.values[:, places[len(names) :]]
+        turn = self.values[:, [self.at(name) for name in quaternion]]
         away = np.abs(np.linalg.norm(turn, axis=1) - 1)
         crooked = bool(quaternion) & ~bad & ~(away <= QUATERNION_TOLERANCE)
         errors, drop = [], "correct or drop the row"
@@ -220,8 +220,11 @@ def read_csv(path: Path, clock: str | None = None) -> CsvFile:
     _limit(str(path), len(rows) * len(header.full), MAX_CELLS, "cells (rows x columns)")
     full = [lines[number] for number in rows]
     fault, dates = np.zeros((len(full), len(header.full)), np.uint8), frozenset[int]()
-    values = _numbers(full, header)
-    if values is None:
+    try:
+        values = np.loadtxt(full, delimiter=header.separator.strip(" ") or None, comments=None, ndmin=2)
+    except ValueError:  # a cell is no number
+        values = np.zeros(0)
+    if values.shape != fault.shape:
         values, dates = _cells(full, header, fault)
     return CsvFile(path, header, values, fault, dates, np.array(rows) + 1, content, clock)
 
@@ -262,52 +265,52 @@ def _is_skipped(line: str) -> bool:
 
 def _header(path: Path, lines: list[str]) -> Header:
     """The header: the first line that is no comment, or the comment above the numbers that names as many."""
-    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 2))
-    first = rows[0] if rows else len(lines)
-    above = [number for number in range(first) if lines[number].strip()]
-    number, row = first, lines[rows[1]] if len(rows) > 1 else ""
-    if not rows or any(map(_is_number, _split(lines[first], _separator(lines[first], lines[first])))):
-        row = lines[first] if rows else ""
-        found = (comment for comment in reversed(above) if not rows or _names_columns(lines[comment], row))
-        number = next(found, min(first, len(lines) - 1))
-    where, line = f"{path}:{number + 1}", _uncommented(lines[number])
-    mark = _separator(line, row)
-    _limit(where, line.count(mark) + 1, MAX_COLUMNS, "columns")
-    full = [name.strip() for name in _split(line, mark)]
+    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 9))
+    while len(rows) > 1 and _width(lines[rows[0]]) == 1 < _width(lines[rows[1]]):
+        del rows[0]  # a title
+    number, row = rows[0] if rows else len(lines) - 1, lines[rows[1]] if len(rows) > 1 else ""
+    above = [comment for comment in range(number) if lines[comment].strip()]
+    if not rows or any(map(_is_number, _names(lines[number], lines[number])[1])):
+        row = lines[number] if rows else ""
+        number = next((k for k in reversed(above) if not rows or _name_columns(lines[k], row)), number)
+    where, (mark, full) = f"{path}:{number + 1}", _names(lines[number], row)
+    _limit(where, len(full), MAX_COLUMNS, "columns")
     if any(map(_is_number, full)):
-        raise InputError(where, f"the first line is {line[:60]!r}", "a header row that names the columns")
+        found = f"the first line is {lines[number][:60]!r}"
+        raise InputError(where, found, "a header row that names the columns")
     strange = next((name for name in full if not name.isprintable() or len(name) > MAX_NAME), None)
     if strange is not None:
-        found_there = f"the header names a column {strange[:40]!r}, {len(strange)} characters"
-        raise InputError(where, found_there, f"text without control characters, at most {MAX_NAME} a name")
+        found = f"the header names a column {strange[:40]!r}, {len(strange)} characters"
+        raise InputError(where, found, f"text without control characters, at most {MAX_NAME} a name")
     units = [plain_unit(cell.strip(" []()")) for cell in _split(row, mark)]
     if any(units) and all(map(is_unit, filter(None, units))) and len(units) == len(full):
         number = lines.index(row, number + 1)  # a second row of the header states the units
         full = [f"{name} [{unit}]" for name, unit in zip(full, units, strict=True)]
-    short = [split_unit(name) for name in full]
-    count = Counter(name for name, _ in short) + Counter(full)
-    alone = [count[bare] == 1 + (bare == name) for name, (bare, _) in zip(full, short, strict=True)]
-    names = [bare if one else name for one, name, (bare, _) in zip(alone, full, short, strict=True)]
-    return Header(number + 1, mark, tuple(full), tuple(names), tuple(unit for _, unit in short))
+    bare, units = (list(parts) for parts in zip(*map(split_unit, full), strict=True))
+    count = Counter(bare) + Counter(full)
+    names = [
+        short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
+    ]
+    return Header(number + 1, mark, tuple(full), tuple(names), tuple(units))
 
 
-def _uncommented(line: str) -> str:
-    return line.lstrip().lstrip(COMMENT).replace("\xa0", " ").strip(" ")
+def _width(line: str) -> int:
+    return len(_names(line, line)[1]) if any(mark in line for mark in ",;\t") else 1
 
 
-def _names_columns(comment: str, row: str) -> bool:
-    """Whether a comment names as many columns as a row has."""
-    line = _uncommented(comment)
-    mark = _separator(line, row)
-    names = _split(line, mark)
-    widths = len(_split(row, mark)), len(_split(row.rstrip().rstrip(mark), mark))
-    return len(names) in widths and not any(map(_is_number, names))
-
-
-def _separator(line: str, row: str) -> str:
-    """What separates the cells of a line: commas, semicolons, tabs, or spaces if a row has as many."""
+def _names(line: str, row: str) -> tuple[str, list[str]]:
+    """What separates the names of a header line, above this row, and the names."""
+    line = line.lstrip().lstrip(COMMENT).replace("\xa0", " ").strip(" ")
     spaced = 1 < len(line.split()) == len(row.split())
-    return next((mark for mark in ",;\t" if mark in line), " " if spaced else ",")
+    mark = next((mark for mark in ",;\t" if mark in line), " " if spaced else ",")
+    return mark, [name.strip() for name in _split(line, mark)]
+
+
+def _name_columns(comment: str, row: str) -> bool:
+    """Whether a comment names as many columns as a row has."""
+    mark, names = _names(comment, row)
+    widths = len(_split(row, mark)), len(_split(row.rstrip(" " + mark), mark))
+    return len(names) in widths and not any(map(_is_number, names))
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -319,16 +322,6 @@ def _split(line: str, separator: str) -> list[str]:
         except csv.Error:  # a cell beyond the size limit of the csv module is not a number
             pass
     return line.split(separator)
-
-
-def _numbers(full: list[str], header: Header) -> np.ndarray | None:
-    """[N, C] parsed at once, or None if a cell needs separate treatment."""
-    try:
-        mark = None if header.separator == " " else header.separator
-        values = np.loadtxt(full, delimiter=mark, comments=None, ndmin=2)
-    except ValueError:
-        return None
-    return values if values.shape == (len(full), len(header.full)) else None
 
 
 def _cells(full: list[str], header: Header, fault: np.ndarray) -> tuple[np.ndarray, frozenset[int]]:

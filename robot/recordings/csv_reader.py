@@ -66,7 +66,10 @@ def read_csv_recording(
 
     whole, part = files[path], config.pose or config.velocity or config.motion
     assert part is not None  # checked by `_absences`
-    kept, errors = _odometry_rows(whole, config, part, warn)
+    names = [name for name, _ in column_keys(part, "")]
+    stamps = config.time if config.rate is None else ""
+    turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, HOLE)
+    kept, errors = sound_rows(whole, names, "rows are", warn, stamps, turn or (), hole=hole)
     base = files[path] = whole.rows(kept)
     time, faults = _times(base, config, kept)
     motion, poses, others = _motion(base, time, part, config.units, kept, limits)
@@ -133,24 +136,6 @@ def _within(
         times = np.column_stack([file.column(name, "time") for name in names])
         found[part.file] = file.rows(((first <= times) & (times <= last)).all(axis=1))
     return found
-
-
-def _odometry_rows(
-    base: CsvFile, config: columns.CsvConfig, part: Odometry, warn: Warn
-) -> tuple[np.ndarray, list[InputError]]:
-    """The rows to keep, those with all numbers of the odometry, and errors."""
-    names, turn = position_columns(part) if isinstance(part, columns.PoseColumns) else ([], [])
-    names = names or [name for name in part.model_dump().values() if name is not None]
-    bad, errors = base.judge([config.time, *names] if config.rate is None else names, turn)
-    if not leave_out(bad, errors, "rows are", warn):
-        return np.arange(len(bad)), errors
-    kept = np.flatnonzero(~bad)
-    steps = np.diff(kept)
-    if steps.max(initial=0) > HOLE + 1 and not isinstance(part, columns.PoseColumns):
-        found = f"{steps.max() - 1} rows one after another lack odometry ({errors[0].found})"
-        error = InputError(base.place(kept[steps.argmax()] + 1), found, f"at most {HOLE}")
-        return np.arange(len(bad)), [error]
-    return kept, []
 
 
 def _times(base: CsvFile, config: columns.CsvConfig, kept: np.ndarray) -> tuple[np.ndarray, list[InputError]]:
@@ -240,15 +225,38 @@ def _motion(
         return (from_velocities if rate else from_motions)(time, forward, left, turn), None, []
 
 
-def leave_out(bad: np.ndarray, errors: list[InputError], what: str, warn: Warn) -> bool:
-    """Whether the bad ones of the rows [N] bool can be left out, with a warning; else `errors` hold."""
-    count = int(bad.sum())
-    if count and (count > max(1, LEAVE_OUT * len(bad)) or count == len(bad)):
-        return False
-    if count and warn is not None:
-        said = f"{errors[0].found}; expected {errors[0].expected}"
-        warn(f"{errors[0].where}: {said}; {count} of {len(bad)} {what} left out")
-    return True
+def sound_rows(
+    file: CsvFile,
+    names: Sequence[str],
+    what: str,
+    warn: Warn,
+    time: str = "",
+    quaternion: Sequence[str] = (),
+    far: bool = False,
+    hole: float = np.inf,
+) -> tuple[np.ndarray, list[InputError]]:
+    """The rows that have all numbers; if too many others are to be left out with a warning, all and errors.
+
+    Args:
+        names, quaternion, far: as for `CsvFile.judge`. time: column of times, which increase; '' for none.
+        hole: how many rows one after another may be left out.
+    """
+    bad, errors = file.judge([*names, *([time] if time else [])], quaternion, far)
+    most = max(1, LEAVE_OUT * len(bad))
+    if time:
+        moments = file.column(time)
+        latest = np.maximum.accumulate(np.where(bad, -np.inf, moments))
+        late = ~bad & np.append(False, moments[1:] <= latest[:-1])
+        set_back = (late[1:] & late[:-1]).any() and hole < np.inf  # without its rows their motion is lost
+        if late.any() and (bad | late).sum() <= most and not set_back:
+            bad, errors = bad | late, errors + clock_errors(moments, time, file.place)
+    kept = np.flatnonzero(~bad)
+    if bad.any() and (bad.sum() > most or bad.all() or np.diff(kept).max(initial=0) > hole + 1):
+        return np.arange(len(bad)), errors
+    if bad.any() and warn is not None:
+        said = f"{errors[0].where}: {errors[0].found}; expected {errors[0].expected}"
+        warn(f"{said}; {bad.sum()} of {len(bad)} {what} left out")
+    return kept, []
 
 
 def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
@@ -286,11 +294,11 @@ def align_views(
         error = InputError(file.top, f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
         return there, file.values, [error]
     seen = file.rows(there)
-    names = beams if file is base else [part.time, *beams]
-    bad, errors = seen.judge(names, far=part.max_range is not None)
-    if not leave_out(bad, errors, "views are", warn):
+    clock = "" if file is base else part.time
+    good, errors = sound_rows(seen, beams, "views are", warn, clock, far=part.max_range is not None)
+    if errors:
         return there, file.values, errors
-    there, seen = there[~bad], seen.rows(~bad)
+    there, seen = there[good], seen.rows(good)
     values, errors = seen.block(part.prefix, part.unit)[0], []
     if part.max_range is None:
         errors += view_errors(values.min(axis=1), values.max(axis=1), what, seen.place)
@@ -313,12 +321,9 @@ def align_contacts(
 ) -> AlignedRows:
     """Contacts [M, W] bool, in the order of the sensors in the settings."""
     file, names = files[part.file or base.path], tuple(part.directions)
-    unknown, errors = file.judge(names)
-    there = np.flatnonzero(~unknown)
+    there, errors = sound_rows(file, names, "contacts are", warn)
     values = np.column_stack([file.column(name)[there] for name in names])
-    if leave_out(unknown, errors, "contacts are", warn):
-        errors = []
-    bad = ~np.isin(values, (0, 1))
+    bad = ~np.isin(values, (0, 1)) & np.isfinite(values)
     if bad.any():
         row, sensor = np.argwhere(bad)[0].tolist()
         found = f"{names[sensor]} is {values[row, sensor]:g}"
@@ -416,20 +421,21 @@ def align_truth(
     Args:
         file: that of the truth. same_rows: its rows are those of `time`.
     """
-    names, turn = position_columns(part)
-    bad, errors = file.judge(names if same_rows else [part.time, *names], turn)
-    if not leave_out(bad, errors, "true poses are", warn):
-        return np.full((len(time), 3), np.nan), errors
-    if same_rows:
-        truth, errors = read_poses(file, part, part.units, time, limits, "table.truth")
-        truth[bad] = np.nan
-        return truth, errors
-    file = file.rows(~bad)
-    moments = file.column(part.time, "time", part.units.time)
+    names = [name for name, _ in column_keys(part, "")[same_rows:]]
+    clock = "" if same_rows else part.time
+    good, errors = sound_rows(file, names, "true poses are", warn, clock, part.quaternion or ())
+    unknown = np.full((len(time), 3), np.nan)
+    if errors:
+        return unknown, errors
+    file = file.rows(good)
+    moments = time[good] if same_rows else file.column(part.time, "time", part.units.time)
     truth, errors = read_poses(file, part, part.units, moments, limits, "table.truth")
+    if same_rows:
+        unknown[good] = truth
+        return unknown, errors
     errors += clock_errors(moments, part.time, file.place)
     if errors:
-        return np.full((len(time), 3), np.nan), errors
+        return unknown, errors
     return interpolated_poses(time, moments, truth, part.time, str(file.path))
 
 
@@ -444,12 +450,6 @@ def column_keys(part: Settings, key: str) -> list[tuple[str, str]]:
     if fields.get("quaternion"):
         del named["heading"]  # which is not read
     return [(name, f"{key}.{field}") for field, name in named.items()]
-
-
-def position_columns(part: columns.PoseColumns) -> tuple[list[str], list[str]]:
-    """The columns that poses are read from, and of those the ones of a quaternion apart."""
-    turn = part.quaternion or []
-    return [part.x, part.y, *([] if turn else [part.heading])], turn
 
 
 def read_poses(

@@ -8,22 +8,19 @@ from typing import Literal
 TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min", "h"]
 LengthUnit = Literal["m", "mm", "cm", "km", "in", "ft"]
 AngleUnit = Literal["rad", "deg", "mrad", "rev"]
-
 PER_UNIT: dict[str, dict[str, float]] = {
     "time": {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "ks": 1e-3, "min": 1 / 60, "h": 1 / 3600},
     "length": {"m": 1, "mm": 1e3, "cm": 1e2, "km": 1e-3, "in": 1 / 0.0254, "ft": 1 / 0.3048},
     "angle": {"rad": 1, "deg": 57.29577951308232, "mrad": 1e3, "rev": 0.15915494309189535},
 }
 """For each quantity, how many of a unit are one s, m or rad."""
-WORDS = {
-    "s": "sec secs second seconds", "ms": "msec msecs millis millisecond milliseconds", "min": "mins minutes",
-    "us": "usec usecs micros microseconds", "ns": "nsec nsecs nanos nanosec nanosecs nanoseconds",
-    "m": "meter meters metre metres", "mm": "millimeter millimeters millimetre millimetres", "ft": "feet",
-    "cm": "centimeter centimeters centimetre centimetres", "in": "inch inches", "deg": "degs degree degrees",
-    "rad": "rads radian radians", "h": "hr hour hours", "m/s": "mps", "deg/s": "dps", "km/h": "kmh kph",
-    "rev/min": "rpm", "": "- 1",
-}  # fmt: skip
-ALIASES = {word: unit for unit, words in WORDS.items() for word in words.split()}
+WORDS = """s sec secs second seconds,ms msec millis milliseconds,us usec micros microseconds,ns nsec nanosec
+    nanoseconds,min minutes,h hour hours,m meter meters metre metres,mm millimeters millimetres,cm centimeters
+    centimetres,in inch inches,ft feet,deg degs degree degrees,rad rads radian radians,m/s mps,deg/s dps,km/h
+    kmh kph,rev/min rpm"""
+ALIASES = {"-": "", "1": ""} | {
+    word: words.split()[0] for words in WORDS.split(",") for word in words.split()
+}
 BRACKETS = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
 VAGUE = ("in", "ft", "h", "min", "", "rev")
 """Units that are no unit at the end of a name: `laser_min`."""
@@ -41,13 +38,10 @@ def per_unit(unit: str, quantity: str) -> float | None:
     """How many of a unit are one in s, m and rad, for a quantity such as `length` or `angle/time`; None if it
     is no unit of it."""
     units, quantities = unit.split("/"), quantity.split("/")
-    if len(units) != len(quantities):
+    factors = [PER_UNIT[name].get(part, 0.0) for name, part in zip(quantities, units, strict=False)]
+    if len(units) != len(quantities) or not all(factors):
         return None
-    factors = [PER_UNIT[name].get(part) for name, part in zip(quantities, units, strict=True)]
-    if any(factor is None for factor in factors):
-        return None
-    over, *under = (float(factor or 0) for factor in factors)
-    return over / under[0] if under else over
+    return factors[0] if len(factors) == 1 else factors[0] / factors[1]
 
 
 def is_unit(unit: str) -> bool:
@@ -59,11 +53,12 @@ def split_unit(name: str) -> tuple[str, str]:
     """The name of a column without its unit, and the unit, '' without one; `[...]` always holds a unit unless
     it is a number: `ranges[0]` is `ranges0`."""
     if found := BRACKETS.fullmatch(name):
-        before, square, text = found[1], found[2] is not None, found[2] if found[2] is not None else found[3]
-        if square and text.isdecimal():
-            return before + text, ""
-        if square or is_unit(plain_unit(text)):
-            return split_unit(before)[0] if before.endswith("]") else before, plain_unit(text)
+        before, square, round_ = found.groups()
+        if square is not None and square.isdecimal():
+            return before + square, ""
+        unit = plain_unit(square or round_ or "")
+        if square is not None or is_unit(unit):
+            return split_unit(before)[0] if before.endswith("]") else before, unit
     words = name.split("_")
     for count in (3, 2, 1):
         if len(words) > count and is_unit(unit := plain_unit("_".join(words[-count:]))) and unit not in VAGUE:
