@@ -22,7 +22,7 @@ from robot.recordings.bags.scans import (
 )
 from robot.recordings.bags.stamps import nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
-from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links, turn_between
+from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
 from robot.recordings.unit_check import MotionTrack, typical_motion
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
@@ -297,14 +297,10 @@ def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
 
 def _wider(bag: Bag, values: list[Any]) -> Extent | None:
     """What the scans of a topic cover together, in the frame of the first; None if it is as the first."""
-    frames = {value[7] for value in values}
-    mounts = {frame: mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1}
-    first = values[0][7]
-    extents = [
-        own if frame == first else own.turned(turn_between(mounts[frame], mounts[first]))
-        for frame, own in (value[7:] for value in values)
-    ]
-    return wider_extent(extents[0], extents)
+    frames = dict.fromkeys(value[7] for value in values)
+    mounts = [mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1]
+    at = dict(zip(frames, mounts, strict=False))
+    return wider_extent([own.turned(at[frame], mounts[0]) if at else own for *_, frame, own in values])
 
 
 def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:
