@@ -263,7 +263,9 @@ def container_fault(path: Path) -> tuple[str, str] | None:
     from mcap.records import Channel, Header, Message, Schema
     from mcap.stream_reader import StreamReader
 
-    if path.suffix != ".mcap" or not path.is_file():
+    if path.is_dir():
+        return next(filter(None, map(container_fault, sorted(path.glob("*.mcap")))), None)
+    if path.suffix != ".mcap":
         return None
     profile, codes = "", set[str]()
     with path.open("rb") as file:
