@@ -230,7 +230,7 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
             if summary is not None:
                 shape = summary.shape(contents, stamps or received)
             if isinstance(shape, ScanShape):
-                shape = shape._replace(wider=_wider(bag, contents))
+                shape = _with_wider(shape, bag, contents)
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
@@ -274,11 +274,8 @@ class Summary(NamedTuple):
 
 
 def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    own, ranges, (low, high) = (
-        extent_of(content, where),
-        np.asarray(content.ranges, float),
-        scan_limits(content),
-    )
+    own, (low, high) = extent_of(content, where), scan_limits(content)
+    ranges = np.asarray(content.ranges, float)
     nothing, unmeasured = ranges > high, np.isnan(ranges) | (ranges < low)
     nothing |= np.isposinf(ranges)
     within = ranges[~nothing & ~unmeasured]
@@ -295,12 +292,13 @@ def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
 
 
-def _wider(bag: Bag, values: list[Any]) -> Extent | None:
-    """What the scans of a topic cover together, in the frame of the first; None if it is as the first."""
+def _with_wider(shape: ScanShape, bag: Bag, values: list[Any]) -> ScanShape:
+    """The shape with what the scans of a topic cover together, in the frame of the first."""
     frames = dict.fromkeys(value[7] for value in values)
     mounts = [mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1]
     at = dict(zip(frames, mounts, strict=False))
-    return wider_extent([own.turned(at[frame], mounts[0]) if at else own for *_, frame, own in values])
+    wider = wider_extent([own.turned(at[frame], mounts[0]) if at else own for *_, frame, own in values])
+    return shape if wider is None else shape._replace(fov=wider.width, ring=wider.ring, wider=wider)
 
 
 def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:
