@@ -148,7 +148,7 @@ def draw_spikes_on_path(
         axes.plot(*place, color=GREY, lw=0.4)
         axes.plot(*(np.interp(times, time, axis) for axis in place), ".", color=VERMILLION, ms=2.5, mew=0)
         axes.set(xticks=[], yticks=[], aspect="equal")
-        label = f"cell {recording.cell[k]}, {len(times)} spikes"
+        label = f"cell {recording.cell[k]}, {len(times)} spike{'s' * (len(times) != 1)}"
         axes.set_title(label, fontsize=7, color=INK, pad=2)
     return figure
 

@@ -140,8 +140,6 @@ def _bag(path: Path) -> FileContents:
         rows.append(
             (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", in_words(topic.shape), roles)
         )
-        if topic.fault and topic.kind not in VIEWS:
-            notes.append(f"{topic.name}: {topic.fault}")
         if topic.roles:
             notes += clock_notes(topic.name, clock)
     moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
@@ -151,10 +149,10 @@ def _bag(path: Path) -> FileContents:
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
-    elif not {"views", "touch"} & topics.keys():
-        faults += [
-            f"{topic.name}: {topic.fault}" for topic in found.topics if topic.kind in VIEWS and topic.fault
-        ]
+    sees = {"views", "touch"} & topics.keys()
+    for topic in found.topics:
+        if topic.fault:
+            (notes if sees or topic.kind not in VIEWS else faults).append(topic.fault)
     if faults:
         return FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
     notes += [
@@ -174,9 +172,7 @@ def _bag(path: Path) -> FileContents:
         notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
     fov = shape.fov if isinstance(shape, ScanShape) else None
-    if isinstance(shape, ScanShape) and shape.wider is not None:
-        fov = shape.wider.width
-    if isinstance(shape, ScanShape) and (shape.ring or (shape.wider is not None and shape.wider.ring)):
+    if isinstance(shape, ScanShape) and shape.ring:
         fov = 2 * np.pi
     if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}

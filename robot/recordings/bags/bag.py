@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from copy import copy
@@ -22,7 +23,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
 MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
-KNOWN_CODES = {"cdr", "ros2msg", "ros2idl", "omgidl", ""}
+ROS2_CODES = {"cdr", "ros2msg", "ros2idl", "omgidl", ""}
 REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
 CONVERT = (
     "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
@@ -84,16 +85,19 @@ class Bag:
             for reader in readers:
                 reader.open()
                 self._stack.callback(reader.close)
-            listed = [each for reader in readers for each in reader.connections]
+            listed = readers
             if not first:
                 readers = [part for reader in readers for part in _storages(reader.storage)]
-                self._report_unlisted(files, readers)
+                names = {files[0].name, *(part.path.name for part in readers)}
+                if unread := [file.name for file in files if not {file.name, file.stem} & names]:
+                    cure = "`ros2 bag reindex` lists it"
+                    self.warn(f"{path}: {', '.join(unread)} is not in {METADATA} and is not read; {cure}")
             self._store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
             for kind in TRANSFORMS - self._store.fielddefs.keys():
                 self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
             self._decode = self._store.deserialize_ros1 if first else self._store.deserialize_cdr
             self._readers, self._first = readers, first
-            self.topics = self._list_topics(listed)
+            self.topics = self._list_topics([each for reader in listed for each in reader.connections])
         if not sum(topic.total for topic in self.topics.values()):
             self._stack.close()
             raise InputError(str(path), "a bag without messages", "at least one message")
@@ -104,26 +108,17 @@ class Bag:
         self._told.add(sentence)
 
     def _list_topics(self, listed: list[Any]) -> dict[str, Topic]:
-        """The topics of the files; of the listed connections too, which are those of metadata.yaml if any."""
+        """The topics of the files and of metadata.yaml, whichever counts more messages."""
         topics = dict[str, Topic]()
         for connections in ((each for reader in self._readers for each in reader.connections), listed):
-            before, topics = topics, {}
+            totals = dict[str, int]()
             for connection in connections:
                 name, kind = str(connection.topic), str(connection.msgtype)
                 known = topics.get(name, Topic(name, kind, 0))
-                both = kind if known.kind == kind else f"{known.kind} and {kind}"
-                topics[name] = Topic(name, both, known.total + int(connection.msgcount))
-            for name, known in before.items():
-                topics[name] = known._replace(total=max(known.total, topics.get(name, known).total))
+                both = known.kind if kind in known.kind else f"{known.kind} and {kind}"
+                totals[name] = totals.get(name, 0) + int(connection.msgcount)
+                topics[name] = Topic(name, both, max(known.total, totals[name]))
         return dict(sorted(topics.items()))
-
-    def _report_unlisted(self, files: list[Path], storages: list[Any]) -> None:
-        """Reports storage files beside metadata.yaml that it does not list."""
-        read = {part.path.name for part in storages} | {files[0].name}
-        unread = [file.name for file in files if not {file.name, file.stem} & read]
-        if unread:
-            cure = "`ros2 bag reindex` lists it"
-            self.warn(f"{self.path}: {', '.join(unread)} is not in {METADATA} and is not read; {cure}")
 
     def topic(self, name: str, key: str) -> Topic:
         """The topic of this name; a leading slash may be missing.
@@ -164,6 +159,7 @@ class Bag:
             InputError: as `messages`, or the first of the others, if they are more, or all.
         """
         where, good, spoilt = f"{self.path}, {topic.name}", 0, list[tuple[int, int, InputError]]()
+        few = max(1, SPOILT * topic.total)
         for number, time, content in self._decoded(topic):
             try:
                 if isinstance(content, InputError):
@@ -171,21 +167,21 @@ class Bag:
                 value = read(content, f"{where}, message {number}")
             except InputError as error:
                 spoilt.append((number, time, error))
-                if len(spoilt) > max(1, SPOILT * topic.total):
-                    raise _spoilt_error(
-                        spoilt[0][2], f"so or alike in over {SPOILT:.0%} of its messages"
-                    ) from error
-                continue
-            good += 1
-            yield number, time, content, value
-        if spoilt:
-            number, time, fault = spoilt[0]
-            if not good:
-                raise fault
-            first = f"the first is message {number}, received at {time / 1e9:.3f} s: {fault.found}"
-            self.warn(
-                f"{where}: {len(spoilt)} of {topic.total} messages cannot be used and are left out; {first}"
-            )
+                if len(spoilt) > few:
+                    break
+            else:
+                good += 1
+                yield number, time, content, value
+        if not spoilt:
+            return
+        number, time, fault = spoilt[0]
+        if not good and len(spoilt) <= few:
+            raise fault
+        if len(spoilt) > few:
+            found = f"{fault.found} (so or alike in over {SPOILT:.0%} of its messages)"
+            raise InputError(fault.where, found, fault.expected, fault.cure)
+        count = f"{len(spoilt)} of {topic.total} messages cannot be used and are left out"
+        self.warn(f"{where}: {count}; the first is message {number}, at {time / 1e9:.3f} s: {fault.found}")
 
     def _decoded(self, topic: Topic) -> Iterator[tuple[int, int, Any]]:
         """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
@@ -240,9 +236,7 @@ class Bag:
             raise ValueError(f"{topic.total} messages of {topic.name} are listed, and none is there")
         if count < topic.total:
             found = f"{count} of {topic.total} messages were read, the last received at {time / 1e9:.3f} s"
-            cure = (
-                "the others are listed and not there; `mcap recover` or `ros2 bag reindex` counts them anew"
-            )
+            cure = "the others are listed, not there; `mcap recover` or `ros2 bag reindex` counts them anew"
             self.warn(f"{self.path}, {topic.name}: {found}; {cure}")
 
     def _check_type(self, topic: Topic) -> None:
@@ -252,9 +246,7 @@ class Bag:
         coded = {getattr(each.ext, "serialization_format", "cdr") for reader in self._readers
                  for each in reader.connections if each.topic == topic.name}  # fmt: skip
         if coded - {"cdr"}:
-            raise InputError(
-                where, f"messages encoded as {', '.join(coded - {'cdr'})}", "CDR, of ROS 2", CONVERT
-            )
+            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
         if self._first:
             digest = self._store.generate_msgdef(topic.kind)[1]
             connections = (each for reader in self._readers for each in reader.connections)
@@ -288,40 +280,33 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def _spoilt_error(error: InputError, count: str) -> InputError:
-    return InputError(error.where, f"{error.found} ({count})", error.expected, error.cure)
-
-
 def container_fault(path: Path) -> tuple[str, str] | None:
     """What is wrong with an MCAP file as a container, and the cure; None for others."""
     from mcap.records import Channel, Header, Message, Schema
     from mcap.stream_reader import StreamReader
 
-    if path.suffix != ".mcap" or not path.is_file():
+    if path.is_dir():
+        return next(filter(None, map(container_fault, sorted(path.glob("*.mcap")))), None)
+    if path.suffix != ".mcap":
         return None
-    profile, coded = "", set[str]()
-    with path.open("rb") as file, suppress(Exception):
-        for record in StreamReader(file).records:
-            if isinstance(record, Header):
-                profile = record.profile
-            elif isinstance(record, (Channel, Schema)):
-                coded.add(record.message_encoding if isinstance(record, Channel) else record.encoding)
-            elif isinstance(record, Message):
-                break
-    if coded and (profile != "ros2" or coded - KNOWN_CODES):
-        names = ", ".join(sorted(coded))
-        return (
-            f"cannot be read as a bag: an MCAP file of profile {profile!r} with {names}, not of ROS 2",
-            CONVERT,
-        )
+    profile, codes = "", set[str]()
     with path.open("rb") as file:
-        whole = file.seek(0, 2) > len(MCAP) and (file.seek(-len(MCAP), 2), file.read())[1] == MCAP
+        with suppress(Exception):  # damage
+            for record in StreamReader(file).records:
+                if isinstance(record, Header):
+                    profile = record.profile
+                elif isinstance(record, (Channel, Schema)):
+                    codes.add(record.message_encoding if isinstance(record, Channel) else record.encoding)
+                elif isinstance(record, Message):
+                    break
+        file.seek(-min(file.seek(0, 2), len(MCAP)), 2)
+        whole = file.read() == MCAP
+    if codes and (profile != "ros2" or codes - ROS2_CODES):
+        found = f"an MCAP file of profile {profile!r} with {', '.join(sorted(codes))}, not of ROS 2"
+        return f"cannot be read as a bag: {found}", CONVERT
     if whole or profile != "ros2":
         return None
-    return (
-        "cannot be read as a bag: a ROS 2 bag (MCAP) that is cut off",
-        f"`mcap recover {path.name} -o whole.mcap`",
-    )
+    return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -374,8 +359,8 @@ def _plain(raw: Any) -> bytes:
 
 def _names_its_storage(metadata: Path) -> bool:
     """Whether metadata.yaml says how the files are stored; `ros2 bag reindex` may leave that empty."""
-    lines = metadata.read_text(encoding="utf-8", errors="replace").splitlines()
-    return not any(line.split() in (["storage_identifier:", mark] for mark in ('""', "''")) for line in lines)
+    text = metadata.read_text(encoding="utf-8", errors="replace")
+    return re.search(r"^\s*storage_identifier:\s*(''|\"\")?\s*$", text, re.MULTILINE) is None
 
 
 def _storages(reader: Any) -> list[Any]:

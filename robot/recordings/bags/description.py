@@ -22,7 +22,7 @@ from robot.recordings.bags.scans import (
 )
 from robot.recordings.bags.stamps import leaps, nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
-from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links, turn_between
+from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
 from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
@@ -234,7 +234,7 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
             if summary is not None:
                 shape = summary.shape(contents, stamps or received)
             if isinstance(shape, ScanShape):
-                shape = shape._replace(wider=_wider(bag, contents))
+                shape = _with_wider(shape, bag, contents)
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
@@ -282,11 +282,8 @@ class Summary(NamedTuple):
 
 
 def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    own, ranges, (low, high) = (
-        extent_of(content, where),
-        np.asarray(content.ranges, float),
-        scan_limits(content),
-    )
+    own, (low, high) = extent_of(content, where), scan_limits(content)
+    ranges = np.asarray(content.ranges, float)
     nothing, unmeasured = ranges > high, np.isnan(ranges) | (ranges < low)
     nothing |= np.isposinf(ranges)
     within = ranges[~nothing & ~unmeasured]
@@ -303,16 +300,13 @@ def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
     return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
 
 
-def _wider(bag: Bag, values: list[Any]) -> Extent | None:
-    """What the scans of a topic cover together, in the frame of the first; None if it is as the first."""
-    frames = {value[7] for value in values}
-    mounts = {frame: mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1}
-    first = values[0][7]
-    extents = [
-        own if frame == first else own.turned(turn_between(mounts[frame], mounts[first]))
-        for frame, own in (value[7:] for value in values)
-    ]
-    return wider_extent(extents[0], extents)
+def _with_wider(shape: ScanShape, bag: Bag, values: list[Any]) -> ScanShape:
+    """The shape with what the scans of a topic cover together, in the frame of the first."""
+    frames = dict.fromkeys(value[7] for value in values)
+    mounts = [mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1]
+    at = dict(zip(frames, mounts, strict=False))
+    wider = wider_extent([own.turned(at[frame], mounts[0]) if at else own for *_, frame, own in values])
+    return shape if wider is None else shape._replace(fov=wider.width, ring=wider.ring, wider=wider)
 
 
 def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:

@@ -64,8 +64,9 @@ class Extent(NamedTuple):
             return -np.pi, np.pi
         return self.middle - self.width / 2, self.middle + self.width / 2
 
-    def turned(self, turn: np.ndarray) -> Extent:
-        """As seen from another sensor; turn: [2, 2] from the plane of the one to that of the other."""
+    def turned(self, mount: Mount, other: Mount) -> Extent:
+        """As seen from a sensor with another mount."""
+        turn = (other.rotation.T @ mount.rotation)[:2, :2]
         ahead = turn @ np.array([np.cos(self.middle), np.sin(self.middle)])
         flip = float(np.sign(np.linalg.det(turn)))
         return Extent(float(np.arctan2(ahead[1], ahead[0])), self.width * flip, self.step)
@@ -90,10 +91,11 @@ def extent_of(message: Any, where: str) -> Extent:
     return Extent(first + step * (beams - 1) / 2, step * beams, abs(step))
 
 
-def wider_extent(first: Extent, extents: Sequence[Extent]) -> Extent | None:
+def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     """What scans cover together, in the order of the first; None if that is no more than the first covers, or
     if most scans cover less than `COVERED` of it."""
-    if first.ring or not extents:
+    first = extents[0]
+    if first.ring:
         return None
     middle, width, step = np.array(extents).T
     middle, half = _wrapped(middle - first.middle), np.abs(width) / 2
@@ -111,7 +113,7 @@ def scan_view(
     max_range: float,
     where: str,
     shared: Extent | None = None,
-    turn: np.ndarray | None = None,
+    own: Extent | None = None,
 ) -> RangeView | None:
     """The sectors of a LaserScan; None if no beam was measured.
 
@@ -121,13 +123,12 @@ def scan_view(
     Args:
         shared: the directions that are cut into sectors; None: those of the scan. If the scan has others, its
             beams go to sectors by their directions, in the order of `shared`.
-        turn: as in `Extent.turned`, if `shared` is of another sensor.
+        own: the directions of the scan, if `shared` is of another sensor.
 
     Raises:
         InputError: the angles are not numbers, or there are fewer beams than pixels.
     """
-    ranges, own = np.asarray(message.ranges, float), extent_of(message, where)
-    own = own if turn is None else own.turned(turn)
+    ranges, own = np.asarray(message.ranges, float), own or extent_of(message, where)
     if shared is None and len(ranges) < pixels:
         raise InputError(where, f"{len(ranges)} beams", f"at least one for each of {pixels} sectors")
     shared = shared or own

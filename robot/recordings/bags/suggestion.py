@@ -78,13 +78,8 @@ def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
     """The frames of the odometry and of the body of each robot in /tf; that with a view comes first."""
     found = []
     for link in bag.links:
-        named = WHEELS.fullmatch(link.parent)
-        if (
-            named
-            and not link.fixed
-            and link.total > 1
-            and link.child in [named[1] + body for body in (*BODIES, "base")]
-        ):
+        named = None if link.fixed or link.total < 2 else WHEELS.fullmatch(link.parent)
+        if named and link.child in [named[1] + body for body in (*BODIES, "base")]:
             found.append((named[1], (link.parent, link.child)))
     views = _views(bag)
     frame = "" if views is None else views[0].frame.lstrip("/")

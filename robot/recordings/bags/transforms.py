@@ -145,11 +145,6 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     return Mount(whole[:3, :3], whole[:3, 3])
 
 
-def turn_between(sensor: Mount, other: Mount) -> np.ndarray:
-    """[2, 2] from the plane of a sensor to that of another one."""
-    return (other.rotation.T @ sensor.rotation)[:2, :2]
-
-
 def _first_chain(links: Links, bodies: Sequence[str], sensor: str) -> Chain | None:
     chains = (chain_between(links, body, sensor) for body in bodies)
     return next((chain for chain in chains if chain is not None), None)

@@ -24,7 +24,7 @@ from robot.recordings.bags.scans import (
     wider_extent,
 )
 from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_usable
-from robot.recordings.bags.transforms import FORWARD, Mount, mount_of, turn_between
+from robot.recordings.bags.transforms import FORWARD, Mount, mount_of
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.rows import Frame, camera_rows
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
@@ -139,7 +139,8 @@ class _RangeReader:
         self._bag, self._topic, self._config, self._body, self._clock = bag, topic, config, body, clock
         self.reach = config.max_range
         self._mounts = dict[str, Mount]()
-        self._first: tuple[str, Extent] | None = None  # sensor, and directions of the sectors
+        self._first = ""  # frame of the first scan
+        self._shared: Extent | None = None  # directions of the sectors
         self._extents = list[Extent]()
 
     def view(self, content: Any, place: str) -> RangeView | None:
@@ -149,46 +150,40 @@ class _RangeReader:
         if self._topic.kind == CLOUD:
             view = cloud_view(content, self._mount(sensor), config.heights, pixels, reach, place)
         else:
-            own = extent_of(content, place)
-            first, shared = self._first or (sensor, _extent_of(config.span, own))
-            turn = turn_between(self._mount(sensor), self._mount(first)) if sensor != first else None
-            mount = self._mount(sensor) if shared.ring else FORWARD
-            known = None if self._first is None and config.span is None else shared
-            view = scan_view(content, mount, pixels, reach, place, known, turn)
-            self._first = first, shared
-            if view is not None:
-                self._extents.append(own if turn is None else own.turned(turn))
+            own, first = extent_of(content, place), sensor if self._shared is None else self._first
+            if sensor != first:
+                own = own.turned(self._mount(sensor), self._mount(first))
+            shared = self._shared
+            if shared is None and config.span is not None:
+                shared = Extent(sum(config.span) / 2, config.span[1] - config.span[0], own.step)
+            mount = self._mount(sensor) if (shared or own).ring else FORWARD
+            view = scan_view(content, mount, pixels, reach, place, shared, own)
+            self._first, self._shared = first, shared or own
+            self._extents.append(own)
         self.reach = reach
         return view
 
     def wider_span(self) -> tuple[float, float] | None:
         """The directions of all scans, if the setting is missing and the first scan covers less."""
-        if self._first is None or self._config.span is not None:
-            return None
-        wider = wider_extent(self._first[1], self._extents)
+        known = self._config.span is not None or not self._extents
+        wider = None if known else wider_extent(self._extents)
         return None if wider is None else wider.span
 
     def _mount(self, sensor: str) -> Mount:
         """The mount of a sensor's frame; one that is unknown is reported."""
         if sensor not in self._mounts:
-            self._mounts[sensor] = self._find_mount(sensor)
+            yaw, mount = self._config.yaw, None
+            if yaw is not None:
+                c, s = np.cos(yaw), np.sin(yaw)
+                mount = Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+            elif sensor:
+                mount = mount_of(self._bag, self._body, sensor, self._clock)
+            if mount is None:
+                frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
+                cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
+                self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
+            self._mounts[sensor] = mount or FORWARD
         return self._mounts[sensor]
-
-    def _find_mount(self, sensor: str) -> Mount:
-        if self._config.yaw is not None:
-            c, s = np.cos(self._config.yaw), np.sin(self._config.yaw)
-            return Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-        mount = mount_of(self._bag, self._body, sensor, self._clock) if sensor else None
-        if mount is None:
-            frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
-            cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
-            self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
-        return mount or FORWARD
-
-
-def _extent_of(span: tuple[float, float] | None, first: Extent) -> Extent:
-    """The directions of the sectors: of the setting, else of the first scan."""
-    return first if span is None else Extent((span[0] + span[1]) / 2, span[1] - span[0], first.step)
 
 
 def _reach(content: Any) -> float:

@@ -22,7 +22,7 @@ from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_video
-from tests.helpers.ros_bags import odometry, scan, write_bag
+from tests.helpers.ros_bags import Entry, header, odometry, scan, tf, transform, write_bag
 
 START, STEP = 1_700_000_000_000_000_000, 100_000_000  # ns
 STEPS = 40
@@ -150,6 +150,54 @@ def test_the_configuration_may_stand_in_another_folder(folder: Path, monkeypatch
 def test_settings_belong_to_live_sessions(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", str(folder / "speeds.csv"), "--set", "seed=1"]) == 2
     assert "--set" in capsys.readouterr().err
+
+
+def images(folder: Path, encoding: str, height: int, width: int) -> Path:
+    """A bag of small images of another camera beside the odometry."""
+    entries = []
+    for stamp in range(START, START + STEPS * STEP, STEP):
+        entries.append(odometry(stamp, (stamp - START) / 10**9, 0, 0))
+        fields = {"height": height, "width": width, "step": width * 4, "encoding": encoding}
+        data = {"header": header(stamp), "data": np.full(width * 4 * height, 7, np.uint8)}
+        entries.append(Entry("/camera", "sensor_msgs/msg/Image", stamp, fields | data))
+    folder.mkdir()
+    return write_bag(folder, "mcap", entries)
+
+
+def test_small_images_are_views_as_they_are(tmp_path: Path) -> None:
+    images(tmp_path / "bag", "mono8", 3, 6)
+    config = written(tmp_path, "bag/run/metadata.yaml")
+    assert config.recording is not None
+    assert config.recording.file == tmp_path / "bag" / "run"
+    with open_source(config) as source:
+        assert source.view_shape == (3, 6, 1)
+
+
+def test_views_that_cannot_be_read_are_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "mine.yaml"
+    assert main(["doctor", str(images(tmp_path / "bag", "32FC1", 60, 80)), "-o", str(output)]) == 1
+    assert not output.exists()
+    (fault,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("fault: "))
+    assert "/camera, message 0: distances (32FC1)" in fault
+    assert "recording.topics.views" in fault
+
+
+def test_other_robots_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    still = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    links = [
+        tf(stamp, *(transform(stamp, f"{name}/odom", f"{name}/base_link", stamp / 10**9 - 1.7e9, 0, still)
+                    for name in ("ada", "bob")))
+        for stamp in range(START, START + STEPS * STEP, STEP)
+    ]  # fmt: skip
+    write_bag(tmp_path, "ros1", links)
+    config = written(tmp_path, "run.bag")
+    assert config.recording is not None
+    assert config.recording.topics is not None
+    assert config.recording.topics.odometry is not None
+    assert config.recording.topics.odometry.tf == ("ada/odom", "ada/base_link")
+    said = capsys.readouterr().out
+    assert "other robots: [bob/odom, bob/base_link]" in said
+    assert "frames: ada/odom -> ada/base_link, bob/odom -> bob/base_link; 0 fixed links" in said
 
 
 def test_a_ring_of_beams_has_its_field_of_view(folder: Path) -> None:

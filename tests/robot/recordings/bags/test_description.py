@@ -144,7 +144,7 @@ SUGGESTED: dict[str, tuple[list[list[Entry]], dict[str, Any]]] = {
     "frames of none": ([framed("map", "odom"), framed("a/odom", "b/base_link"), SCANS], {}),
     "scans that vary": (
         [WHEELS, SCANS[:1], [scan(TIMES[5], [2.0] * 24, -0.6, 0.05)]],
-        {"odometry": "/odom", "views": {"topic": "/scan", "span": [-0.625, 0.575]}},
+        {"odometry": "/odom", "views": RAYS | {"columns": 14, "span": [-0.625, 0.575]}},
     ),
     "velocities": ([STILL], {"odometry": {"topic": "/odom", "use": "twist"}}),
     "no stamps": ([UNSTAMPED], {"odometry": "/odom", "clock": "bag"}),

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from robot.recordings.bags.description import describe_bag
 from robot.recordings.bags.images import COMPRESSED, RAW, grey_image
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, stored_frames, write_video
-from tests.helpers.ros_bags import ROS2, Entry, built, header, write_bag
+from tests.helpers.ros_bags import ROS2, Entry, built, header, odometry, write_bag
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
 GREY = np.asarray(Image.fromarray(COLOUR).convert("L"))
@@ -39,6 +40,12 @@ def raw(pixels: np.ndarray, encoding: str, padding: int = 0, **fields: Any) -> A
 
 def with_alpha(pixels: np.ndarray) -> np.ndarray:
     return np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 9, np.uint8)], axis=2)
+
+
+def encoded(pixels: np.ndarray) -> np.ndarray:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return np.frombuffer(file.getvalue(), np.uint8)
 
 
 ENCODED = {
@@ -105,9 +112,7 @@ def test_compressed_images_become_grey(kind: str, pixels: np.ndarray) -> None:
 
 
 def test_sixteen_bit_png() -> None:
-    file = io.BytesIO()
-    Image.fromarray(GREY.astype(np.uint16) * 256 + 77).save(file, "PNG")
-    content = built(ROS2, COMPRESSED, {"format": "png", "data": np.frombuffer(file.getvalue(), np.uint8)})
+    content = built(ROS2, COMPRESSED, {"format": "png", "data": encoded(GREY.astype(np.uint16) * 256 + 77)})
     assert np.array_equal(grey_image(content, COMPRESSED, "here"), GREY)
 
 
@@ -128,10 +133,36 @@ def test_images_that_cannot_be_read_are_refused(refused: Refused) -> None:
     refused(lambda: read(raw(GREY, "mono8", width=0)), "0 x 5 pixels")
     nonsense = {"format": "jpeg", "data": np.arange(99, dtype=np.uint8)}
     refused(lambda: read(built(ROS2, COMPRESSED, nonsense), COMPRESSED), "99 bytes of format 'jpeg'")
-    file = io.BytesIO()
-    Image.fromarray(COLOUR).save(file, "PNG")
-    cut = {"format": "png", "data": np.frombuffer(file.getvalue(), np.uint8)[:60]}
+    cut = {"format": "png", "data": encoded(COLOUR)[:60]}
     refused(lambda: read(built(ROS2, COMPRESSED, cut), COMPRESSED), "cannot be decoded")
+
+
+SPOILT = {
+    "broken": {"data": np.arange(99, dtype=np.uint8)},
+    "empty": {"data": np.zeros(0, np.uint8)},
+    "of another size": {"data": encoded(COLOUR[:4])},
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_one_image_that_cannot_be_used_is_left_out(case: str, tmp_path: Path) -> None:
+    times = range(10**9, 3 * 10**9, 10**8)
+    entries = [odometry(time, time / 10**10, 0, 0) for time in times]
+    for row, time in enumerate(times):
+        fields = {"header": header(time), "format": "png", "data": encoded(COLOUR)}
+        entries.append(Entry("/camera", COMPRESSED, time, fields | (SPOILT[case] if row == 5 else {})))
+    path = write_bag(tmp_path, "mcap", sorted(entries, key=lambda entry: entry.time))
+    told: list[str] = []
+    recording = {
+        "file": path,
+        "topics": {"odometry": "/odom", "views": "/camera"},
+        "image": {"rows": 4, "columns": 7},
+    }
+    source = open_recording(RecordingConfig.model_validate(recording), told.append)
+    assert [bool(sample.reading.view_seen) for sample in source] == [row != 5 for row in range(20)]
+    assert len(told) == 1
+    assert "1 of 20 messages cannot be used and are left out; the first is message 5, at 1.500 s: " in told[0]
+    assert describe_bag(path).topics[0].roles == ("views",)
 
 
 def test_a_bag_of_jpegs_gives_the_rows_of_their_video(tmp_path: Path) -> None:

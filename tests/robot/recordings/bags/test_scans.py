@@ -109,14 +109,14 @@ def test_a_part_of_a_ring_has_the_sectors_of_the_ring() -> None:
 
 def test_the_span_of_scans_is_what_they_cover_together() -> None:
     first = Extent(0.0, -1.0, 0.01)
-    assert wider_extent(first, [first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
-    wider = wider_extent(first, [first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
+    assert wider_extent([first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
+    wider = wider_extent([first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
     assert wider is not None
     assert wider.span == pytest.approx((0.7, -0.5))
-    ring = wider_extent(Extent(0.0, 4.0, 0.01), [Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
+    ring = wider_extent([Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
     assert ring is not None
     assert ring.span == (-np.pi, np.pi)
-    assert wider_extent(first, [first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
+    assert wider_extent([first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
 
 
 def test_beams_without_a_measurement_do_not_count() -> None:
