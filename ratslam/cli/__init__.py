@@ -25,7 +25,7 @@ from ratslam.cli import (
     studies,
     tools,
 )
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, check_output
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands
 from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError, printable
 
@@ -51,7 +51,8 @@ def main(argv: list[str] | None = None) -> int:
         return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     try:
-        check_output(arguments)
+        if getattr(arguments, "output", None) is not None:
+            arguments.check(arguments.output)
         code = arguments.command(arguments)
         sys.stdout.flush()
         return code

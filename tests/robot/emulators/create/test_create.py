@@ -126,7 +126,7 @@ def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path: Path) -> None:
     name.unlink()
     name.symlink_to("/etc/hostname")
     with pytest.raises(InputError, match="is no emulated port"):
-        EmulatedTerminal(str(name))
+        Terminal(str(name))
     name.unlink()
     name.symlink_to("/dev/pts/none")  # left by an emulator that was killed
     terminal = Terminal(str(name))
