@@ -102,9 +102,7 @@ def test_of_two_sensors_both_maps_are_named(halves) -> None:
     cells = two.config.pose_cells.model_copy(update={"cell_size": 7.0})
     other = replace(two, config=two.config.model_copy(update={"pose_cells": cells}))
     size = one.config.pose_cells.cell_size
-    with pytest.raises(
-        ratslam.InputError, match=r"two.npz: made with other settings of the sensor"
-    ) as caught:
+    with pytest.raises(ratslam.InputError, match=r"two.npz: made with other settings of") as caught:
         check_mergeable([one, other])
     assert f"pose_cells.cell_size is 7.0 here and {size} there" in str(caught.value)
     assert f"config.yaml --set pose_cells.cell_size={size} -o" in caught.value.cure
