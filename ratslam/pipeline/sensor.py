@@ -27,8 +27,8 @@ WORDS = {
     "unit": "the unit of the views",
 }
 CELL = "pose_cells.cell_size"
-SAME_FOV = 0.05  # rad
-GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length")
+SAME_FOV = 0.3  # rad, by which the ends of the scans of one sensor may vary
+GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length", "touch.frontend.plugin")
 
 
 class Sensor(NamedTuple):
