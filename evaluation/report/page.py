@@ -22,8 +22,6 @@ from evaluation.report.verdict import describe_score
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
 
-PAGE_START = rb"<!doctype html>\n[^\0]*? \xc2\xb7 ratslam report</title>"
-"""Pattern of the beginning of a page."""
 _TEMPLATES = Path(__file__).parent / "templates"
 _CAPTIONS = {
     "error": ("Error over time", "Distance from the truth after one alignment of the whole path."),

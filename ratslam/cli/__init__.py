@@ -29,7 +29,7 @@ from ratslam.cli import (
     studies,
     tools,
 )
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands, check_output
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
 from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError, printable
 
@@ -85,7 +85,8 @@ def _sigterm_as_interrupt() -> Iterator[list[int]]:
 def _run_command(arguments: argparse.Namespace) -> int:
     """Runs a command and prints its errors; returns the exit code."""
     try:
-        check_output(arguments)
+        if getattr(arguments, "output", None) is not None:
+            arguments.check(arguments.output)
         code: int = arguments.command(arguments)
         sys.stdout.flush()
         return code

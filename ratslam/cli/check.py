@@ -49,7 +49,7 @@ def _backend(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.checks.backend import check_backend
 
-    tell("this takes a minute or two, most of it compilation, and several on a busy machine")
+    tell("the checks take a minute or two, and several on a busy machine")
 
     return _report(arguments, check_backend(arguments.name, arguments.set))
 

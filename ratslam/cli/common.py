@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,37 +50,23 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = NEGATIVE
 
     def add_argument(
-        self, *names: Any, check: Callable[[Path], None] = require_new_file, **options: Any
+        self, *names: Any, check: Callable[[Path], None] | None = None, **options: Any
     ) -> argparse.Action:
-        """Adds an argument; `check` is called with the value of `-o` before the command (`check_output`)."""
+        """Adds an argument; `check` is called with the value of `-o` before the command, by default for a new
+        file, or a new folder `DIR` and those above it."""
         action = super().add_argument(*names, **options)
         self.arguments.append(action)
         if "-o" in names:
-            self.set_defaults(check=check)
+            new = partial(require_new_file, parents=options.get("metavar") == "DIR")
+            self.set_defaults(check=check or new)
         if options.get("type") is Path:
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
 
 
-def require_new_folder(path: Path) -> None:
-    """Checks a folder that is made with those above it."""
-    require_new_file(path, parents=True)
-
-
 def own_folder(*marks: str) -> Callable[[Path], None]:
     """The check of a folder that a command makes, or goes on with if one of the marks is in it."""
     return lambda path: require_own_folder(path, marks)
-
-
-def check_output(arguments: argparse.Namespace) -> None:
-    """Refuses an output that is there already, or cannot be made, before the work of any command.
-
-    Raises:
-        InputError: as the `check` of its option.
-    """
-    output = getattr(arguments, "output", None)
-    if output is not None:
-        arguments.check(output)
 
 
 class Commands:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax, require_new_folder
+from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax
 from ratslam.cli.run import add_rerun, open_target
 
 if TYPE_CHECKING:
@@ -31,9 +31,8 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     add_set(localise)
     localise.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
-        help="new run directory (default runs/RECORDING_in_MAP)",
-    )  # fmt: skip
+        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/RECORDING_in_MAP)"
+    )
     add_rerun(localise)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
+from evaluation.report import PAGE_START
 from ratslam.cli.common import Commands
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
@@ -60,7 +62,8 @@ def add_commands(commands: Commands) -> None:
     report.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="run directory")
     report.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), metavar="HTML",
-        check=_require_page, help="the page; one that is there is replaced (default ./report.html)",
+        check=partial(require_new_file, replaces=PAGE_START),
+        help="the page; one that is there is replaced (default ./report.html)",
     )  # fmt: skip
 
 
@@ -108,12 +111,6 @@ def _score(arguments: argparse.Namespace) -> int:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
     print(card.model_dump_json(indent=2) if arguments.json else render_scores(arguments.log, card))
     return 0
-
-
-def _require_page(path: Path) -> None:
-    from evaluation.report.page import PAGE_START
-
-    require_new_file(path, replaces=PAGE_START)
 
 
 def render_scores(path: Path, card: Scorecard) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from ratslam.cli.common import (
@@ -17,7 +18,6 @@ from ratslam.cli.common import (
     positive_integer,
     prepare_jax,
     read_config,
-    require_new_folder,
 )
 from ratslam.cli.reproduce_tables import add_tables
 from ratslam.config.packaged import find_config
@@ -25,6 +25,7 @@ from ratslam.experiments.atlas.registry import ROWS as MAP_ROWS
 from ratslam.experiments.cells.reproduction import NAMES as CELL_ROWS
 from ratslam.experiments.real.reproduction import NAMES as REAL_ROWS
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
 
 SALMAN2016 = {
     "fig2": "odometry drift over three clockwise laps",
@@ -65,9 +66,8 @@ def add_commands(commands: Commands) -> None:
     add_config(threshold)
     add_workers(threshold, 1)
     threshold.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
-        help="new folder for threshold.png and threshold.csv",
-    )  # fmt: skip
+        "-o", "--output", type=Path, metavar="DIR", help="new folder for threshold.png and threshold.csv"
+    )
     tables = names.add(
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
@@ -91,8 +91,8 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     add_config(train)
     train.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="NPZ", check=require_new_folder,
-        help="the new file",
+        "-o", "--output", type=Path, required=True, metavar="NPZ",
+        check=partial(require_new_file, parents=True), help="the new file",
     )  # fmt: skip
 
 

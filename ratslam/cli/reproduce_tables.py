@@ -6,14 +6,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ratslam.cli.common import (
-    Commands,
-    add_count,
-    add_workers,
-    positive_integer,
-    prepare_jax,
-    require_new_folder,
-)
+from ratslam.cli.common import Commands, add_count, add_workers, positive_integer, prepare_jax
 
 BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
 
@@ -62,10 +55,7 @@ def add_tables(tables: Commands) -> None:
     precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
     add_count(precision, "--seeds", 20, "sessions per method")
     precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
-    precision.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
-        help="new folder for BACKEND.npz",
-    )  # fmt: skip
+    precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="new folder for BACKEND.npz")
     add_workers(precision, 1)
     chaos = add("chaos", _chaos_lines, "divergence of two almost equal pose-cell networks", "--steps 1000")
     add_count(chaos, "--steps", 100_000, "steps per walk")

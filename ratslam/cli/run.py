@@ -5,15 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import (
-    INTERRUPTED,
-    CommandParser,
-    Commands,
-    add_config,
-    prepare_jax,
-    read_config,
-    require_new_folder,
-)
+from ratslam.cli.common import INTERRUPTED, Commands, add_config, prepare_jax, read_config
 from ratslam.cli.look import render_scores
 
 
@@ -46,12 +38,11 @@ def add_commands(commands: Commands) -> None:
     )
 
 
-def add_run_directory(parser: CommandParser) -> None:
+def add_run_directory(parser: argparse.ArgumentParser) -> None:
     """Adds the option that names the run directory."""
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=require_new_folder,
-        help="new run directory (default runs/CONFIG)",
-    )  # fmt: skip
+        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/CONFIG)"
+    )
 
 
 def add_rerun(parser: argparse.ArgumentParser) -> None:

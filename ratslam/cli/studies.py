@@ -296,7 +296,7 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
-    tell(f"runs {arguments.cycles} cycles with each cheaper setting: this takes ten minutes or more")
+    tell("trial runs take a minute or two, and several on a busy machine")
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)

@@ -6,9 +6,11 @@ import argparse
 import json
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 from ratslam.cli.common import Commands
+from ratslam.config import SCHEMA_START
 from tactile.base.atomic_write import write_text_atomically
 from tactile.base.new_file import make_new_file, require_new_file
 
@@ -43,7 +45,10 @@ def add_commands(commands: Commands) -> None:
         "schema", _schema, "print the JSON schema of configurations, for editors",
         "tools schema -o runs/schema.json",
     )  # fmt: skip
-    schema.add_argument("-o", "--output", type=Path, metavar="FILE", check=_require_schema, help=to_file)
+    schema.add_argument(
+        "-o", "--output", type=Path, metavar="FILE",
+        check=partial(require_new_file, replaces=SCHEMA_START), help=to_file,
+    )  # fmt: skip
 
     tools.add("version", _version, "print the versions of ratslam, Python and JAX", "tools version")
 
@@ -81,12 +86,6 @@ def _convert(arguments: argparse.Namespace) -> int:
     else:
         print(text, end="")
     return 0
-
-
-def _require_schema(path: Path) -> None:
-    from ratslam.config.strict_yaml import SCHEMA_START
-
-    require_new_file(path, replaces=SCHEMA_START)
 
 
 def _schema(arguments: argparse.Namespace) -> int:

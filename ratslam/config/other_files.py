@@ -20,8 +20,8 @@ CURES = {
 }
 """What to do with each kind; {0} is the path, {1} its folder."""
 BAGS = (".bag", ".db3", ".mcap")
-BEGINNINGS = (
-    (b"\x89MCAP0", RECORDING), (b"#ROSBAG", RECORDING), (b"SQLite format 3", RECORDING),
+BEGINNINGS = (  # in lower case
+    (b"\x89mcap0", RECORDING), (b"#rosbag", RECORDING), (b"sqlite format 3", RECORDING),
     (b"rosbag2_bagfile", BAG_PART), (b"<!doctype html", PAGE), (b"<html", PAGE),
 )  # fmt: skip
 
@@ -47,11 +47,12 @@ def kind_of(path: Path) -> str | None:
     of ours."""
     try:
         if path.is_dir():
-            return _kind_of_folder({file.name for file in path.iterdir()})
+            names = {file.name for file in path.iterdir()}
+            bag = "metadata.yaml" in names or any(name.endswith(BAGS) for name in names)
+            run = names & {"manifest.json", "steps.csv"}
+            return RUN if run else MAP if "map.npz" in names else RECORDING if bag else FOLDER
         if not path.is_file():
             return DEVICE if path.exists() else None
-        if path.suffix.lower() in (".csv", *BAGS, *VIDEOS):
-            return RECORDING
         with path.open("rb") as file:
             begins = file.read(16).lower()
         if begins.startswith(b"pk\3\4"):
@@ -61,13 +62,6 @@ def kind_of(path: Path) -> str | None:
         return RECORDING
     except (OSError, ValueError):  # whoever reads it says so
         return None
-    return next((kind for beginning, kind in BEGINNINGS if begins.startswith(beginning.lower())), None)
-
-
-def _kind_of_folder(names: set[str]) -> str:
-    if names & {"manifest.json", "steps.csv"}:
-        return RUN
-    if "map.npz" in names:
-        return MAP
-    bag = "metadata.yaml" in names or any(name.endswith(BAGS) for name in names)
-    return RECORDING if bag else FOLDER
+    if path.suffix.lower() in (".csv", *BAGS, *VIDEOS):
+        return RECORDING
+    return next((kind for beginning, kind in BEGINNINGS if begins.startswith(beginning)), None)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluation.report.page import PAGE_START, PageRun, check_report_libraries, write_page
+from evaluation.report import PAGE_START
+from evaluation.report.page import PageRun, check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.config.changed_settings import ChangedSetting, changed_settings
 from ratslam.config.packaged import read_citation

@@ -155,7 +155,7 @@ class Result:
         """Writes a page (HTML) about the run, which opens in a browser without network.
 
         Args:
-            path: the file, replaced if it exists; None: report.html in the run directory.
+            path: the file, which may replace a page only; None: report.html in the run directory.
 
         Returns:
             the path of the page.

@@ -16,6 +16,8 @@ from tactile.base.errors import InputError
 WHISKER_HEAD, FIXED_WHISKERS, OTHER_TOUCH = "whisker head", "fixed whiskers", "registered touch sensor"
 VIEWS, LABELS = "camera or laser", "given place labels"
 UNITS = {True: "signed departures from rest, in the sensor's unit", False: "values in 0..1"}
+Difference = tuple[str, Any, Any]
+"""What differs, by the name of a setting or in words, and its values in a map and elsewhere."""
 NORMALISATION = ("source", "normalise_mean", "patch", "patch_sd")
 
 WORDS = {
@@ -25,8 +27,8 @@ WORDS = {
     "unit": "the unit of the views",
 }
 CELL = "pose_cells.cell_size"
-SAME_FOV = 0.05  # rad
-GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length")
+SAME_FOV = 0.3  # rad, by which the ends of the scans of one sensor may vary
+GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length", "touch.frontend.plugin")
 
 
 class Sensor(NamedTuple):
@@ -86,14 +88,6 @@ def sensor_of(config: RunConfig, source: Source) -> Sensor:
     return Sensor(kind, source.view_shape, source.whiskers, unit, cell, *plain)
 
 
-class Difference(NamedTuple):
-    """What differs between two sensors, and its values; `what` is the name of a setting, or in words."""
-
-    what: str
-    ours: Any
-    others: Any
-
-
 def disagreement(of_map: Sensor, other: Sensor) -> str:
     """How another sensor differs from that of a map, as a clause; '' if they agree."""
     found = [[("null" if each is None else each) for each in found] for found in differences(of_map, other)]
@@ -106,23 +100,21 @@ def differences(one: Sensor, other: Sensor) -> list[Difference]:
     kinds, only the kind is named.
     """
     if one.kind != other.kind:
-        return [Difference(WORDS["kind"], one.kind, other.kind)]
+        return [(WORDS["kind"], one.kind, other.kind)]
     known = flat_settings(one.geometry | one.transform | {CELL: one.cell})
     others = flat_settings(other.geometry | other.transform | {CELL: other.cell})
-    found = [
-        Difference(key, known[key], value) for key, value in others.items() if known.get(key, value) != value
-    ]
-    shaped = any(setting.what.endswith((".rows", ".columns")) for setting in found)
+    found = [(key, known[key], value) for key, value in others.items() if known.get(key, value) != value]
+    shaped = any(what.endswith((".rows", ".columns")) for what, _, _ in found)
     for name in ("view_shape", "whiskers", "unit"):
         ours, theirs = getattr(one, name), getattr(other, name)
         if ours != theirs and not (shaped and name == "view_shape"):
-            found.insert(0, Difference(WORDS[name], ours, theirs))
+            found.insert(0, (WORDS[name], ours, theirs))
     return found
 
 
 def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:
     """The settings that make a sensor that of a map; None if the device or its views differ beyond them."""
-    if any(each.what in WORDS.values() or each.what.startswith(GEOMETRY) for each in found):
+    if any(what in WORDS.values() or what.startswith(GEOMETRY) for what, _, _ in found):
         return None
     return {key: ours for key, ours, _ in found}
 

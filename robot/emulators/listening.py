@@ -20,7 +20,7 @@ def listening(host: str, port: int, open_to_network: bool) -> Iterator[None]:
         InputError: the address is not loopback and the network was not asked for, or it cannot be used.
     """
     if not (open_to_network or is_loopback(host)):
-        cure = f"or give --open-to-network: then {OPENS}"
+        cure = f"or `--open-to-network` (open_to_network: true): {OPENS}"
         found, expected = "an address that others may reach", "loopback, such as 127.0.0.11"
         raise InputError(repr(host), found, expected, cure)
     try:

@@ -22,8 +22,6 @@ from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=Settings)
 
-SCHEMA_START = rb'{\s+"\$schema": "[^"]*",\s+"title": "RunConfig",\s'
-"""Pattern of the beginning of the schema of configurations."""
 _ALONE: dict[KeyPath, str] = {("recording", "topics"): "topic"}
 """Sections in which a text stands for a section with this key alone."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
-from robot.emulators.listening import OPENS
 from tactile.base.errors import InputError
 
 
@@ -21,15 +20,12 @@ def main(words: list[str] | None = None) -> int:
     """Runs the program; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.head", description=__doc__)
     parser.add_argument("--host", help="address to listen on; overrides the configuration")
-    parser.add_argument("--open-to-network", action="store_true", help=f"any --host: {OPENS}")
     parser.add_argument("--config", type=Path, help="HeadEmulatorConfig as JSON (default values if omitted)")
     arguments = parser.parse_args(words)
     try:
         config = _read(arguments.config)
         if arguments.host is not None:
             config = config.model_copy(update={"host": arguments.host})
-        if arguments.open_to_network:
-            config = config.model_copy(update={"open_to_network": True})
         serve(config)
     except InputError as error:
         print(error, file=sys.stderr)

@@ -6,7 +6,6 @@ import argparse
 import sys
 from typing import Any
 
-from robot.emulators.listening import OPENS
 from robot.emulators.ur10 import UrEmulatorConfig, serve
 from tactile.base.errors import InputError
 
@@ -15,7 +14,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m robot.emulators.ur10", description=__doc__)
     parser.add_argument("--config", help="settings as JSON; the other options override them")
     parser.add_argument("--host", help="address to listen on (127.0.0.11)")
-    parser.add_argument("--open-to-network", action="store_true", default=None, help=f"any --host: {OPENS}")
     parser.add_argument("--hz", type=int, choices=(125, 500), help="control steps per second (125)")
     parser.add_argument("--polyscope", help="PolyScope version (3.15.8 at 125 Hz, 5.11.0 at 500 Hz)")
     parser.add_argument("--start", type=float, nargs=6, metavar=("x", "y", "z", "rx", "ry", "rz"))

@@ -115,7 +115,7 @@ def test_another_sensor_is_refused(
     (tmp_path / "other.yaml").write_text(config)
     file = square / "map.npz" if map == "square" else map
     error = refused(capsys, tmp_path / "run", "localise", str(file), str(tmp_path / "other.yaml"))
-    assert f"{file}: made with another sensor" in error
+    assert f"{file}: made with " in error
     assert message in error
 
 

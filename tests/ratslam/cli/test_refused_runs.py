@@ -168,4 +168,4 @@ def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_refused(capsys, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    refuses(capsys, ["run", SQUARE, "-o", tmp_path / "file" / "run"], "cannot be created")
+    refuses(capsys, ["run", SQUARE, "-o", tmp_path / "file" / "run"], f"{tmp_path}/file: not a folder")

@@ -87,8 +87,8 @@ def test_existing_files_are_not_overwritten(
     path, old = tmp_path / "a.mcap", tmp_path / "old.mcap"
     path.write_bytes(small[0])
     old.write_bytes(b"precious")
-    refused(lambda: recover(path, old), str(old), "exists already", "another name")
-    refused(lambda: Recorder(old), str(old), "exists already", "another name")
+    refused(lambda: recover(path, old), str(old), "exists already", "another")
+    refused(lambda: Recorder(old), str(old), "exists already", "another")
     refused(lambda: Recorder(tmp_path / "no" / "folder.mcap"), "cannot be written")
     assert old.read_bytes() == b"precious"
 
