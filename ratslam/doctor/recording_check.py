@@ -65,8 +65,10 @@ def diagnose_recording(path: Path) -> Diagnosis:
     sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
     if "visual_odometry" in found.recording:
         sections["presets"] = ["visual_odometry"]
+    warned: list[str] = []
     try:
-        with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
+        config = validate(parse(dump_data(sections), path.name), RunConfig)
+        with open_source(config, warned.append) as source:
             contents = summarise(source)
     except InputError as error:
         return Diagnosis(found.what, found.table, found.notes, (*found.faults, *str(error).splitlines()))
@@ -75,7 +77,7 @@ def diagnose_recording(path: Path) -> Diagnosis:
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
         if found.field_of_view is not None:
             sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
-    notes, advice = (*found.notes, *facts(contents)), shortcomings(contents)
+    notes, advice = (*found.notes, *warned, *facts(contents)), shortcomings(contents)
     return Diagnosis(found.what, found.table, notes, found.faults, advice, sections)
 
 
