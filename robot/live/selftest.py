@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,12 +28,17 @@ MIN_RATE_SHARE = 0.9
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
-    """Checks the free disk space in a directory; returns a line of text.
+    """Checks that a directory can be made, and the free disk space there; returns a line of text.
 
     Raises:
-        InputError: not enough free space.
+        InputError: it cannot be made, or there is not enough free space.
     """
     there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        found = f"cannot be made ({error.strerror})"
+        raise InputError(str(directory), found, "a writable folder", "choose another with -o") from None
     free = shutil.disk_usage(there).free
     if free < config.room:
         found = f"{free / 1e9:.2g} GB free"

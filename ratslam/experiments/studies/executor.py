@@ -15,11 +15,11 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent import futures
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, closing, contextmanager, suppress
-from multiprocessing import resource_tracker
+from contextlib import ExitStack, closing, suppress
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
+from robot.drivers.withheld_signals import withheld_signals
 from tactile.base.errors import InputError
 
 ANSWER_TIME = 10  # time that a scheduler has for its first answer, s
@@ -134,7 +134,7 @@ class Executor(ExitStack):
         if self._scheduler is None and workers > self.processes:
             self.close()
         if self._client is None:
-            with _holding_interrupts():
+            with withheld_signals([signal.SIGINT]):
                 self._client = self._client_of(workers)
                 self.callback(setattr, self, "_client", None)
         self.processes = max(self.processes, min(len(self._client.nthreads()) or 1, tasks))
@@ -222,7 +222,7 @@ def _call_afresh(function: Callable[[Task], Result], task: Task) -> Result:
     context = multiprocessing.get_context("spawn")  # forked children of a process with JAX hang
     with futures.ProcessPoolExecutor(1, context, _end_with_parent) as pool:
         try:
-            with _holding_interrupts():
+            with withheld_signals([signal.SIGINT]):
                 future = pool.submit(function, task)
             return future.result()
         finally:
@@ -239,17 +239,3 @@ def _end_with_parent() -> None:
             os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-@contextmanager
-def _holding_interrupts() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block; processes started in it, and their successors, ignore it."""
-    if not hasattr(signal, "pthread_sigmask"):  # not on this system
-        yield
-        return
-    resource_tracker.ensure_running()  # its start would end the block of the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

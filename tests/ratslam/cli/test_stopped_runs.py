@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import signal
@@ -14,7 +15,7 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.config.run_config import load_config
-from ratslam.pipeline.run import process_source
+from ratslam.pipeline.run import catch_interrupt, process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.source import open_observations
 from tests.ratslam.cli.run_cases import FILES, ROOT
@@ -76,6 +77,22 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path, number, 
     added = (second / "steps.csv").read_text().split("\n", 1)[1]
     assert (first / "steps.csv").read_text() + added == (whole / "steps.csv").read_text()
     assert (whole / "trajectory.tum").read_text().endswith((second / "trajectory.tum").read_text())
+
+
+def test_a_second_interrupt_is_not_lost_in_the_garbage_collector():
+    """Python prints what callbacks of the collector raise (JAX has one) and goes on."""
+
+    def interrupt(phase, info):
+        signal.raise_signal(signal.SIGINT)
+
+    def collect():
+        gc.callbacks.append(interrupt)
+        gc.collect(0)  # calls it twice
+        gc.callbacks.remove(interrupt)
+        time.sleep(10)
+
+    with pytest.raises(KeyboardInterrupt), catch_interrupt("ending"):
+        collect()
 
 
 def test_a_run_of_known_length_compiles_its_kernel_once(corridor_run):

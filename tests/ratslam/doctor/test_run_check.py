@@ -69,6 +69,29 @@ def test_an_interrupted_run_can_be_continued(run: Path, capsys: pytest.CaptureFi
     assert f"--continue {run}/map.npz" in said(run, capsys)
 
 
+@pytest.mark.parametrize(
+    ("digest", "steps", "words"),
+    [
+        ("abc", True, "It was killed, or ended by an error"),
+        ("abc", False, "a run that was killed before its first step"),
+        ("", True, "next: map its recording: python -m ratslam run "),
+    ],
+)
+def test_a_killed_run_is_said_to_be_killed_and_how_to_go_on(
+    run: Path, capsys: pytest.CaptureFixture[str], digest: str, steps: bool, words: str
+) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    recording = manifest["recording"] | {"sha256": digest}
+    killed = manifest | {"status": "running", "recording": recording}
+    (run / "manifest.json").write_text(json.dumps(killed))
+    if not steps:
+        (run / "online.tum").write_text("")
+    text = said(run, capsys)
+    assert words in text
+    assert ("--continue" in text) == bool(digest)
+    assert "This method" not in text
+
+
 def test_bad_steps_are_faults(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     header, *lines = (run / "steps.csv").read_text().splitlines()
     column = header.split(",").index("outcome")

@@ -43,6 +43,15 @@ def test_invalid_sessions_are_refused(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_folder_that_cannot_be_made_is_refused_before_the_devices(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump({"live": CREATE, "backend": "grid"}))
+    assert main(["live", str(file), "-o", str(file / "run")]) == 2
+    assert f"{file / 'run'}: cannot be made (Not a directory); expected a writable" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "messages"),
     [

@@ -116,9 +116,9 @@ def test_interrupts_while_it_finishes_leave_the_report(bench: Bench) -> None:
 @pytest.mark.parametrize("number", [*FEW, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, 31))])
 def test_a_killed_session_is_mapped_again_to_the_same_bits(bench: Bench, number: int, tmp_path: Path) -> None:
     """With its mapper, or alone: the mapper then completes the run."""
-    with bench.session(mapper=None, waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
+    with bench.session(mapper=None, waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)] * 3) as session:
         session.wait_for("armed")
-        time.sleep(float(stream(number, "mapped").uniform(1.0, 8.0)))
+        time.sleep(float(stream(number, "mapped").uniform(0.0, 8.0)))
         (os.kill if number % 2 else os.killpg)(session.process.pid, signal.SIGKILL)
         until(lambda: not session.lives(), "nothing of it stays")
         live = session.directory
