@@ -78,7 +78,8 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     """The grid map of a run with its truth, if known."""
     grid = read_grid(directory / "grid.npz")
     if len(run.state):
-        shown, layers = arrange_pieces(run), align_layers(arrange_pieces(run))
+        shown = arrange_pieces(run)
+        layers = align_layers(shown)
         true = np.full((1, 2), np.nan) if layers.truth is None else layers.truth
         known = np.where(run.found[:, None], shown.final[:, :2], np.nan)
         line = f"found in {run.found.sum():,} of {len(run.time):,} steps"

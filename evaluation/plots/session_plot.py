@@ -34,7 +34,8 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
     figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes, style.MAP)
+    largest = int(np.bincount(piece).argmax())
+    style.metre_grid(axes, style.MAP if pieces == 1 else f"piece {largest + 1}, the largest")
     ends = np.cumsum(steps).tolist()
     for number, (count, end) in enumerate(zip(steps, ends, strict=True)):
         own = slice(end - count, end)

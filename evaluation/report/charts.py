@@ -19,6 +19,7 @@ from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
 from evaluation.report.closure_records import WORDS
 from evaluation.report.palette import GRID_SCALES, RUN_ROLES
 from evaluation.report.run_report import RunReport
+from tactile.base.se2 import compose, inverse
 
 _DASHES = ("solid", "dash", "dot", "dashdot")
 _CLOSURES = {ACCEPTED: ("accepted", "circle", "solid"), "open": ("refused", "x", "dot")}
@@ -56,7 +57,11 @@ def map_chart(report: RunReport) -> Any:
     if report.map_path is not None:
         traces.append(_line(report.map_path, "map, not believed", "doubted", dash="dot", width=1.2))
     traces += _path_traces(report)
-    figure = _map_figure([*traces, *_place_traces(report), *_closure_traces(report)], _frame(report))
+    main = (
+        f"piece {report.run.main + 1}," if report.run.has_pieces and not len(report.run.state) else "the map,"
+    )
+    traces = [*traces, *_place_traces(report), *_closure_traces(report)]
+    figure = _map_figure(traces, _frame(report), main)
     figure.update_layout(shapes=[*_link_shapes(report), *_closure_shapes(report)])
     if report.grid is not None:  # no empty space beside the grid
         figure.update_xaxes(constrain="domain").update_yaxes(constrain="domain")
@@ -81,13 +86,20 @@ def _path_traces(report: RunReport) -> list[Any]:
 
 def overlay_chart(reports: Sequence[RunReport]) -> Any:
     """The final trajectories of several runs, each aligned to its truth, over the truth of the first."""
-    known = next((report.layers.truth for report in reports if report.layers.truth is not None), None)
-    traces = [] if known is None else [_line(split_at_jumps(known, known), "truth", "truth", width=5)]
+    known = [_as_true(each, each.layers.truth) for each in reports if each.layers.truth is not None][:1]
+    paths = [_as_true(report, report.layers.final) for report in reports]
+    traces = [_line(split_at_jumps(truth, truth), "truth", "truth", width=5) for truth in known]
     traces += [
-        _line(report.layers.final, report.name, *_run_style(number)) for number, report in enumerate(reports)
+        _line(path, report.name, *_run_style(k))
+        for k, (path, report) in enumerate(zip(paths, reports, strict=True))
     ]
-    frames = np.stack([_frame(report) for report in reports])
-    return _map_figure(traces, np.stack([frames[:, 0].min(axis=0), frames[:, 1].max(axis=0)]))
+    return _map_figure(traces, _around(*bounds(*paths, *known)), "the truth, or of the map,")
+
+
+def _as_true(report: RunReport, points: np.ndarray) -> np.ndarray:
+    """Points [n, 2] of a run's layers in the frame of its truth, m."""
+    poses = np.column_stack([points, np.zeros(len(points))])
+    return compose(inverse(report.layers.to_map), poses)[:, :2]
 
 
 def error_chart(reports: Sequence[RunReport]) -> Any | None:
@@ -244,9 +256,9 @@ def _line(
     )
 
 
-def _map_figure(traces: list[Any], frame: np.ndarray) -> Any:
+def _map_figure(traces: list[Any], frame: np.ndarray, of: str = "the map,") -> Any:
     """A figure with equal scales that shows a frame [[left, bottom], [right, top]], m."""
-    figure = _figure(traces, "x in the frame of the map, m", "y in the frame of the map, m")
+    figure = _figure(traces, f"x in the frame of {of} m", f"y in the frame of {of} m")
     figure.update_layout(dragmode="pan")
     figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
     figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
@@ -261,6 +273,11 @@ def _frame(report: RunReport) -> np.ndarray:
     room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
     low = np.minimum(low, np.maximum(far_low, low - room))
     high = np.maximum(high, np.minimum(far_high, high + room))
+    return _around(low, high)
+
+
+def _around(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Corners [[left, bottom], [right, top]] with a margin."""
     margin = max(_MARGIN * (high - low).max(), 1e-3)
     return np.stack([low - margin, high + margin])
 

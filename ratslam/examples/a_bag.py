@@ -8,7 +8,7 @@ Install its reader first: `pip install 'ratslam[ros]'`.
 """
 
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -29,14 +29,14 @@ recording:
 
 
 def main() -> None:
-    folder = Path(mkdtemp())
-    write_bag(folder / "robot")
-    (folder / "robot.yaml").write_text(CONFIG, encoding="utf-8")
-    result = ratslam.run(folder / "robot.yaml", folder / "a bag")
-    error = result.scorecard.quantities["ate_final"]
-    print(f"{len(result.time)} samples: {error.value:.1g} m off, odometry {error.odometry:.1g} m")
-    print(f"{folder / 'a bag'} holds the run")
-    result.plot().savefig("a_bag.png")
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_bag(folder / "robot")
+        (folder / "robot.yaml").write_text(CONFIG, encoding="utf-8")
+        result = ratslam.run(folder / "robot.yaml", folder / "a bag")
+        error = result.scorecard.quantities["ate_final"]
+        print(f"{len(result.time)} samples: {error.value:.1g} m off, odometry {error.odometry:.1g} m")
+        result.plot().savefig("a_bag.png")
 
 
 def write_bag(path: Path) -> None:

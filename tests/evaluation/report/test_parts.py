@@ -7,6 +7,7 @@ import re
 from base64 import b64decode, b64encode
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from evaluation.artifacts.closure_views import (
 )
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.metrics.scorecard import score_run
+from evaluation.plots.map_plot import align_layers
+from evaluation.report.charts import overlay_chart
 from evaluation.report.citation import read_citations
 from evaluation.report.closure_records import VIEW_BYTES, closure_records, halve, view_records
 from evaluation.report.page import content_policy, embedded_json
@@ -31,6 +34,7 @@ from evaluation.report.palette import PALETTE
 from evaluation.report.run_files import FILES, OTHER, list_run_files
 from evaluation.report.verdict import describe_score, judge_map
 from tactile.base.errors import InputError
+from tactile.base.se2 import compose
 
 ROOT = Path(__file__).parents[3]
 
@@ -64,6 +68,18 @@ def test_the_score_is_told_in_words(circle) -> None:
 
 def words(run) -> str:
     return describe_score(score_run(run))
+
+
+def test_compared_runs_are_drawn_in_the_frame_of_their_truth(circle) -> None:
+    """Each map has a frame of its own."""
+    turned = circle._replace(final=compose(np.array([3.0, -2.0, 1.0]), circle.final))
+    runs = [
+        SimpleNamespace(name=name, layers=align_layers(run)) for name, run in (("a", circle), ("b", turned))
+    ]
+    traces = overlay_chart(runs).data
+    assert [trace.name for trace in traces] == ["truth", "a", "b"]
+    for trace in traces:
+        assert np.stack([trace.x, trace.y], axis=1) == pytest.approx(circle.truth[:, :2], abs=1e-5)
 
 
 def test_every_reference_is_cited() -> None:
