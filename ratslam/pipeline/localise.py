@@ -21,7 +21,7 @@ from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.run import print_status, process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.saved_map import SavedMap, is_map
-from ratslam.pipeline.source import WarningLog, open_observations
+from ratslam.pipeline.source import open_observations
 from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
 
@@ -158,9 +158,10 @@ def localise(
         InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
             map.
     """
+    warnings: list[str] = []
     with (
-        open_observations(localising(config, saved), log := WarningLog(print_status)) as (completed, source),
-        open_runner(completed, source, directory, observers=observers, warnings=log.found) as runner,
+        open_observations(localising(config, saved), print_status, warnings) as (completed, source),
+        open_runner(completed, source, directory, observers=observers, warnings=warnings) as runner,
     ):
         interrupted = process_source(runner, source)
         card = runner.finish(interrupted)

@@ -161,8 +161,8 @@ class Runner:
         found = list(self._warnings)
         if self._config.recording is None:
             time, poses = read_tum(self._directory.path / "odometry.tum")
-            moved = np.concatenate([poses[:1], between(poses[:-1], poses[1:])])
-            motion = np.column_stack([moved, np.diff(time, prepend=time[0])])
+            moved = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+            motion = np.column_stack([moved, np.diff(time, prepend=time[:1])])
             found += judge_motion(time, motion, self._source.name)
         self._manifest |= {"status": "running", "input": _input(found)}
         _write_manifest(self._directory, self._manifest)
@@ -234,8 +234,7 @@ def open_runner(
         files.text("config.yaml", text)
         warnings = [] if warnings is None else warnings  # a reader goes on to add to it
         if resume is not None:
-            earlier = read_manifest(map_file(resume).parent).warnings
-            warnings[:0] = [sentence for sentence in earlier if sentence not in warnings]
+            warnings[:0] = read_manifest(map_file(resume).parent).warnings
         manifest = _manifest(config, text, source, resume)
         _write_manifest(files, manifest | {"status": "running", "input": _input(warnings)})
         save_world(source.info, files)

@@ -18,7 +18,7 @@ def labels(figure):
 
 def test_the_plot_shows_map_truth_and_odometry(circle):
     figure = draw_map(circle, score_run(circle, "circle"))
-    assert labels(figure)[:4] == ["truth", "raw odometry", "mapped path", "experience"]
+    assert labels(figure)[:4] == ["truth", "odometry", "mapped path", "experience"]
     assert "link to an older experience" in labels(figure)
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x (m)", "y (m)", 1.0)
@@ -48,7 +48,7 @@ def test_without_truth_odometry_starts_where_the_map_does(circle):
     figure = draw_map(blind, score_run(blind))
     odometry, final = (
         next(line for line in figure.axes[0].lines if line.get_label() == name).get_xydata()[0]
-        for name in ("raw odometry", "mapped path")
+        for name in ("odometry", "mapped path")
     )
     assert odometry == pytest.approx(final)
     assert "truth" not in labels(figure)
@@ -87,7 +87,7 @@ def drawn(figure, label):
 def test_walls_are_drawn_in_the_frame_of_the_truth(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     axes = figure.axes[0]
-    assert labels(figure)[:3] == ["truth", "mapped path", "raw odometry"]
+    assert labels(figure)[:3] == ["truth", "mapped path", "odometry"]
     (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
     for box, path in zip(WALLS, boxes.get_paths(), strict=True):
         assert path.get_extents().extents == pytest.approx(box[:4])

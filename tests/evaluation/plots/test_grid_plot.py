@@ -129,9 +129,9 @@ def test_walls_and_paths_are_drawn_at_their_position():
     assert np.allclose([path.vertices for path in walls.get_paths()], SIDE.reshape(-1, 2, 2))
     lines = {line.get_label(): line for line in axes.lines}
     assert list(lines) == [
-        f"dead reckoning, error {0.8:.3f} m",
+        f"odometry, mean error {0.8:.3f} m",
         "true path",
-        "estimated path, error 0.050 m",
+        "estimated path, mean error 0.050 m",
         "start",
     ]
     for line, path in zip(
@@ -147,9 +147,9 @@ def test_rows_without_truth_are_not_drawn():
     truth = WAY.copy()
     truth[::2] = np.nan
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
-    assert [line.get_label() for line in axes.lines][2] == "estimated path, error 0.050 m"
+    assert [line.get_label() for line in axes.lines][2] == "estimated path, mean error 0.050 m"
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
-    assert [line.get_label() for line in axes.lines] == ["dead reckoning", "true path", "estimated path"]
+    assert [line.get_label() for line in axes.lines] == ["odometry", "true path", "estimated path"]
     poses = np.column_stack([WAY, TURN])
     assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 
