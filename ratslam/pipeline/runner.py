@@ -233,7 +233,7 @@ def open_runner(
         text = dump(config)
         files.text("config.yaml", text)
         warnings = [] if warnings is None else warnings  # a reader goes on to add to it
-        if resume is not None:
+        if resume is not None and map_file(resume).name == NAME:  # of a run
             warnings[:0] = read_manifest(map_file(resume).parent).warnings
         manifest = _manifest(config, text, source, resume)
         _write_manifest(files, manifest | {"status": "running", "input": _input(warnings)})
