@@ -34,10 +34,10 @@ WORSE = 1.01
 
 
 class HealthCard(Settings):
-    """How far the result of a run can be believed, judged without truth: its input, and its map."""
+    """How far input and map of a run can be believed, judged without truth."""
 
     input: Literal["clean", "warned"] = "clean"
-    """The verdict on the input; one that is refused makes no run."""
+    """One that is refused makes no run."""
     warnings: tuple[str, ...] = ()
     """About the input, a sentence each."""
     worse_than_odometry: float | None = None
@@ -79,23 +79,17 @@ def score_run(
     """
     check_run(run)
     data = run_data(run, exm, relations, gap)
+    known = bool(np.isfinite(run.doubt))
+    health = HealthCard(
+        input="warned" if run.warnings else "clean", warnings=run.warnings,
+        worse_than_odometry=float(run.doubt) if known else None, reason="" if known else run.unjudged,
+    )  # fmt: skip
     quantities = {}
     for metric in (*RUN_METRICS, *metrics):
         unused = metric.section == PIECES and not run.has_pieces
         if not unused and (relations is not None or not metric.name.startswith("relations_")):
             quantities[metric.name] = metric.quantity(metric.compute(data) or MISSING_TRUTH)
-    return Scorecard(name=name, exm=exm, quantities=quantities, health=health_card(run))
-
-
-def health_card(run: RunArrays) -> HealthCard:
-    """The health of a run."""
-    doubt = float(run.doubt) if np.isfinite(run.doubt) else None
-    return HealthCard(
-        input="warned" if run.warnings else "clean",
-        warnings=run.warnings,
-        worse_than_odometry=doubt,
-        reason=run.unjudged if doubt is None else "",
-    )
+    return Scorecard(name=name, exm=exm, quantities=quantities, health=health)
 
 
 def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT_EXM) -> Scorecard:
@@ -175,10 +169,9 @@ def render_health(card: Scorecard) -> str:
 
 def render_warnings(card: Scorecard) -> list[str]:
     """The warnings about the input, a line each; the number of further ones if they are many."""
-    warnings = () if card.health is None else card.health.warnings
-    lines = [f"warning: {sentence}" for sentence in warnings[:MOST_WARNINGS]]
-    more = len(warnings) - MOST_WARNINGS
-    return lines + ([f"and {more} more, which scorecard.json lists"] if more > 0 else [])
+    lines = [f"warning: {sentence}" for sentence in (card.health.warnings if card.health else ())]
+    more = [f"and {len(lines) - MOST_WARNINGS} more, which scorecard.json lists"]
+    return lines if len(lines) <= MOST_WARNINGS else lines[:MOST_WARNINGS] + more
 
 
 def position_error(card: Scorecard) -> Quantity:

@@ -33,8 +33,8 @@ class Comparison(NamedTuple):
 def key_figures(report: RunReport) -> list[KeyFigure]:
     """The figures of one run, the most important first."""
     figures = [_error(report), *_pieces(report), *_grid(report)]
-    if report.run.warnings:
-        figures.append(KeyFigure("Input", "warned", f"{len(report.run.warnings)} warnings"))
+    if warned := len(report.run.warnings):
+        figures.append(KeyFigure("Input", "warned", f"{warned} warning{'s' * (warned > 1)}"))
     if len(report.run.nodes):
         figures.append(
             KeyFigure("Experiences", f"{len(report.run.nodes):,}", f"{len(report.run.links):,} links")

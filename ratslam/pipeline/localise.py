@@ -23,7 +23,7 @@ from ratslam.pipeline.run import LAST_TASK, catch_interrupt, print_status, proce
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.saved_map import SavedMap, is_map
 from ratslam.pipeline.sensor import check_same_fov
-from ratslam.pipeline.source import WarningLog, open_observations
+from ratslam.pipeline.source import open_observations
 from robot.recordings.formats import RecordingConfig
 from tactile.base.errors import InputError
 
@@ -166,9 +166,10 @@ def localise(
         InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
             map.
     """
+    warnings: list[str] = []
     with (
-        open_observations(localising(config, saved), log := WarningLog(print_status)) as (completed, source),
-        open_runner(completed, source, directory, observers=observers, warnings=log.found) as runner,
+        open_observations(localising(config, saved), print_status, warnings) as (completed, source),
+        open_runner(completed, source, directory, observers=observers, warnings=warnings) as runner,
         catch_interrupt(LAST_TASK),
     ):
         interrupted = process_source(runner, source)

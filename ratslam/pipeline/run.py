@@ -20,7 +20,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.pipeline.progress import Observer
 from ratslam.pipeline.runner import Runner, open_runner
-from ratslam.pipeline.source import WarningLog, open_observations, open_source
+from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
 from robot.sources.source import Source
 from tactile.base.errors import InputError, printable
@@ -48,9 +48,10 @@ def run(
         InputError: the source, the checkpoint or the run directory cannot be used.
         OSError: the disk is full.
     """
+    warnings: list[str] = []
     with (
-        open_observations(config, log := WarningLog(print_status)) as (completed, source),
-        open_runner(completed, source, directory, resume, observers=observers, warnings=log.found) as runner,
+        open_observations(config, print_status, warnings) as (completed, source),
+        open_runner(completed, source, directory, resume, observers=observers, warnings=warnings) as runner,
         catch_interrupt(LAST_TASK),
     ):
         interrupted = process_source(runner, source)

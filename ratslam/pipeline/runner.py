@@ -183,8 +183,8 @@ class Runner:
         found = list(self._warnings)
         if self._config.recording is None:
             time, poses = read_tum(self._directory.path / "odometry.tum")
-            moved = np.concatenate([poses[:1], between(poses[:-1], poses[1:])])
-            motion = np.column_stack([moved, np.diff(time, prepend=time[0])])
+            moved = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+            motion = np.column_stack([moved, np.diff(time, prepend=time[:1])])
             found += judge_motion(time, motion, self._source.name)
         self._manifest |= {"input": _input(found)}
         self._directory.text("manifest.json", _manifest_text(self._manifest | {"status": "running"}))
@@ -246,9 +246,8 @@ def open_runner(
     text = dump(config)
     manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
     warnings = [] if warnings is None else warnings  # a reader goes on to add to it
-    if begun is not None:
-        earlier = read_manifest(map_file(begun).parent).warnings
-        warnings[:0] = [sentence for sentence in earlier if sentence not in warnings]
+    if begun is not None and map_file(begun).name == NAME:  # of a run
+        warnings[:0] = read_manifest(map_file(begun).parent).warnings
     running = _manifest_text(manifest | {"status": "running", "input": _input(warnings)})
     with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns(), running) as files:
         files.text("config.yaml", text)

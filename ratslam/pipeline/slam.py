@@ -18,7 +18,7 @@ from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.localise import localising
 from ratslam.pipeline.saved_map import describe_readings, is_map, read_map, write_map
-from ratslam.pipeline.source import ConfigLike, WarningLog, open_source, resolve_config
+from ratslam.pipeline.source import ConfigLike, open_source, resolve_config
 from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
@@ -56,8 +56,9 @@ class Slam:
     def __init__(self, config: ConfigLike, info: Source | SourceInfo | None = None) -> None:
         config = resolve_config(config, source_required=False)
         if info is None:
-            with open_source(config, log := WarningLog()) as source:
-                self._build(complete(config, source), source, log.found)
+            found: list[str] = []
+            with open_source(config, warnings=found) as source:
+                self._build(complete(config, source), source, found)
         else:
             source = describe_whiskers(info, config.touch) if isinstance(info, SourceInfo) else info
             self._build(complete(config, source), source)

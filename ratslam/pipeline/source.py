@@ -22,28 +22,6 @@ from tactile.base.types import Observation
 
 ConfigLike = str | os.PathLike[str] | RunConfig
 """A configuration, its file, or its name."""
-WARNING = "warning: "
-"""Beginning of the sentences about a source that are warnings."""
-
-
-class WarningLog:
-    """Passes sentences about a source on, and keeps the warnings among them.
-
-    Args:
-        report: called with each sentence.
-
-    Attributes:
-        found: the warnings.
-    """
-
-    def __init__(self, report: Callable[[str], None] = lambda sentence: None) -> None:
-        self.found: list[str] = []
-        self._report = report
-
-    def __call__(self, sentence: str) -> None:
-        self._report(sentence)
-        if sentence.startswith(WARNING):
-            self.found.append(sentence.removeprefix(WARNING))
 
 
 def resolve_config(config: ConfigLike, *, source_required: bool = True) -> RunConfig:
@@ -60,11 +38,14 @@ def resolve_config(config: ConfigLike, *, source_required: bool = True) -> RunCo
     return load_config(config, source_required=source_required)
 
 
-def open_source(config: ConfigLike, report: Callable[[str], None] | None = None) -> Source:
+def open_source(
+    config: ConfigLike, report: Callable[[str], None] | None = None, warnings: list[str] | None = None
+) -> Source:
     """The recording or simulation of a configuration, a context manager; readings are as recorded.
 
     Args:
         report: called with one sentence about the fidelity of a simulation, or if a recording is incomplete.
+        warnings: gets the sentences that are warnings, also while the source is read.
 
     Raises:
         InputErrors: the configuration has errors.
@@ -83,29 +64,35 @@ def open_source(config: ConfigLike, report: Callable[[str], None] | None = None)
     if config.source is not None:
         entry = SOURCES.get(config.source.plugin, "source.plugin")
         settings = read_settings(entry.config_class, config.source.settings, "source.settings")
-        return entry.open(settings, _warning(report))
+        return entry.open(settings, _warning(report, warnings))
     if config.recording is None and config.live is None:
         cure = "ratslam.Slam takes `info` instead: the source of the readings, or a SourceDescription"
         raise InputError("config", "no source", "a recording or a simulation", cure)
     if config.recording is None:
         cure = "`python -m ratslam live` runs it; `run` maps the recording that it makes"
         raise InputError("live", "a live session", "a recording or a simulation", cure)
-    return open_recording(config.recording, _warning(report))
+    return open_recording(config.recording, _warning(report, warnings))
 
 
-def _warning(report: Callable[[str], None] | None) -> Callable[[str], None] | None:
-    return report and (lambda sentence: report(WARNING + sentence))
+def _warning(report: Callable[[str], None] | None, warnings: list[str] | None) -> Callable[[str], None]:
+    def warn(sentence: str) -> None:
+        if warnings is not None:
+            warnings.append(sentence)
+        if report is not None:
+            report(f"warning: {sentence}")
+
+    return warn
 
 
 @contextmanager
 def open_observations(
-    config: RunConfig, report: Callable[[str], None] | None = None
+    config: RunConfig, report: Callable[[str], None] | None = None, warnings: list[str] | None = None
 ) -> Iterator[tuple[RunConfig, Source]]:
     """The completed configuration and its source, whisker readings turned into observations.
 
     Args, Raises: as `open_source` and `complete`.
     """
-    with open_source(config, report) as source:
+    with open_source(config, report, warnings) as source:
         config = complete(config, source)
         yield config, open_touch_source(source, config.touch)
 

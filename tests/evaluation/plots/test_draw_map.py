@@ -19,7 +19,7 @@ def labels(figure):
 
 def test_the_plot_shows_map_truth_and_odometry(circle):
     figure = draw_map(circle, score_run(circle, "circle"))
-    assert labels(figure)[:4] == ["truth", "raw odometry", "mapped path", "experience"]
+    assert labels(figure)[:4] == ["truth", "odometry", "mapped path", "experience"]
     assert "link to an older experience" in labels(figure)
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == (
@@ -52,7 +52,7 @@ def test_without_truth_odometry_starts_where_the_map_does(circle):
     figure = draw_map(blind, score_run(blind))
     odometry, final = (
         next(line for line in figure.axes[0].lines if line.get_label() == name).get_xydata()[0]
-        for name in ("raw odometry", "mapped path")
+        for name in ("odometry", "mapped path")
     )
     assert odometry == pytest.approx(final)
     assert "truth" not in labels(figure)
@@ -91,7 +91,7 @@ def drawn(figure, label):
 def test_walls_are_drawn_where_the_map_says_they_are(circle):
     figure = draw_map(circle, score_run(circle), WALLS)
     axes = figure.axes[0]
-    assert labels(figure)[:3] == ["truth", "mapped path", "raw odometry"]
+    assert labels(figure)[:3] == ["truth", "mapped path", "odometry"]
     (boxes,) = (found for found in axes.collections if len(found.get_paths()) == len(WALLS))
     to_map = compose(circle.final[0], inverse(circle.truth[0]))
     for (west, south, _, north, _), path in zip(WALLS, boxes.get_paths(), strict=True):

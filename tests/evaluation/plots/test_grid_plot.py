@@ -129,7 +129,7 @@ def test_walls_and_paths_are_drawn_at_their_position():
     assert np.allclose([path.vertices for path in walls.get_paths()], SIDE.reshape(-1, 2, 2))
     lines = {line.get_label(): line for line in axes.lines}
     assert list(lines) == [
-        f"raw odometry, mean error {0.8:.3f} m",
+        f"odometry, mean error {0.8:.3f} m",
         "truth",
         "online path, mean error 0.050 m",
         "start",
@@ -149,7 +149,7 @@ def test_rows_without_truth_are_not_drawn():
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
     assert [line.get_label() for line in axes.lines][2] == "online path, mean error 0.050 m"
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
-    assert [line.get_label() for line in axes.lines] == ["raw odometry", "truth", "online path"]
+    assert [line.get_label() for line in axes.lines] == ["odometry", "truth", "online path"]
     poses = np.column_stack([WAY, TURN])
     assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 

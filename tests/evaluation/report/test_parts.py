@@ -24,6 +24,7 @@ from evaluation.artifacts.closure_views import (
     write_closure_views,
 )
 from evaluation.artifacts.manifest import read_manifest
+from evaluation.metrics.run_arrays import UNFINISHED
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.map_plot import align_layers
 from evaluation.report.charts import overlay_chart
@@ -42,16 +43,18 @@ ROOT = Path(__file__).parents[3]
 @pytest.mark.parametrize(
     ("doubt", "level", "words"),
     [
-        (0.0, "unjudged", "nothing corrects the drift"),
+        (0.0, "believed", "100% likely no worse"),
         (0.001, "believed", "over 99% likely no worse"),
         (0.29, "believed", "71% likely no worse"),
         (0.5, "uncertain", "leaves 50%"),
         (0.71, "doubted", "71% likely worse"),
         (np.nan, "unjudged", "does not say"),
+        ("no loop closure was accepted, the map is the odometry", "unjudged", "nothing corrects its drift"),
+        (UNFINISHED, "unjudged", "when the run has ended"),
     ],
 )
-def test_the_verdict_follows_the_doubt(doubt: float, level: str, words: str) -> None:
-    verdict = judge_map(doubt)
+def test_the_verdict_follows_the_doubt(doubt: float | str, level: str, words: str) -> None:
+    verdict = judge_map(np.nan, doubt) if isinstance(doubt, str) else judge_map(doubt)
     assert verdict.level == level
     assert words in verdict.reason
 
@@ -59,9 +62,8 @@ def test_the_verdict_follows_the_doubt(doubt: float, level: str, words: str) -> 
 def test_the_score_is_told_in_words(circle) -> None:
     better = circle._replace(final=circle.final + np.array([[0.001, 0, 0], [-0.001, 0, 0]] * 54))
     assert re.search(r"error is 0\.001 m; that of odometry is \S+ m, \S+ times as much", words(better))
-    assert "times as far off" in words(
-        circle._replace(final=circle.odometry * 2, odometry=circle.final * 1.001)
-    )
+    worse = words(circle._replace(final=circle.odometry * 2, odometry=circle.final * 1.001))
+    assert "times as far off, worse than odometry." in worse
     assert words(circle._replace(final=circle.odometry)).endswith(", the same.")
     assert words(circle._replace(truth=None)) == "The truth is unknown, so there is no score."
 

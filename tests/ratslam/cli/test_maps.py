@@ -91,6 +91,10 @@ def test_the_files_of_a_run_follow_a_map_that_is_corrected_in_it(capsys, tmp_pat
     number, verdict = head.index("sequence"), head.index("verdict")
     rows = [line.split(",") for line in lines[1:]]
     assert {row[verdict] for row in rows if row[number] == str(sequence)} == {"undone"}
+    assert info(capsys, run)["closures"] == 0
+    assert (run / "trajectory.tum").read_bytes() == (run / "odometry.tum").read_bytes()
+    assert not (run / "calibration.yaml").exists()
+    before.pop("calibration.yaml")
     changed = {name for name, content in before.items() if (run / name).read_bytes() != content}
     assert {"map.npz", "closures.csv", "map.tum", "map.g2o", "scorecard.json", "map.png"} <= changed
     assert not changed & {"steps.csv", "online.tum", "odometry.tum", "truth.tum", "config.yaml"}

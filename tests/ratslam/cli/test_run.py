@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 import signal
 
-import numpy as np
 import pytest
 
-from evaluation.metrics.trajectory import read_tum
 from ratslam.cli import main
+from ratslam.core.backend import NO_CLOSURE
 from tests.ratslam.cli.run_cases import FILES, ROOT, SQUARE, refuses
 
 
@@ -39,17 +39,25 @@ TRACES = (
 
 
 def check_odometry(path):
-    _, final = read_tum(path / "trajectory.tum")
-    _, odometry = read_tum(path / "odometry.tum")
-    assert np.abs(final[:, :2] - odometry[:, :2]).max() <= 1e-9
+    for name in ("trajectory", "map", "online"):
+        assert (path / f"{name}.tum").read_bytes() == (path / "odometry.tum").read_bytes(), name
+    health = json.loads((path / "scorecard.json").read_text())["health"]
+    assert (health["worse_than_odometry"], health["reason"]) == (None, NO_CLOSURE)
+    assert not (path / "calibration.yaml").exists()
 
 
+@pytest.mark.parametrize("backend", ["recall", "classic"])
 @pytest.mark.parametrize("trace", TRACES)
-def test_without_closures_the_map_is_odometry(trace, tmp_path):
+def test_without_closures_the_map_is_odometry(trace, backend, tmp_path, capsys):
     file = ROOT / "tests" / "golden" / f"{trace}.npz"
     sets = ["--set", f"recording.file={file}", "--set", "experience.closures=false"]
-    assert main(["run", SQUARE, "-o", str(tmp_path / "run"), *sets]) == 0
+    assert main(["run", SQUARE, "-o", str(tmp_path / "run"), *sets, "--set", f"backend={backend}"]) == 0
     check_odometry(tmp_path / "run")
+    done, error, closures, warnings, health, *_ = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf"{tmp_path}/run: \d+ steps of {trace} by {backend}, \S+ s, \S+ m by odometry", done)
+    assert re.fullmatch(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", error)
+    assert re.fullmatch("closures: (none|0 of .*)", closures)
+    assert (warnings, health) == ("warnings: none", f"health: input clean; {NO_CLOSURE}")
 
 
 @pytest.mark.soak

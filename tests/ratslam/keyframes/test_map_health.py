@@ -86,6 +86,12 @@ def test_a_map_without_closures_is_odometry_and_not_doubted(graph):
     assert np.isnan(worse_than_odometry(graph, solved_map(graph, log)))
 
 
+def test_closures_of_little_weight_are_closures(graph):
+    found = solution(graph, closed(CLEAN))
+    found.log.weigh(np.full(len(CLEAN), 0.1))
+    assert np.isfinite(worse_than_odometry(graph, found))
+
+
 def test_true_poses_claim_revisits_that_the_views_bear_out(graph):
     claims = claimed_revisits(graph, TRUTH, 300)
     assert claims.examined == len(TRUTH) - GUARD - 1

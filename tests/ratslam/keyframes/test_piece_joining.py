@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.keyframes.acceptance import AcceptByEvidence
+from ratslam.core.backend import NO_CLOSURE
+from ratslam.keyframes.acceptance import AcceptByEvidence, believe
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.keyframes.loop_closures import Candidate
 from ratslam.keyframes.map_health import DOUBTED
+from ratslam.keyframes.optimizer import CalibrationPrior
 from ratslam.keyframes.piece_placement import APART
 from ratslam.keyframes.piece_ties import Tie, no_tie
-from tests.ratslam.keyframes.map_cases import CELL, LAP, drive, new_map, sequence
+from tactile.base.se2 import between, compose
+from tests.ratslam.keyframes.map_cases import BIAS, CELL, LAP, STEP, drive, new_map, sequence
 
 BEGIN = LAP
 RULES = pytest.mark.parametrize(
@@ -87,6 +90,30 @@ def test_odometry_of_a_piece_does_not_count_before_it(rule):
     assert np.allclose(reckoned[BEGIN], (APART * CELL, 0.0, 0.0))
     assert np.allclose(map.trajectory(), reckoned)
     assert map.covariance()[0, 0] < CELL**2 * 100  # of the newest keyframe from the first of its piece
+
+
+@RULES
+@pytest.mark.parametrize("begin", [40, None])
+def test_a_piece_without_an_accepted_closure_is_its_odometry(rule, begin):
+    """To the bit where the map begins with it; also where the views show another bias."""
+    map = drive(new_map(rule), {}, last=40)
+    if begin:
+        map.begin_piece()
+    believe(map.kept_keyframes(), map.log, CalibrationPrior(0.3, 0.01))
+    drive(map, {}, first=40, last=80)
+    motion, path = np.array([STEP, 0.0, 2 * np.pi / LAP - BIAS * STEP]), [np.zeros(3)]
+    for _ in range(79):
+        path.append(compose(path[-1], motion))
+    odometry = np.array(path)
+    for found in (map.trajectory(), map.map_trajectory(), map.online_trajectory()):
+        assert np.array_equal(found[:begin], odometry[:begin])
+        assert np.allclose(between(found[40], found[40:]), between(odometry[40], odometry[40:]))
+    assert np.isnan([map.doubt(), map.final_doubt()]).all()
+    assert map.unjudged() == NO_CLOSURE
+    assert "calibration.yaml" not in map.files()
+    ends = map.edges()
+    poses = map.kept_solution().fit.poses
+    assert np.allclose(between(poses[ends.i], poses[ends.j]), ends.motion)
 
 
 def test_a_map_without_keyframes_begins_with_its_first_one():

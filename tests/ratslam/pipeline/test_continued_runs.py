@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ratslam
 import ratslam.pipeline.runner
 from ratslam.config.run_config import LoopConfig
 from ratslam.core.session import Session
@@ -82,10 +84,10 @@ def compiled() -> Session:
     return build_session(LoopConfig.model_validate(METHOD), first())
 
 
-def run(source: InMemorySource, directory: Path, resume: Path | None = None) -> SavedMap:
+def run(source: InMemorySource, directory: Path, resume: Path | None = None, *warned: str) -> SavedMap:
     config, session = LoopConfig.model_validate(METHOD), compiled()
     session.restart()
-    with open_runner(config, source, directory, resume, session) as runner:
+    with open_runner(config, source, directory, resume, session, warnings=list(warned)) as runner:
         runner.finish(process_source(runner, source))
     return read_map(directory)
 
@@ -101,6 +103,30 @@ def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def expected(monday: Path) -> SavedMap:
     """The map of both recordings, without an interruption."""
     return run(second(), monday.with_name("whole"), monday)
+
+
+def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of readers and of the judge of motion, those of the map first, each once."""
+    told = iter((["a gap"], ["a gap", "a jump"]))
+    found: list[tuple[np.ndarray, np.ndarray, str]] = []
+    monkeypatch.setattr(
+        ratslam.pipeline.runner, "judge_motion", lambda *args: found.append(args) or next(told)
+    )
+    for name, source, resume, wanted in (
+        ("a", first(), None, ["cut off", "a gap"]),
+        ("b", second(), tmp_path / "a", ["cut off", "a gap", "late", "a jump"]),
+    ):
+        run(source, tmp_path / name, resume, *(["cut off", "late"] if resume else ["cut off"]))
+        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
+        assert manifest["input"] == {"verdict": "warned", "warnings": wanted}
+        result = ratslam.Result(tmp_path / name)
+        assert list(result.warnings) == list(result.scorecard.health.warnings) == wanted
+        assert result.health.input == "warned"
+    time, motion, where = found[1]
+    assert where == "tuesday"
+    np.testing.assert_array_equal(time, second().time)
+    np.testing.assert_allclose(motion[:, :3], second().motion[:, :3], atol=1e-12)
+    np.testing.assert_allclose(motion[1:, 3], np.diff(time))
 
 
 def assert_same(found: SavedMap, expected: SavedMap) -> None:

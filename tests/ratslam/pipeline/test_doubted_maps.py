@@ -9,8 +9,9 @@ import pytest
 
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics import run_metrics
-from evaluation.metrics.scorecard import render_health, score_run
+from evaluation.metrics.scorecard import render_health, render_warnings, score_run
 from evaluation.metrics.trajectory import ate
+from ratslam.core.backend import NO_CLOSURE
 from ratslam.experiments.trials.spoilt_maps import Recipe, solved_anew, spoil
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from tactile.base.se2 import integrate
@@ -52,17 +53,32 @@ def test_the_doubt_is_the_same_live_and_in_replay():
     assert len(set(replayed)) > 2
 
 
-@pytest.mark.parametrize(("doubt", "words"), [(0.03, "97% likely no worse"), (0.8, "map_doubted, 80%")])
-def test_the_health_of_a_run_is_told(tmp_path, doubt, words):
+@pytest.mark.parametrize("warnings", [[], ["a wild pose"], [f"gap {k}" for k in range(13)]])
+@pytest.mark.parametrize(
+    ("doubt", "words"),
+    [
+        (0.03, "map 97% likely no worse than odometry"),
+        (0.0, "map 100% likely no worse than odometry"),
+        (0.8, "map_doubted, 80% likely worse than odometry, which is given instead"),
+        (None, NO_CLOSURE),
+    ],
+)
+def test_the_health_of_a_run_is_told(tmp_path, doubt, words, warnings):
+    """Of its input and of its map; a warning does not change the probability."""
     pose = "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
     for name in ("online.tum", "odometry.tum", "truth.tum"):
         (tmp_path / name).write_text(f"0.0 {pose}\n1.0 {pose}\n")
     (tmp_path / "steps.csv").write_text("t,place\n0.0,-1\n1.0,-1\n")
-    assert render_health(score_run(read_run(tmp_path))) == ""
-    (tmp_path / "health.json").write_text(json.dumps({"worse_than_odometry": doubt}))
+    assert render_health(score_run(read_run(tmp_path))).endswith("not judged before the end of the run")
+    (tmp_path / "health.json").write_text(json.dumps({"worse_than_odometry": doubt, "reason": words}))
+    manifest = {"status": "complete", "recording": {"samples": 2}, "continued": False}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"input": {"warnings": warnings}}))
     card = score_run(read_run(tmp_path))
-    assert card.quantities["map_doubt"].value == doubt
-    assert words in render_health(card)
+    assert card.quantities["map_doubt"].value == card.health.worse_than_odometry == doubt
+    count = {0: "clean", 1: "warned (1 warning)", 13: "warned (13 warnings)"}[len(warnings)]
+    assert render_health(card) == f"health: input {count}; {words}"
+    assert len(render_warnings(card)) == min(len(warnings), 11)
+    assert len(set(render_warnings(card))) == len(render_warnings(card))
 
 
 def test_both_sides_doubt_alike():

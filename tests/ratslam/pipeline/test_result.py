@@ -46,8 +46,9 @@ def test_a_result_has_the_parts_of_a_run(result: ratslam.Result) -> None:
     assert np.abs(result.odometry - truth).max() > 0
     assert len(result.graph) == result.scorecard.quantities["experiences"].value
     assert {"x", "y", "heading"} <= set(result.graph.nodes[0])
-    assert np.isnan(result.health.doubt)  # the published method does not judge its map
-    assert not result.health.doubted
+    assert np.isnan(result.health.doubt)
+    assert "no loop closure was accepted" in result.health.reason
+    assert (result.health.input, result.warnings, result.health.doubted) == ("clean", (), False)
     assert not result.interrupted
 
 
@@ -124,7 +125,7 @@ def test_texts_of_the_page_are_escaped(result: ratslam.Result) -> None:
 
 def test_the_page_says_whether_to_believe_the_map(result: ratslam.Result) -> None:
     page = result._repr_html_()
-    assert "<p>The map is not judged. This method does not say" in page
+    assert "<p>This map is the odometry. No loop closure was accepted" in page
     assert "Against the truth, the root mean square position error is" in page
 
 

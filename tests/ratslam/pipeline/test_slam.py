@@ -106,8 +106,7 @@ def test_a_checkpoint_continues_to_the_same_bits(walk: Walk) -> None:
 
 
 def assert_equal(found: ratslam.PoseEstimate, expected: ratslam.PoseEstimate) -> None:
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one, other)
+    np.testing.assert_equal(found, expected)
 
 
 def test_the_source_and_its_observations_give_the_same_steps(walk: Walk) -> None:
