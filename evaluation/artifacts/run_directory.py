@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import read_tum
+from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
 
@@ -79,12 +80,7 @@ def read_scorecard(path: Path) -> Scorecard:
         InputError: it is missing or malformed.
     """
     file = path / "scorecard.json"
-    try:
-        return Scorecard.model_validate_json(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(str(file), "no such file", "the directory of a scored run") from None
-    except ValueError as error:
-        raise InputError(str(file), f"not a scorecard ({error})", "the scorecard.json of a run") from None
+    return read_json(file, "the scorecard.json of a scored run", Scorecard.model_validate)
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
@@ -132,9 +128,7 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
     Raises:
         InputError: the file is missing, or a row has no number in that column.
     """
-    if not path.exists():
-        raise InputError(str(path), "no such file", "a file of a run directory")
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path, "a file of a run directory")
     header, *lines = text[: text.rfind("\n") + 1].splitlines() or [name]
     try:
         column = header.split(",").index(name)
@@ -154,21 +148,23 @@ def _doubt(path: Path) -> float:
     """Probability that the map is worse than odometry; NaN without the file."""
     if not path.exists():
         return np.nan
-    try:
-        return float(json.loads(path.read_text(encoding="utf-8"))["worse_than_odometry"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(str(path), f"malformed ({error})", "the health.json of a run directory") from None
+    expected = "the health.json of a run directory"
+    return read_json(path, expected, lambda content: float(content["worse_than_odometry"]))
 
 
 def _map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [M, 3] and links [L, 2] of a node-link file; empty without the file."""
     if not path.exists():
         return np.zeros((0, 3)), np.zeros((0, 2), int)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        nodes = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
-        links = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
-    except (ValueError, KeyError, TypeError) as error:
-        expected = "the map.json of a run directory"
-        raise InputError(str(path), f"not a node-link map ({error})", expected) from None
-    return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2)
+    return read_json(path, "the map.json of a run directory", _graph)
+
+
+def _graph(content: Any) -> tuple[np.ndarray, np.ndarray]:
+    rows = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
+    pairs = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
+    nodes, links = np.array(rows, float).reshape(-1, 3), np.array(pairs).reshape(-1, 2)
+    if not np.isfinite(nodes).all():
+        raise ValueError("a pose that is not finite")
+    if links.size and (links.dtype.kind != "i" or links.min() < 0 or links.max() >= len(nodes)):
+        raise ValueError("a link to no node")
+    return nodes, links.astype(int)

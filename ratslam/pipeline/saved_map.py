@@ -25,7 +25,6 @@ from ratslam.pipeline.folder_change import unfinished_change
 from ratslam.pipeline.map_archive import (
     EXPECTED,
     FORMAT,
-    SPOILT,
     digest_of,
     read_arrays,
     text_of,
@@ -39,6 +38,7 @@ from robot.sources.source import Source
 from robot.touch_source import TouchSource, open_touch_source
 from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT
 
 NAME = "map.npz"
 """The map file of a run directory."""

@@ -5,6 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 
+def printable(text: str) -> str:
+    """The text in one line, without the control characters that names and cells of files may hold."""
+    if text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(text.split("\n"))
+    )
+
+
+def _short(text: str, most: int = 600) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
+
+
 class InputError(ValueError):
     """Invalid user input. The program prints the error without a traceback and exits with code 2.
 
@@ -20,12 +33,12 @@ class InputError(ValueError):
         self.found = found
         self.expected = expected
         self.cure = cure
-        parts = [f"{where}: {found}" if where else found]
+        parts = [f"{where}: {_short(found)}" if where else _short(found)]
         if expected:
             parts.append(f"expected {expected}")
         if cure:
             parts.append(cure)
-        super().__init__("; ".join(parts))
+        super().__init__(printable("; ".join(parts)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the parts, so that a worker process can return the error."""

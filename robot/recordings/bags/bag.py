@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
+from robot.recordings.bags.expansion import bound_expansion, expand_message
 from robot.sources.input_files import missing_error, require_file, unreadable_error
 from tactile.base.errors import InputError
 
@@ -55,6 +56,7 @@ class Bag:
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError:
             raise InputError("rosbags", "not installed", "", "pip install 'ratslam[ros]'") from None
+        bound_expansion()
         first = files[0].suffix == ".bag"
         with damage_errors(path):
             readers: list[Any] = [rosbag1.Reader(file) for file in files] if first else [rosbag2.Reader(path)]
@@ -210,6 +212,4 @@ def _plain(raw: Any) -> bytes:
     content = bytes(raw)
     if content[:4] != ZSTD:
         return content
-    import zstandard
-
-    return zstandard.ZstdDecompressor().decompressobj().decompress(content)
+    return expand_message(content)
