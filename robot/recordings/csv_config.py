@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat
 
-from tactile.base.config import Settings
+from tactile.base.config import Settings, Side
 from tactile.whiskers.head_geometry import Degrees
 
 
@@ -136,9 +136,9 @@ class CsvConfig(Settings):
     """Odometry as velocities."""
     motion: MotionColumns | None = None
     """Odometry as motions."""
-    rows: int = Field(default=3, gt=0)
+    rows: Side = 3
     """R, rows of a view, also of the masked view of a recording with labels only."""
-    columns: int = Field(default=6, gt=0)
+    columns: Side = 6
     """C, columns of a view."""
     views: ViewColumns | None = None
     """Views, if any."""

@@ -20,6 +20,8 @@ T = TypeVar("T")
 MOST_BYTES, MOST_TIMES = 1 << 28, 32
 """What is compressed, or said to be large in a header, may expand to so many bytes, or to so many times the
 bytes that are stored, whichever is more. 256 MiB leave room for copies in 2 GB of memory."""
+MOST_PIXELS = 1 << 26
+"""Most values of all views of a recording; 512 MiB as float64."""
 MOST_TEXT = 1 << 26
 """Most bytes of a text file, of which lists of numbers take 20 times as much memory."""
 SPOILT = (

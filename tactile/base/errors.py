@@ -33,7 +33,8 @@ class InputError(ValueError):
         self.found = found
         self.expected = expected
         self.cure = cure
-        parts = [f"{where}: {_short(found)}" if where else _short(found)]
+        found = _short(printable(found))
+        parts = [f"{where}: {found}" if where else found]
         if expected:
             parts.append(f"expected {expected}")
         if cure:

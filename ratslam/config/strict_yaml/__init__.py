@@ -6,6 +6,7 @@ import copy
 import json
 import os
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,10 @@ from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=Settings)
 
+SMALLEST, LARGEST = 1e-30, 1e15
+"""Magnitudes of numbers other than 0; squares and quotients of others overflow."""
+MOST = 2**31 - 1
+"""Largest integer but seeds: counts of steps and cells are 32 bits wide."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
@@ -113,11 +118,24 @@ def validate(document: Document, model: type[Model]) -> Model:
     Raises:
         InputErrors: all errors in it, each with its place.
     """
+    if errors := [error for path in document.places for error in _beyond_measure(document, path)]:
+        raise InputErrors(errors)
     try:
         # As JSON: pydantic is then strict, but accepts lists for tuples and texts for paths.
         return model.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
         raise InputErrors(input_errors(error, model, document)) from None
+
+
+def _beyond_measure(document: Document, path: KeyPath) -> list[InputError]:
+    value = document.value(path)
+    if isinstance(value, float) and 0 < abs(value) < inf and not SMALLEST <= abs(value) <= LARGEST:
+        expected = f"0, or a number of {SMALLEST:g} to {LARGEST:g}"
+    elif isinstance(value, int) and abs(value) > MOST and path[-1:] != ("seed",):
+        expected = f"at most {MOST}"
+    else:
+        return []
+    return [InputError(document.at_value(path), describe(value), expected)]
 
 
 def dump(model: BaseModel) -> str:

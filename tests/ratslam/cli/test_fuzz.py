@@ -5,8 +5,10 @@ No traceback, no minute without a word, no more than 2 GB, no wrong map without 
 
 from __future__ import annotations
 
+import io
 import re
 import shutil
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace as altered
 from pathlib import Path
@@ -267,3 +269,74 @@ def other_folders(worker: CommandWorker, square: Path, folder: Path) -> list[Pat
         done = worker.run(folder, *command, long=300.0)
         assert done.code == 0, done.said
     return [folder / str(command[-1]) for command in commands]
+
+
+def bomb(folder: Path, name: str) -> Path:
+    """A file that is small and expands to much, or nests deeply."""
+    path = folder / name
+    match path.suffix:
+        case ".npz":
+            with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+                for member in ("in_t", "in_v", "in_w", "in_flags", "in_view", "params_json"):
+                    shape = (2**70,) if name == "long.npz" else (2**26,)
+                    header = io.BytesIO()
+                    np.lib.format.write_array_header_1_0(
+                        header, {"descr": "<f8", "fortran_order": False, "shape": shape}
+                    )
+                    with archive.open(f"{member}.npy", "w") as file:
+                        file.write(header.getvalue())
+                        for _ in range(0 if name == "long.npz" else 2**26 * 8 >> 24):
+                            file.write(bytes(1 << 24))
+        case ".json":
+            path.write_text("[" * 200_000)
+        case ".yaml":
+            levels = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 30)]
+            path.write_text("a0: &a0 [1]\n" + "\n".join(levels) + "\nbackend: *a29\n")
+        case ".csv":
+            path.write_text(
+                "t,id,x,y,theta\n" + "".join(f"{k},{k},0,0,0\n" for k in range(9)) + "9,1e20,0,0,0\n"
+            )
+    return path
+
+
+SQUARE = str(ROOT / "configs" / "square.yaml")
+TOO_LARGE: dict[str, tuple[list[str], int, str]] = {
+    "npz": (["doctor", "bomb.npz"], 2, "256 MiB, or 32 times what is stored"),
+    "npz run": (["run", SQUARE, "--set", "recording.file={}/bomb.npz", "-o", "run"], 2, "256 MiB, or 32 times what is stored"),
+    "shape": (["doctor", "long.npz"], 2, "is not a plain array"),
+    "ids": (["score", "ids.csv"], 2, "ids.csv:11: experience id 1e+20"),
+    "yaml": (["run", "bomb.yaml"], 2, "anchor"),
+    "reserve": (["run", SQUARE, "--set", "session.reserve=4194304", "-o", "run"], 2, "524288"),
+    "network": (
+        ["run", SQUARE, "--set", "pose_cells.cells_xy=1001", "--set", "pose_cells.cells_heading=720", "-o", "run"], 2, "1024 MiB",
+    ),
+    "particles": (
+        ["run", "create_arena", "--set", "grid.particles=1000000", "-o", "run"], 2, "fewer particles",
+    ),
+}  # fmt: skip
+"""Command, exit code and words of what is refused because it is too large."""
+
+
+@pytest.mark.parametrize(("command", "code", "words"), TOO_LARGE.values(), ids=TOO_LARGE.keys())
+def test_what_is_too_large_is_refused(
+    command: list[str], code: int, words: str, worker: CommandWorker, tmp_path: Path
+) -> None:
+    for part in command:
+        if part.rpartition("/")[2] in ("bomb.npz", "long.npz", "ids.csv", "bomb.yaml"):
+            bomb(tmp_path, part.rpartition("/")[2])
+    there = set(tmp_path.rglob("*"))
+    done = worker.run(tmp_path, *(part.replace("{}", str(tmp_path)) for part in command))
+    assert done.code == code, done.said
+    assert words in done.said, done.said
+    assert not faults(done, tmp_path, there)
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "map.json", "scorecard.json"])
+def test_a_run_folder_with_a_bomb_is_refused_or_shown(
+    name: str, worker: CommandWorker, square: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(square, tmp_path / "run"))
+    bomb(run, name)
+    for command in (["report", "run", "-o", "r.html"], ["doctor", "run"], ["export", "run", "-o", "x.json"]):
+        there = set(tmp_path.rglob("*"))
+        assert not faults(worker.run(tmp_path, *command), tmp_path, there)
