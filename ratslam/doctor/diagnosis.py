@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from tactile.base.errors import printable
+
 
 class Diagnosis(NamedTuple):
     """What was found.
@@ -33,4 +35,4 @@ def render(diagnosis: Diagnosis) -> str:
             )
     for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
         lines += [f"{mark}{text}" for text in texts]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))

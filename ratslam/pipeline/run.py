@@ -21,7 +21,7 @@ from ratslam.pipeline.runner import Runner, open_runner
 from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
 from robot.sources.source import Source
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, printable
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
@@ -141,4 +141,4 @@ def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
 
 def print_status(sentence: str) -> None:
     """Prints one sentence about the progress."""
-    print(f"ratslam: {sentence}", file=sys.stderr)
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr)
