@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from tactile.base.errors import InputError
+from tactile.base.bounded import read_rows
 
 NAME = "changes.csv"
 COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
@@ -56,17 +56,12 @@ def read_changes(path: Path) -> list[ChangeRow]:
     Raises:
         InputError: a line is malformed.
     """
-    rows = []
-    with path.open(encoding="utf-8", newline="") as file:
-        for number, line in enumerate(csv.DictReader(file), start=2):
-            try:
-                x, y, extent, evidence, alarms = (float(line[name]) for name in NUMBERS)
-                passes, first, last = (int(line[name]) for name in ("passes", "first_step", "last_step"))
-                kind = str(line["kind"])
-            except (KeyError, TypeError, ValueError):
-                expected = f"the columns {', '.join(COLUMNS)}"
-                raise InputError(f"{path}:{number}", "a malformed change", expected) from None
-            if not np.isfinite([x, y, extent, evidence, alarms]).all():
-                raise InputError(f"{path}:{number}", "a number that is not finite", "finite numbers")
-            rows.append(ChangeRow(x, y, extent, kind, evidence, alarms, passes, first, last))
-    return rows
+    return read_rows(path, f"the columns {', '.join(COLUMNS)}", _parse)
+
+
+def _parse(line: Mapping[str, str]) -> ChangeRow:
+    x, y, extent, evidence, alarms = (float(line[name]) for name in NUMBERS)
+    if not np.isfinite([x, y, extent, evidence, alarms]).all():
+        raise ValueError("a number that is not finite")
+    passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
+    return ChangeRow(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)

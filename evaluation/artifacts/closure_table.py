@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.artifacts.run_directory import first_step
-from tactile.base.errors import InputError
+from tactile.base.bounded import read_rows
 
 ACCEPTED = "accepted"
 """Verdict on the closures of the map."""
@@ -46,21 +45,18 @@ def read_closure_table(directory: Path) -> ClosureTable:
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
-    steps, verdicts, numbers = [], [], []
-    with file.open(encoding="utf-8", newline="") as lines:
-        reader = csv.DictReader(lines)
-        names = [name for name in reader.fieldnames or () if name not in KEYS]
-        for row in reader:
-            try:
-                steps.append([int(row["match_step"]), int(row["step"])])
-                verdicts.append(str(row["verdict"]))
-                numbers.append([float(row[name]) for name in names])
-            except (KeyError, TypeError, ValueError):
-                expected = "the columns step, match_step, verdict, and numbers in all others"
-                raise InputError(f"{file}:{reader.line_num}", "a malformed closure", expected) from None
-    columns = np.array(numbers, float).reshape(len(steps), len(names)).T
+    expected = "the columns step, match_step, verdict, and numbers in all others"
+    rows = read_rows(file, expected, _parse)
+    names = list(rows[0][2]) if rows else []
+    steps, verdicts, evidence = zip(*rows, strict=True) if rows else ((), (), ())
+    columns = np.array([list(cells.values()) for cells in evidence], float).reshape(len(rows), len(names)).T
     counted = np.array(steps, int).reshape(-1, 2) - first_step(directory)
-    return ClosureTable(counted, verdicts, dict(zip(names, columns, strict=True)))
+    return ClosureTable(counted, list(verdicts), dict(zip(names, columns, strict=True)))
+
+
+def _parse(row: Mapping[str, str]) -> tuple[list[int], str, dict[str, float]]:
+    steps = [int(np.int32(row[name])) for name in ("match_step", "step")]
+    return steps, str(row["verdict"]), {name: float(row[name]) for name in row if name not in KEYS}
 
 
 def read_closures(directory: Path) -> np.ndarray:

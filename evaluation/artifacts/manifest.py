@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import fcntl
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from tactile.base.errors import InputError
+from tactile.base.bounded import read_json
 
 SESSION_REPORT = "live.json"
 """Report of a live session, written when it has ended."""
@@ -46,25 +45,25 @@ def read_manifest(directory: Path) -> Manifest:
         InputError: the file, or the report of a live session, is malformed.
     """
     file = directory / "manifest.json"
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        recording, versions = content["recording"], content.get("versions", {})
-        found = Manifest(
-            status=str(content["status"]),
-            source=str(recording.get("name", "")),
-            total=None if content["continued"] else recording["samples"],
-            seed=content.get("seeds", {}).get("session"),
-            versions={str(name): str(version) for name, version in versions.items()},
-            continued=bool(content["continued"]),
-            killed=content["status"] == RUNNING and _is_left(directory / "steps.csv"),
-            digest=str(recording.get("sha256", "")),
-            warnings=tuple(map(str, content.get("input", {}).get("warnings", ()))),
-        )
-    except FileNotFoundError:
-        found = Manifest()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(str(file), f"not a manifest ({error})", "the manifest of a run") from None
+    found = read_json(file, "the manifest of a run", _parse) if file.exists() else Manifest()
+    if found.status == RUNNING:
+        found = found._replace(killed=file.exists() and _is_left(directory / "steps.csv"))
     return found._replace(status=_session_outcome(directory)) if found.status == RUNNING else found
+
+
+def _parse(content: Any) -> Manifest:
+    recording, versions, seed = content["recording"], content.get("versions", {}), content.get("seeds", {})
+    total = None if content["continued"] else recording["samples"]
+    return Manifest(
+        status=str(content["status"]),
+        source=str(recording.get("name", "")),
+        total=None if total is None else int(total),
+        seed=None if seed.get("session") is None else int(seed["session"]),
+        versions={str(name): str(version) for name, version in versions.items()},
+        continued=bool(content["continued"]),
+        digest=str(recording.get("sha256", "")),
+        warnings=tuple(map(str, content.get("input", {}).get("warnings", ()))),
+    )
 
 
 def _is_left(file: Path) -> bool:
@@ -82,9 +81,6 @@ def _is_left(file: Path) -> bool:
 def _session_outcome(directory: Path) -> str:
     """The outcome in the report of a live session; `running` without a report."""
     file = directory / SESSION_REPORT
-    try:
-        return str(json.loads(file.read_text(encoding="utf-8"))["outcome"])
-    except FileNotFoundError:
+    if not file.exists():
         return RUNNING
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(str(file), f"not a report ({error})", "the report of a live session") from None
+    return read_json(file, "the report of a live session", lambda content: str(content["outcome"]))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError
 
 NAME = "merge.json"
@@ -28,8 +28,5 @@ def read_session_steps(folder: Path) -> list[int]:
     Raises:
         InputError: merge.json is missing or malformed.
     """
-    file = folder / NAME
-    try:
-        return [int(count) for count in json.loads(file.read_text(encoding="utf-8"))["steps"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(str(file), f"malformed ({error})", f"the {NAME} of a merged map") from None
+    expected = f"the {NAME} of a merged map"
+    return read_json(folder / NAME, expected, lambda content: [int(count) for count in content["steps"]])

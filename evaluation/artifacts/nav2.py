@@ -17,6 +17,7 @@ import yaml
 
 from evaluation.metrics.occupancy_grid import OccupancyGrid, check_grid
 from tactile.base.atomic_write import write_atomically, write_text_atomically
+from tactile.base.bounded import read_plain_yaml
 from tactile.base.errors import InputError
 
 FREE_THRESH, OCCUPIED_THRESH = 0.19, 0.65
@@ -63,7 +64,7 @@ def read_nav2(path: str | Path) -> Nav2Map:
         InputError: a file or a key is missing or invalid.
     """
     path = Path(path)
-    given = _description(path)
+    given = read_plain_yaml(path, "the map.yaml of a map_server")
     keys = ("resolution", "free_thresh", "occupied_thresh")
     resolution, free, occupied = (_value(path, given, key) for key in keys)
     origin = given.get("origin")
@@ -90,16 +91,6 @@ def read_nav2(path: str | Path) -> Nav2Map:
 def _number(value: float) -> str:
     """All digits without an exponent, since some YAML readers take 1e-05 as a string."""
     return np.format_float_positional(float(value), trim="0")
-
-
-def _description(path: Path) -> dict[str, Any]:
-    try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "the map.yaml of a map_server") from None
-    if not isinstance(given, dict):
-        raise InputError(str(path), "not a mapping", "the map.yaml of a map_server")
-    return given
 
 
 def _value(path: Path, given: dict[str, Any], key: str) -> float:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from evaluation.artifacts.manifest import SESSION_REPORT as SESSION_REPORT
 from evaluation.artifacts.manifest import read_manifest
@@ -17,6 +16,7 @@ from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import read_tum
+from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
 
@@ -102,13 +102,7 @@ def read_scorecard(path: Path) -> Scorecard:
         InputError: it is missing or malformed.
     """
     file = path / "scorecard.json"
-    try:
-        return Scorecard.model_validate_json(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(str(file), "no such file", "the directory of a scored run") from None
-    except ValueError as error:
-        cause = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-        raise InputError(str(file), f"not a scorecard ({cause})", "the scorecard.json of a run") from None
+    return read_json(file, "the scorecard.json of a scored run", Scorecard.model_validate)
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
@@ -138,10 +132,8 @@ def first_step(path: Path) -> int:
 
     Manifests of earlier versions do not tell it; the map of a run that has ended does.
     """
-    with suppress(OSError, ValueError, TypeError, AttributeError):
-        told = json.loads((path / "manifest.json").read_text(encoding="utf-8")).get("first_step")
-        if isinstance(told, int):
-            return told
+    with suppress(InputError):
+        return read_json(path / "manifest.json", "a manifest", lambda content: int(content["first_step"]))
     saved = checkpoint_steps(path)
     return max(0, saved - len(_tum(path / "online.tum")[0])) if saved else 0
 
@@ -163,9 +155,7 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
     Raises:
         InputError: the file is missing, or a row has no number in that column.
     """
-    if not path.exists():
-        raise InputError(str(path), "no such file", "a file of a run directory")
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path, "a file of a run directory")
     header, *lines = text[: text.rfind("\n") + 1].splitlines() or [name]
     try:
         column = header.split(",").index(name)
@@ -186,22 +176,20 @@ def _doubt(folder: Path) -> tuple[float, str]:
     path = folder / "health.json"
     if not path.exists():
         return np.nan, NOT_JUDGED if (folder / "trajectory.tum").exists() else UNFINISHED
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        doubt = content["worse_than_odometry"]
-        return (np.nan, str(content["reason"])) if doubt is None else (float(doubt), "")
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(str(path), f"malformed ({error})", "the health.json of a run directory") from None
+    return read_json(path, "the health.json of a run directory", _health)
+
+
+def _health(content: Any) -> tuple[float, str]:
+    doubt = content["worse_than_odometry"]
+    return (np.nan, str(content["reason"])) if doubt is None else (float(doubt), "")
 
 
 def _states(path: Path, steps: int) -> np.ndarray:
     """[N] the state of each step of a localised session; empty without the file."""
     if not path.exists():
         return np.zeros(0, str)
-    try:
-        states = [line.split(",")[1] for line in path.read_text(encoding="utf-8").splitlines()[1 : steps + 1]]
-    except IndexError:
-        states = []
+    lines = read_text(path, "the states of a session").splitlines()[1 : steps + 1]
+    states = [cells[1] for cells in (line.split(",") for line in lines) if len(cells) > 1]
     if len(states) < steps:
         raise InputError(str(path), "not a state for each step", f"{steps} lines step,state,...")
     return np.array(states, str)
@@ -211,12 +199,16 @@ def _map(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes [M, 3], links [L, 2] and pieces [M] of a node-link file; empty without the file."""
     if not path.exists():
         return np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0, int)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        nodes = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
-        piece = np.array([node.get("piece", 0) for node in content["nodes"]], int)
-        links = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
-    except (ValueError, KeyError, TypeError) as error:
-        expected = "the map.json of a run directory"
-        raise InputError(str(path), f"not a node-link map ({error})", expected) from None
-    return np.array(nodes, float).reshape(-1, 3), np.array(links, int).reshape(-1, 2), piece
+    return read_json(path, "the map.json of a run directory", _graph)
+
+
+def _graph(content: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
+    piece = np.array([node.get("piece", 0) for node in content["nodes"]], int)
+    pairs = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]
+    nodes, links = np.array(rows, float).reshape(-1, 3), np.array(pairs).reshape(-1, 2)
+    if not np.isfinite(nodes).all():
+        raise ValueError("a pose that is not finite")
+    if links.size and (links.dtype.kind != "i" or links.min() < 0 or links.max() >= len(nodes)):
+        raise ValueError("a link to no node")
+    return nodes, links.astype(int), piece

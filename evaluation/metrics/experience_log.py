@@ -47,10 +47,10 @@ def read_experience_log(path: str | Path) -> ExperienceLog:
     """
     table = read_text_table(path, _COLUMNS)
     time, experience, x, y, theta = table.values.T
-    broken = np.flatnonzero(experience != np.round(experience))
+    broken = np.flatnonzero((experience != np.round(experience)) | (np.abs(experience) > 2**53))
     if len(broken):
-        where, found = f"{path}:{table.line[broken[0]]}", f"experience id {experience[broken[0]]}"
-        raise InputError(where, found, "a whole number, -1 for none")
+        where, found = f"{path}:{table.line[broken[0]]}", f"experience id {experience[broken[0]]:g}"
+        raise InputError(where, found, "a whole number of at most 2^53, -1 for none")
     return ExperienceLog(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
 
 

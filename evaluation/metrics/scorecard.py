@@ -22,6 +22,7 @@ from evaluation.metrics.run_metrics import (
     run_data,
 )
 from tactile.base.config import Settings
+from tactile.base.errors import printable
 
 REGISTERED = "Registered metrics"
 """Heading of the metrics that are not ours."""
@@ -134,7 +135,7 @@ def scorecard_lines(card: Scorecard) -> dict[str, list[Line]]:
 def render_scorecard(card: Scorecard) -> str:
     """The scorecard as a text table: quantity, value, unit, value of odometry, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
-    lines = [f"{card.name:<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
+    lines = [f"{printable(card.name):<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
     for section, shown in scorecard_lines(card).items():
         lines += ["", section]
         for label, value, unit, odometry, note in shown:

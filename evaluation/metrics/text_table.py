@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import chain
 from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
 
 LONGEST = 80
@@ -35,14 +37,14 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
         InputError: the file cannot be read, lacks a column or has a malformed row (with file and line).
     """
     lines = _lines(path)
-    if not lines:
+    first, fields, ended = next(lines, (1, [], False))
+    if not fields:
         raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
-    first, fields, _ = lines[0]
     header = _numbers(fields) is None
     names = [name.lower() for name in fields] if header else list(columns)
     where = _places(f"{path}:{first}", names, columns)
     rows, at = [], []
-    for number, cells, whole in lines[header:]:
+    for number, cells, whole in lines if header else chain([(first, fields, ended)], lines):
         row = _numbers(cells)
         if row is not None and len(row) == len(names) and all(map(isfinite, row)):
             rows.append([row[place] for place in where])
@@ -55,20 +57,12 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     return TextTable(np.array(rows), np.array(at))
 
 
-def _lines(path: str | Path) -> list[tuple[int, list[str], bool]]:
+def _lines(path: str | Path) -> Iterator[tuple[int, list[str], bool]]:
     """Line number, fields, and whether the line ends with a newline."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            str(path), f"cannot be read ({getattr(error, 'strerror', error)})", "a text file of numbers"
-        ) from error
-    lines = text.split("\n")
-    return [
-        (number, _cells(line), number < len(lines))
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = read_text(path, "a text file of numbers").split("\n")
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, _cells(line), number < len(lines)
 
 
 def _cells(line: str) -> list[str]:

@@ -24,6 +24,7 @@ from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
 from evaluation.plots.map_plot import align_layers, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
+from tactile.base.bounded import read_json
 from tactile.base.se2 import between
 
 if TYPE_CHECKING:
@@ -87,6 +88,6 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     if run.truth is None or not (directory / "arena.npz").exists():
         return GridPanel(directory.name, "", grid)
     truth, start = read_grid_truth(directory / "arena.npz")
-    score = GridScore.model_validate_json((directory / "gridscore.json").read_text(encoding="utf-8"))
+    score = read_json(directory / "gridscore.json", "the scores of a grid", GridScore.model_validate)
     paths = GridPaths(between(start, run.truth), run.online, run.odometry)
     return GridPanel(directory.name, grid_headline(score), grid, truth.segments, paths)

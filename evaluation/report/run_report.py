@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import yaml
 
 from evaluation.artifacts.closure_table import ClosureTable, read_closure_table
 from evaluation.artifacts.closure_views import ClosureViews, read_closure_views
@@ -29,6 +28,8 @@ from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers, align_layers
 from evaluation.report.run_files import RunFile, list_run_files
 from evaluation.report.verdict import Verdict, judge_map
+from tactile.base.bounded import read_json, read_plain_yaml
+from tactile.base.errors import InputError
 from tactile.base.se2 import between
 
 SOURCES = {
@@ -146,12 +147,13 @@ def describe_status(report: RunReport) -> str:
 def _method(directory: Path) -> dict[str, str]:
     """Backend and kind of source by the configuration."""
     try:
-        content = yaml.safe_load((directory / "config.yaml").read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        content = None
-    given: Mapping[str, Any] = content if isinstance(content, dict) else {}
-    source = next((words for name, words in SOURCES.items() if given.get(name) is not None), "")
-    return {"backend": str(given.get("backend", "")), "source": source}
+        given = read_plain_yaml(directory / "config.yaml", "the configuration of a run")
+    except InputError:
+        given = {}
+    source, backend = next((words for name, words in SOURCES.items() if given.get(name) is not None), ""), ""
+    if isinstance(given.get("backend"), str):
+        backend = given["backend"]
+    return {"backend": backend, "source": source}
 
 
 def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, OccupancyGrid | None]:
@@ -197,4 +199,4 @@ def _cost(directory: Path) -> Series:
 
 
 def _grid_score(file: Path) -> GridScore | None:
-    return GridScore.model_validate_json(file.read_text(encoding="utf-8")) if file.exists() else None
+    return read_json(file, "the scores of a grid", GridScore.model_validate) if file.exists() else None

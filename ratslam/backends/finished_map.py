@@ -6,12 +6,12 @@ import zipfile
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from ratslam.backends.config import LocaliseConfig
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import with_prefix
+from tactile.base.bounded import reason
 from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT, read_arrays
 
 FinishedMap = TypeVar("FinishedMap", bound=Map)
 
@@ -41,12 +41,16 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
         cure = "put it back, or set localise.map to where it is"
         raise InputError(str(path), found, "the map in which the session is localised", cure)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name.startswith("map/")}
-        made.restore(with_prefix(arrays, "map/"))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if name.startswith("map/")]
+            arrays = read_arrays(archive, names, str(path))
+        known = dict(zip([name.removesuffix(".npy") for name in names], arrays, strict=True))
+        made.restore(with_prefix(known, "map/"))
+    except InputError:
+        raise
+    except SPOILT as error:
         expected = f"a map made by `backend: {method}` with the same settings"
-        raise InputError(str(path), str(error) or type(error).__name__, expected) from None
+        raise InputError(str(path), reason(error), expected) from None
     if not len(made.trajectory()):
         raise InputError(str(path), "a map without steps", "a map in which a session can be found")
     return made

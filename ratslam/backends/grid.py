@@ -40,6 +40,8 @@ LIVE_SIDE = 2.5
 """Default side length of the map, m (Fox et al. 2012, II-D)."""
 MAX_CELLS = 2**31 - 1
 """Largest number of cells of all maps together: they are indexed in int32."""
+MAX_WINDOW_CELLS = 1 << 27
+"""Largest number of cells that the footprints of a step cover, a few of which arrays hold at a time."""
 
 
 class GridOutcome(IntEnum):
@@ -298,7 +300,16 @@ class GridBackend(Backend):
         return particle_maps.write_window(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
-        """Side length, cells, of a window that reaches `reach` m in every direction."""
+        """Side length, cells, of a window that reaches `reach` m in every direction.
+
+        Raises:
+            InputError: the windows of all particles and whiskers would have too many cells.
+        """
+        cells = self.config.particles * max(1, self.whiskers) * (2 * reach / self.config.cell + 3) ** 2
+        if not cells <= MAX_WINDOW_CELLS:
+            found = f"footprints that reach {reach:g} m, in cells of {self.config.cell:g} m"
+            expected = f"{MAX_WINDOW_CELLS:.3g} cells around all whiskers of all particles"
+            raise InputError("grid", found, expected, "smaller footprints, coarser cells or fewer particles")
         return 2 * int(np.ceil(reach / self.config.cell)) + 2
 
     def _in_cells(self, pose: Array, points: Array) -> Array:
@@ -321,7 +332,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
             "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
         )
     side = config.side or LIVE_SIDE
-    if config.particles * particle_maps.LAYERS * int(np.ceil(side / config.cell)) ** 2 > MAX_CELLS:
+    if config.particles * particle_maps.LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
         raise InputError(
             "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"

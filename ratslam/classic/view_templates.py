@@ -27,7 +27,7 @@ class TemplateConfig(Settings):
     """`views`: compare images; `labels`: use the place ids of the recording."""
     threshold: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Largest mean absolute difference of a match, in units of a view's values (0..1)."""
-    shift: NonNegativeInt = 0
+    shift: Annotated[int, Field(ge=0, le=4096)] = 0
     """Largest shift of a view in either direction, columns."""
     shift_step: PositiveInt = 1
     """Step between shifts, columns."""
@@ -38,7 +38,7 @@ class TemplateConfig(Settings):
     """Columns form a ring: all shifts are compared and `shift` is ignored."""
     normalise_mean: NonNegativeFloat = 0.0
     """Mean to which camera views are scaled; 0: not scaled."""
-    patch: NonNegativeInt = 0
+    patch: Annotated[int, Field(ge=0, le=4096)] = 0
     """Half width of the (2 patch + 1)^2 values whose mean and deviation normalise each value; 0: none."""
     patch_sd: NonNegativeFloat = 0.0
     """Standard deviation below which a patch is uniform and becomes 0.5."""

@@ -39,7 +39,7 @@ class SessionConfig(Settings):
     """Floating-point type of the kernel."""
     seed: NonNegativeInt = 0
     """Seed of all random streams."""
-    reserve: Annotated[int, Field(ge=0, le=2**24)] = 0
+    reserve: Annotated[int, Field(ge=0, le=2**19)] = 0
     """Steps to allocate memory for at the start. 0: those of a source of known length of at most 4096 steps;
     for others memory grows as needed, and each power of two compiles the kernel again."""
 

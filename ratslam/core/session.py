@@ -23,10 +23,13 @@ from ratslam.core.checkpoint import with_prefix
 from ratslam.core.packing import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.precision import Precision, check_precision
 from ratslam.core.types import Estimate
+from tactile.base.errors import InputError
 from tactile.base.types import Observation
 
 CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
+MOST_STATE = 1 << 30
+"""Largest state of a new session, bytes."""
 UNKNOWN = -1
 """`Session.earlier` of a checkpoint that does not tell it."""
 
@@ -86,6 +89,7 @@ class Session:
             of these came before the present recording (`begin_recording`), or `UNKNOWN`.
 
     Raises:
+        InputError: the state would take more than `MOST_STATE`.
         ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
     """
 
@@ -106,14 +110,24 @@ class Session:
         self._init = jax.jit(backend.init, static_argnums=1)
         run = run_chunk if probe is None else partial(run_probed_chunk, probe)
         self._run_chunk = jax.jit(partial(run, backend.kernel), donate_argnums=0)
+        self._check_memory()
         self.restart(seed)
 
     def restart(self, seed: int = 0) -> None:
         """Goes back to the start with an empty map; the compiled functions are kept."""
-        self.map: Map = self.backend.new_map()
         self.steps = self.earlier = 0
         self._capacity = capacity_at(0, self.reserve)
+        self.map: Map = self.backend.new_map()
         self.state = self._init(jax.random.key(seed), self._capacity)
+
+    def _check_memory(self) -> None:
+        capacity = capacity_at(0, self.reserve)
+        state = jax.eval_shape(lambda key: self.backend.init(key, capacity), jax.random.key(0))
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+        if size > MOST_STATE:
+            found = f"a state of {size >> 20} MiB, with rows for {capacity} steps"
+            cure = "fewer cells or particles, smaller views, or a smaller session.reserve"
+            raise InputError("session", found, f"at most {MOST_STATE >> 20} MiB at the start", cure)
 
     def step(self, observation: Observation) -> Step:
         """Folds one observation, live."""

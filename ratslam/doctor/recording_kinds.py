@@ -107,16 +107,10 @@ def _csv(path: Path) -> FileContents:
 
 
 def _npz(path: Path) -> FileContents:
-    with np.load(path, allow_pickle=False) as arrays:
-        rows = (
-            ("array", "shape"),
-            *(
-                (name, " x ".join(map(str, arrays[name].shape)))
-                for name in arrays.files
-                if name.startswith(("in_", "truth"))
-            ),
-        )
-    return FileContents(f"{path}: arrays of a reference trace", {}, rows)
+    from robot.recordings.npz_trace import array_shapes
+
+    shapes = [(name, " x ".join(map(str, shape))) for name, shape in array_shapes(path).items() if shape]
+    return FileContents(f"{path}: arrays of a reference trace", {}, (("array", "shape"), *shapes))
 
 
 def _mcap(path: Path) -> FileContents:

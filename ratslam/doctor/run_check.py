@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from evaluation.report.verdict import CAUTION, judge_map
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.pose_graph.io import read_json
+from tactile.base.bounded import read_rows
 from tactile.base.se2 import between
 
 SAME = 0.99
@@ -84,12 +84,9 @@ def error_notes(run: RunArrays) -> list[str]:
 
 def count_outcomes(path: Path) -> Counter[str]:
     """Number of steps by outcome, and of those that were lost."""
-    counts: Counter[str] = Counter()
-    with (path / "steps.csv").open(encoding="utf-8", newline="") as lines:
-        for row in csv.DictReader(lines):
-            counts[row["outcome"] or "ok"] += 1
-            counts["lost"] += row["lost"] == "1"
-    return counts
+    parse = lambda row: (row["outcome"] or "ok", row["lost"] == "1")  # noqa: E731
+    rows = read_rows(path / "steps.csv", "the columns outcome and lost", parse)
+    return Counter(outcome for outcome, _ in rows) + Counter(lost=sum(lost for _, lost in rows))
 
 
 def count_pieces(path: Path) -> int:

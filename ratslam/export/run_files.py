@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import align
 from ratslam.config.run_config import load_config
 from ratslam.pipeline.source import open_observations, read_observations
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, inverse
 
@@ -116,9 +116,13 @@ def _recorded_views(directory: Path, time: np.ndarray) -> Iterator[tuple[int, np
     config = load_config(directory / "config.yaml")
     if config.recording is None:
         return
-    manifest = json.loads((directory / "manifest.json").read_text(encoding="utf-8"))
+    digest = read_json(
+        directory / "manifest.json",
+        "the manifest of a run",
+        lambda content: str(content["recording"]["sha256"]),
+    )
     with open_observations(config) as (_, source):
-        if source.digest != manifest["recording"]["sha256"]:
+        if source.digest != digest:
             cure = "the views are those of another recording"
             raise InputError(source.name, "changed since the run", "the recording of the run", cure)
         step = 0

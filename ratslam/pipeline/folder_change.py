@@ -13,8 +13,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 from tactile.base.atomic_write import errors_of, flush_to_disk, write_text_atomically
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError, InputErrors
 
 READY = ".change"
@@ -63,9 +65,27 @@ def change_folder(folder: Path, what: str, last: str, change: Callable[[Path], N
 def unfinished_change(folder: Path) -> str | None:
     """The name of a complete change that was killed before all its files were in place; None without one."""
     try:
-        return json.loads((folder / READY / RECORD).read_text(encoding="utf-8"))["what"]
-    except OSError:  # no record, or no folder that can be read
+        if not (folder / READY / RECORD).is_file():
+            return None
+    except OSError:  # no folder that can be read
         return None
+    return _read_record(folder)["what"]
+
+
+def _read_record(folder: Path) -> dict[str, Any]:
+    """What is to be done: its name, files to remove, and the file to put in place last.
+
+    Raises:
+        InputError: the record is damaged, or names files elsewhere.
+    """
+
+    def parse(content: Any) -> dict[str, Any]:
+        removed, last = [str(name) for name in content["removed"]], str(content["last"])
+        if any(Path(name).name != name for name in removed):
+            raise ValueError("files of another folder")
+        return {"what": str(content["what"]), "removed": removed, "last": last}
+
+    return read_json(folder / READY / RECORD, "the record of a change of this folder", parse)
 
 
 def finish_change(folder: Path) -> None:
@@ -83,7 +103,7 @@ def _put_in_place(folder: Path) -> None:
         InputError: a file cannot be put in place.
     """
     ready = folder / READY
-    record = json.loads((ready / RECORD).read_text(encoding="utf-8"))
+    record = _read_record(folder)
     new = sorted((ready / FILES).glob("*/*"), key=lambda file: (file.name == record["last"], file.name))
     try:
         for name in record["removed"]:

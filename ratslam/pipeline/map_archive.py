@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import stat
-import struct
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile.base import npz
 from tactile.base.atomic_write import flush_to_disk
+from tactile.base.bounded import reason
 from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT
 
 FORMAT = "ratslam-map-2"
 """Name and version of the format; a later version reads it."""
@@ -25,13 +24,6 @@ FORMATS = ("ratslam-map-1", FORMAT)
 EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
 ARCHIVE = b"PK"
 """Beginning of every map file, by which a damaged one is told from another file."""
-MOST_BYTES = 8 << 30
-"""Largest size of all arrays of a map file."""
-SPOILT = (
-    OSError, ValueError, LookupError, EOFError, TypeError, AttributeError, SyntaxError, RuntimeError,
-    MemoryError, OverflowError, tokenize.TokenError, struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""Errors of zipfile and NumPy in a spoilt file, and of a session in arrays that do not fit it."""
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
@@ -43,23 +35,19 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
     begin = _begin(file)
     try:
         with zipfile.ZipFile(file) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            members = [name.removesuffix(".npy") for name in archive.namelist()]
             if "steps" not in members:
                 raise InputError(str(file), "an archive of other arrays", EXPECTED)
             if "format" in members:
-                _check_format(file, _array(archive, members["format"]))
-            size = sum(info.file_size for info in members.values())
-            if size > MOST_BYTES:
-                found = f"arrays of {size / 2**30:.1f} GiB"
-                raise InputError(str(file), found, f"a map of at most {MOST_BYTES >> 30} GiB")
-            return {name: _array(archive, info) for name, info in members.items()}
+                _check_format(file, *npz.read_arrays(archive, ["format.npy"], str(file)))
+            found = npz.read_arrays(archive, archive.namelist(), str(file))
+            return dict(zip(members, found, strict=True))
     except InputError:
         raise
     except SPOILT as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        spoilt = f"damaged, or not a map ({reason})" if begin == ARCHIVE else "not a map"
-        found = spoilt if begin else "empty, so not a map"
-        raise InputError(str(file), found, EXPECTED, "restore it from a copy if it was one") from None
+        spoilt = f"damaged, or not a map ({reason(error)})" if begin == ARCHIVE else "not a map"
+        spoilt = spoilt if begin else "empty, so not a map"
+        raise InputError(str(file), spoilt, EXPECTED, "restore it from a copy if it was one") from None
 
 
 def _begin(file: Path) -> bytes:
@@ -78,14 +66,6 @@ def _begin(file: Path) -> bytes:
     except OSError as error:
         found = f"cannot be read ({error.strerror})"
         raise InputError(str(file), found, EXPECTED, "check the path and its permissions") from None
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = BytesIO(archive.read(info))  # whole, so that its checksum is compared before it is parsed
-    array = np.lib.format.read_array(content, allow_pickle=False)
-    if array.dtype.hasobject or content.read(1):
-        raise ValueError(f"{info.filename} is not a plain array")
-    return array
 
 
 def _check_format(file: Path, array: np.ndarray) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from base64 import b64encode
 from functools import cached_property
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.run_directory import read_run, read_scorecard
 from evaluation.cells.recording import NAME as CELLS
 from evaluation.cells.recording import CellRecording, read_recording
@@ -134,7 +134,7 @@ class Result:
     def interrupted(self) -> bool:
         """Whether Ctrl-C ended the run before its source ended."""
         file = self.directory / "manifest.json"
-        return file.exists() and json.loads(file.read_text(encoding="utf-8"))["status"] == "interrupted"
+        return file.exists() and read_manifest(self.directory).status == "interrupted"
 
     def plot(self, name: str = "map") -> Figure:
         """A plot of the run as a matplotlib figure; a notebook shows it after `%matplotlib inline`.

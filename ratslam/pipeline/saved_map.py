@@ -25,7 +25,6 @@ from ratslam.pipeline.folder_change import unfinished_change
 from ratslam.pipeline.map_archive import (
     EXPECTED,
     FORMAT,
-    SPOILT,
     digest_of,
     read_arrays,
     text_of,
@@ -38,7 +37,9 @@ from robot.sources.description import SourceDescription, describe
 from robot.sources.source import Source
 from robot.touch_source import TouchSource, open_touch_source
 from tactile.base.atomic_write import write_atomically
+from tactile.base.bounded import reason
 from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT
 
 NAME = "map.npz"
 """The map file of a run directory."""
@@ -123,7 +124,7 @@ class SavedMap:
             session.restore(dict(self.arrays))
             found = _mismatch(self.arrays, session.arrays())
         except SPOILT as error:
-            found = f"without {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+            found = reason(error)
         if found:
             check_same_settings(str(self.path), self.config, config)
             expected = "a map made with this configuration"
@@ -228,8 +229,7 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
         estimate = read_estimate(with_prefix(arrays, ESTIMATE))
         steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
     except SPOILT as error:
-        missing = f"without {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(str(file), missing, EXPECTED) from None
+        raise InputError(str(file), reason(error), EXPECTED) from None
     if steps < 0:
         raise InputError(str(file), f"{steps} steps", EXPECTED)
     if not UNKNOWN <= earlier <= steps:
@@ -253,7 +253,7 @@ def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], 
         try:
             readings = SourceDescription.from_json(text_of(file, arrays, "source"))
         except ValueError as error:
-            raise InputError(str(file), str(error), EXPECTED) from None
+            raise InputError(str(file), reason(error), EXPECTED) from None
         source = describe_readings(open_touch_source(readings, config.touch))
     else:
         beside = file.with_name("config.yaml")

@@ -76,10 +76,11 @@ def open_source(
 
 def _warning(report: Callable[[str], None] | None, warnings: list[str] | None) -> Callable[[str], None]:
     def warn(sentence: str) -> None:
-        if warnings is not None:
+        is_note = sentence.startswith("note: ")  # a fact that is no fault
+        if warnings is not None and not is_note:
             warnings.append(sentence)
         if report is not None:
-            report(f"warning: {sentence}")
+            report(sentence if is_note else f"warning: {sentence}")
 
     return warn
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ratslam.pose_graph.edges import Edges, information_matrices
+from tactile.base import bounded
+from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:
     """
     poses: dict[int, list[float]] = {}
     rows: list[tuple[int, int, list[float]]] = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "a graph (.g2o)").splitlines(), start=1):
         word, *cells = line.split() or [""]
         try:
             if word == "VERTEX_SE2":
@@ -87,13 +89,13 @@ def read_json(path: Path) -> networkx.DiGraph:
     """
     import networkx  # slow to import
 
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-        return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))
-    except (ValueError, KeyError, TypeError, AttributeError, networkx.NetworkXException) as error:
-        raise InputError(
-            str(path), f"not a node-link graph ({error})", "a map.json written by ratslam"
-        ) from None
+    def parse(content: Any) -> networkx.DiGraph:
+        try:
+            return networkx.DiGraph(networkx.node_link_graph(content, edges="edges"))
+        except networkx.NetworkXException as error:
+            raise ValueError(str(error)) from None
+
+    return bounded.read_json(path, "a map.json written by ratslam", parse)
 
 
 def _floats(values) -> str:

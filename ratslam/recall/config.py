@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from tactile.base.config import Settings
 
@@ -26,7 +26,7 @@ class RecallConfig(Settings):
     """Whiskers: `heights`: a pixel is silent or has a height in 0..1, compared by its level; `signed`: pixels
     are signed departures from rest in any unit, compared by their covariances. Sources of signed views set
     it."""
-    shifts: NonNegativeInt = 3
+    shifts: Annotated[int, Field(ge=0, le=4096)] = 3
     """Largest sector shift in either direction. With whiskers, any value but 0 compares views turned by half
     a turn too, where each whisker is compared with the opposite one; signed images are not."""
     frame_distance: PositiveFloat = 0.3
@@ -72,7 +72,7 @@ class RecallConfig(Settings):
     energy: PositiveFloat = 3.0
     """Activity injected into the pose cells for a candidate of posterior 1; the packet's activity is 1. With
     less, two packets compete for longer, which takes time and gains nothing."""
-    modes: PositiveInt = 8
+    modes: Annotated[int, Field(ge=1, le=4096)] = 8
     """Number of modes kept between keyframes; the mass of the others goes to novelty."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from robot.recordings.sanity_checks import RowName
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
+from tactile.base.bounded import MOST_PIXELS
 from tactile.base.errors import InputError
 
 RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
@@ -62,7 +64,10 @@ class RecordingRows:
     label: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        rows = len(self.time)
+        rows, pixels = len(self.time), prod(self.shape)
+        if rows * pixels > MOST_PIXELS:
+            found = f"{rows} views of {pixels} pixels"
+            raise InputError("views", found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns")
         self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
         self.label = np.full(rows, -1, np.int32)
 

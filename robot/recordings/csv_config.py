@@ -8,10 +8,9 @@ from typing import Annotated
 from pydantic import Field, PositiveFloat
 
 from robot.recordings.csv_units import AngleUnit, LengthUnit, TimeUnit
-from tactile.base.config import Settings
+from tactile.base.config import Settings, Side
 from tactile.whiskers.head_geometry import Degrees
 
-MAX_SIDE = 4096  # rows or columns of a view
 Quaternion = Annotated[list[str], Field(min_length=4, max_length=4)]
 
 
@@ -156,9 +155,9 @@ class CsvConfig(Settings):
     """Odometry as velocities."""
     motion: MotionColumns | None = None
     """Odometry as motions."""
-    rows: int = Field(default=3, gt=0, le=MAX_SIDE)
+    rows: Side = 3
     """R, rows of a view, also of the masked view of a recording with labels only."""
-    columns: int = Field(default=6, gt=0, le=MAX_SIDE)
+    columns: Side = 6
     """C, columns of a view."""
     views: ViewColumns | None = None
     """Views, if any."""

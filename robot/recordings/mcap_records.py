@@ -16,8 +16,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.recordings.cdr import Malformed
-
-CHUNK_LIMIT = 1 << 28  # bytes; ratslam writes 64 kB, or one sample if that is larger
+from tactile.base.bounded import MOST_BYTES
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
 DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
@@ -70,8 +69,8 @@ def _open_chunk(chunk: Chunk) -> list[McapRecord]:
     size = len(chunk.data)
     if chunk.compression:
         size = max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data))
-    if size > CHUNK_LIMIT:
-        raise Malformed(f"a chunk of {size} bytes")
+    if size > MOST_BYTES:  # ratslam writes 64 kB, or one sample if that is larger
+        raise Malformed(f"a chunk of {size} bytes, of at most {MOST_BYTES}")
     if not chunk.uncompressed_crc:
         raise Malformed("a chunk without its checksum")
     return breakup_chunk(chunk, validate_crc=True)

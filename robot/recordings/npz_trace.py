@@ -14,7 +14,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +24,15 @@ from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
 from robot.sources.source_info import SourceInfo
+from tactile.base.bounded import check_size, reason
 from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT, read_arrays
 
 VIEW, ODOMETRY = 1, 2
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
 NEEDED = (*COLUMNS, "in_view", "params_json")
 
 Parameters = dict[str, float | int | str]
-
-# Exceptions of NumPy and zipfile for a file that is damaged, truncated or of another type.
-_BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, LookupError, EOFError, OSError, MemoryError,
-           RuntimeError, SyntaxError)  # fmt: skip
 
 
 def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
@@ -90,6 +87,15 @@ def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
     )
 
 
+def array_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """The shapes of the arrays of a trace, by name.
+
+    Raises:
+        InputError: the file is not readable, or arrays are missing.
+    """
+    return {name: array.shape for name, array in _arrays(path, read_bytes(path)).items()}
+
+
 def _value_errors(
     place: RowName,
     arrays: dict[str, np.ndarray],
@@ -119,18 +125,17 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
             there = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
             if absent := [name for name in NEEDED if name not in there]:
                 raise_errors([missing_error(str(path), "array", name, there) for name in absent])
-            return {name: _array(archive, name) for name in (*NEEDED, "truth") if name in there}
+            names = [name for name in (*NEEDED, "truth") if name in there]
+            arrays = read_arrays(archive, [f"{name}.npy" for name in names], str(path))
+            check_size(str(path), 8 * sum(array.size for array in arrays), len(content))  # as float64
+            return dict(zip(names, arrays, strict=True))
     except InputError:
         raise
-    except _BROKEN as error:
+    except SPOILT as error:
         cut = content.startswith(b"PK") and isinstance(error, zipfile.BadZipFile)
         cure = "it seems truncated or damaged: copy it again" if cut else "write it with numpy.savez"
-        raise InputError(str(path), f"cannot be read as .npz ({error})", "a NumPy archive", cure) from error
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """One array; its checksum is verified first, and pickled objects are refused."""
-    return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
+        found = f"cannot be read as .npz ({reason(error)})"
+        raise InputError(str(path), found, "a NumPy archive", cure) from error
 
 
 def _shape_errors(path: Path, arrays: dict[str, np.ndarray]) -> list[InputError]:

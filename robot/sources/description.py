@@ -9,6 +9,7 @@ from typing import ClassVar
 
 from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
+from tactile.base.bounded import SPOILT, reason
 from tactile.base.errors import InputError
 
 
@@ -61,8 +62,8 @@ class SourceDescription(ClosedSource):
             rows, columns, channels = content.pop("view_shape")
             info = SourceInfo.model_validate(content.pop("info"))
             return cls(view_shape=(rows, columns, channels), info=info, **content)
-        except (AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"not a description of a source ({error})") from None
+        except SPOILT as error:
+            raise ValueError(f"not a description of a source ({reason(error)})") from None
 
 
 def describe(source: Source) -> SourceDescription:

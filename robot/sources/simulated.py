@@ -11,11 +11,21 @@ import numpy as np
 
 from robot.sources.input_files import digest_of
 from robot.sources.source import ClosedSource, Sample
+from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 NO_ODOMETRY = Odometry(0.0, 0.0, 0.0, 0.0)
 """Placeholder in a reading until its row's odometry is filled in."""
+
+MOST_STEPS = 1_000_000
+"""Longest simulated session, steps: all are computed before the first."""
+
+
+def check_steps(where: str, steps: float) -> None:
+    """Raises `InputError` if a session would be longer than `MOST_STEPS`."""
+    if not steps <= MOST_STEPS:
+        raise InputError(where, f"{steps:.3g} steps", f"at most {MOST_STEPS}", "a shorter session")
 
 
 class SimulatedSource(ClosedSource, ABC):

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeInt, PlainSerializer, PlainValidator, PositiveFloat
 
+from tactile.base.bounded import SPOILT, reason
 from tactile.base.config import Settings
 from tactile.features.calibration import Calibration, calibration_from_arrays, calibration_json
 from tactile.whiskers.head_geometry import HeadConfig
@@ -103,7 +104,10 @@ class SourceInfo(Settings):
     @classmethod
     def from_json(cls, text: str) -> SourceInfo:
         """Raises `ValueError` for text that `to_json` cannot have written."""
-        return cls.model_validate(json.loads(text))
+        try:
+            return cls.model_validate(json.loads(text))
+        except SPOILT as error:
+            raise ValueError(f"not a description of a source ({reason(error)})") from None
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SourceInfo) and self.to_json() == other.to_json()  # arrays compare by value

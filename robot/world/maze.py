@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.world.walls import Walls
+from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
 
 CELL_SIDE = 0.18
@@ -236,11 +237,7 @@ def read_maze(path: Path) -> Maze:
     Raises:
         InputError: the file is unreadable, has an unexpected character, or lacks an outer wall.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "a micromouse maze as text") from None
-    return parse_maze(text, path)
+    return parse_maze(read_text(path, "a micromouse maze as text", 1 << 20), path)
 
 
 def parse_maze(text: str, path: Path) -> Maze:

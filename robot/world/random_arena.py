@@ -32,9 +32,9 @@ OTHER_START_TRIES, OTHER_START_CLEARANCE = 1000, 0.2
 class ArenaConfig(Settings):
     """A random square arena with square objects, its south-west corner at the origin, or an arena file."""
 
-    side: PositiveFloat = 1.25
+    side: Annotated[float, Field(gt=0, le=100)] = 1.25
     """Side length of the arena, m; the second one of the paper has 2.5."""
-    objects: NonNegativeInt | None = None
+    objects: Annotated[int, Field(ge=0, le=1000)] | None = None
     """Number of objects; null: proportional to the side, 4 on 1.25 m and 7 on 2.5 m."""
     smallest: PositiveFloat = 0.12
     """Smallest side of an object, m."""

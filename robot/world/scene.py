@@ -6,7 +6,7 @@ from pathlib import Path as File
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
 from robot.sources.source_info import MazeInfo
 from robot.world.head_trajectory import HeadPath, MotionConfig, add_kidnaps, plan_path, poses_at
@@ -45,7 +45,7 @@ class MazeConfig(Settings):
     """Cells from west to east; 7 x 5 cells fit the 1.35 m x 1 m of the paper."""
     rows: Annotated[int, Field(ge=2, le=64)] = 5
     """Cells from south to north."""
-    loop: PositiveInt = 20
+    loop: Annotated[int, Field(ge=1, le=4096)] = 20
     """Length of the open loop for circuits, cells."""
     kind: Literal["loop", "tree"] = "loop"
     """`loop`: an open loop, and each other wall with the probability `share`; `tree`: one way between each
@@ -77,7 +77,7 @@ class PathConfig(Settings):
 
     circuits: str = PAPER_CIRCUITS
     """One letter per circuit: C clockwise seen from above, A anticlockwise; '' for none."""
-    explore: NonNegativeFloat = 0.0
+    explore: Annotated[float, Field(ge=0, le=100_000)] = 0.0
     """Duration of a free exploration instead, from the first cell of the loop, s."""
     start: NonNegativeInt = 0
     """Number of the cell of the loop, counted anticlockwise from its first, at which circuits or an

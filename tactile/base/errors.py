@@ -10,6 +10,10 @@ _CONTROL = re.compile(
 )
 
 
+def _short(text: str, most: int = 600) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
+
+
 class InputError(ValueError):
     """Invalid user input. The program prints the error without a traceback and exits with code 2.
 
@@ -25,12 +29,13 @@ class InputError(ValueError):
         self.found = found
         self.expected = expected
         self.cure = cure
+        found = _short(found)
         parts = [f"{where}: {found}" if where else found]
         if expected:
             parts.append(f"expected {expected}")
         if cure:
             parts.append(cure)
-        super().__init__(printable("; ".join(parts)))
+        super().__init__(printable("; ".join(parts).replace("\n", " ")))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the parts, so that a worker process can return the error."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
 from tactile.base.config import Settings
 from tactile.base.types import Array
@@ -39,7 +39,7 @@ class HeadConfig(Settings):
         RingConfig(length=0.16, radius=0.08, height=0.165),
     )
     """Rings from the inside out: the rows of the whisker image."""
-    whiskers: PositiveInt = 6
+    whiskers: Annotated[int, Field(ge=1, le=256)] = 6
     """Whiskers per ring: the columns of the image."""
     first_deg: Degrees = 0.0
     """Direction of the first column, counter-clockwise from ahead."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import json
 import os
+import stat
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,6 +26,10 @@ Model = TypeVar("Model", bound=Settings)
 
 _ALONE: dict[KeyPath, str] = {("recording", "topics"): "topic"}
 """Sections in which a text stands for a section with this key alone."""
+SMALLEST, LARGEST = 1e-30, 1e15
+"""Magnitudes of numbers other than 0; squares and quotients of others overflow."""
+MOST = 2**31 - 1
+"""Largest integer but seeds: counts of steps and cells are 32 bits wide."""
 _MAX_BYTES = 1 << 17  # a configuration is a few kB; the parser needs about a second for this much
 
 
@@ -40,8 +46,12 @@ def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Docum
     name = os.fspath(path)
     refuse_other_files(Path(name))
     try:
+        if stat.S_ISFIFO(os.stat(name).st_mode):
+            raise InputError(name, "a pipe, which may have no end", "a file")
         with Path(name).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(name, f"cannot be read: {error.strerror}") from None
     except ValueError as error:  # a NUL or a lone surrogate in the name
@@ -120,11 +130,24 @@ def validate(document: Document, model: type[Model]) -> Model:
     Raises:
         InputErrors: all errors in it, each with its place.
     """
+    if errors := [error for path in document.places for error in _beyond_measure(document, path)]:
+        raise InputErrors(errors)
     try:
         # As JSON: pydantic is then strict, but accepts lists for tuples and texts for paths.
         return model.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
         raise InputErrors(input_errors(error, model, document)) from None
+
+
+def _beyond_measure(document: Document, path: KeyPath) -> list[InputError]:
+    value = document.value(path)
+    if isinstance(value, float) and 0 < abs(value) < inf and not SMALLEST <= abs(value) <= LARGEST:
+        expected = f"0, or a number of {SMALLEST:g} to {LARGEST:g}"
+    elif isinstance(value, int) and abs(value) > MOST and path[-1:] != ("seed",):
+        expected = f"at most {MOST}"
+    else:
+        return []
+    return [InputError(document.at_value(path), describe(value), expected)]
 
 
 def dump(model: BaseModel) -> str:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from robot.recordings.bags.expansion import bound_expansion, expand_message
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.input_files import missing_error, require_file, unreadable_error
 from tactile.base.errors import InputError
@@ -77,6 +78,7 @@ class Bag:
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError:
             raise InputError("rosbags", "not installed", "", "pip install 'ratslam[ros]'") from None
+        bound_expansion()
         first = files[0].suffix == ".bag"
         with damage_errors(path):
             readers: list[Any] = [rosbag1.Reader(file) for file in files] if first else [rosbag2.Reader(path)]
@@ -352,9 +354,7 @@ def _plain(raw: Any) -> bytes:
     content = bytes(raw)
     if content[:4] != ZSTD:
         return content
-    import zstandard
-
-    return zstandard.ZstdDecompressor().decompressobj().decompress(content)
+    return expand_message(content)
 
 
 def _names_its_storage(metadata: Path) -> bool:

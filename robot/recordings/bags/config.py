@@ -15,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
-from tactile.base.config import Settings
+from tactile.base.config import Settings, Side
 
 
 def _as_tuple(value: Any) -> Any:
@@ -75,9 +75,9 @@ class ViewsTopic(Topic):
 
     topic: str
     """The topic."""
-    rows: PositiveInt = 3
+    rows: Side = 3
     """R, rows of a view of ranges."""
-    columns: PositiveInt = 6
+    columns: Side = 6
     """C, columns of a view of ranges; its R x C sectors are filled row by row."""
     max_range: PositiveFloat | None = None
     """Range that becomes 1, m; null: `range_max` of the first scan, at most 8 m."""
@@ -103,9 +103,9 @@ class TouchTopic(Topic):
 
     topic: str
     """The topic."""
-    rows: PositiveInt | None = None
+    rows: Side | None = None
     """R, rows of the sensors; null: those of the message's layout, else 1."""
-    columns: PositiveInt | None = None
+    columns: Side | None = None
     """C, columns of the sensors; null: the values divided by the rows."""
     use: Literal["position", "velocity", "effort"] = "position"
     """Which values of JointState messages."""

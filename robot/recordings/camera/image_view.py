@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import NonNegativeInt, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.config import Settings, Side
 from tactile.base.errors import InputError
 
 
@@ -31,9 +31,9 @@ class ImageViewConfig(Settings):
 
     crop: Crop = Crop()
     """The part of the image that is seen; leave out the robot itself and featureless floor and sky."""
-    rows: PositiveInt = 12
+    rows: Side = 12
     """R, rows of a view."""
-    columns: PositiveInt = 60
+    columns: Side = 60
     """C, columns of a view."""
 
 

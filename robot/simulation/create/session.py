@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path as File
+from typing import Annotated
 
 import numpy as np
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt
 
 from robot.simulation.create.robot import CreateRobot, CreateStep
 from robot.simulation.create.state_machine import (
@@ -52,9 +53,9 @@ class CreateSimulationConfig(Settings):
     """Whiskers and strain sensors."""
     wheels: WheelsConfig = WheelsConfig()
     """Odometry errors."""
-    minutes: PositiveFloat = 6.0
+    minutes: Annotated[float, Field(gt=0, le=1000)] = 6.0
     """Duration, min."""
-    reports: PositiveInt | None = None
+    reports: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """Number of steps, instead of a duration."""
     seed: NonNegativeInt = 0
     """Seed of all random streams."""

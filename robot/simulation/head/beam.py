@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from tactile.base.config import Settings
 from tactile.features.contact import ShaftConfig
@@ -50,9 +50,9 @@ class StreamConfig(Settings):
     """Samples per second (Salman & Pearson 2016, III-C)."""
     full_scale: PositiveFloat = 1.5
     """Deflection at which the sensors saturate, rad."""
-    poses: PositiveInt = 16
+    poses: Annotated[int, Field(ge=1, le=1024)] = 16
     """Number of head poses per cycle at which contacts with walls are computed."""
-    batch: PositiveInt = 16
+    batch: Annotated[int, Field(ge=1, le=1024)] = 16
     """Number of cycles simulated in parallel; affects only speed."""
     beam: BeamConfig = BeamConfig()
     servo: ServoConfig = ServoConfig()

@@ -7,10 +7,10 @@ the limit slips off.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from robot.simulation.head.baseline import BaselineConfig
 from robot.simulation.head.beam import StreamConfig
@@ -48,7 +48,7 @@ class MechanicsConfig(Settings):
     """Fraction of free whiskers that report a contact."""
     reach_noise: NonNegativeFloat = 0.1
     """Standard deviation of the contact position along the shaft, as a fraction of its length."""
-    poses: PositiveInt = 8
+    poses: Annotated[int, Field(ge=1, le=1024)] = 8
     """Number of head poses per protraction at which contacts are computed."""
     baseline: BaselineConfig = BaselineConfig()
     """Coloured noise, drift and creep of the deflections; only the raw fidelities have them."""

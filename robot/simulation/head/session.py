@@ -21,7 +21,13 @@ from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskCol
 from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.whisk_stream import simulate_cycles, simulate_free_cycles
 from robot.sources.odometry import OdometryConfig, simulate_odometry
-from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
+from robot.sources.simulated import (
+    NO_ODOMETRY,
+    SimulatedSource,
+    check_steps,
+    digest_of_document,
+    wrap_headings,
+)
 from robot.sources.source_info import SimulationInfo, SourceInfo
 from robot.world.head_trajectory import MotionConfig, poses_at
 from robot.world.maze import POSE_CELL_SIZE, maze_text
@@ -128,6 +134,7 @@ class HeadSimulation(SimulatedSource):
         whisking, seed = config.whisking, config.seed
         check_amplitude(whisking, head)
         self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
+        check_steps("simulation", min(self.scene.duration, self.scene.path.duration) * whisking.rate)
         count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
         if count < 1:
             raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "at least one whisk")

@@ -15,7 +15,13 @@ from robot.simulation.rat.random_walk import RandomWalkConfig, walk_randomly
 from robot.simulation.rat.rat_odometry import RatOdometryConfig, measure_motion
 from robot.simulation.rat.rat_path import RatPath, check_path, sample_path
 from robot.sources.input_files import digest_of
-from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
+from robot.sources.simulated import (
+    NO_ODOMETRY,
+    SimulatedSource,
+    check_steps,
+    digest_of_document,
+    wrap_headings,
+)
 from robot.sources.source_info import SourceInfo
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
@@ -146,9 +152,11 @@ def _poses_of(config: RatSimulationConfig, path: RatPath | None) -> np.ndarray:
         check_path(path, config.path, lambda row: f"{where}, row {row}")
     elif config.walk is not None:
         where, seconds = "rat_simulation.walk", config.seconds or WALK_SECONDS
+        check_steps(where, seconds * rate)
         path = walk_randomly(config.walk, size, seconds, rate, config.seed)
     else:
         where, path, smoothing = str(config.path.file), read_path(config.path), config.path.smoothing
+        check_steps(where, rate * (path.time[-1] - path.time[0]))
     return sample_path(_enter_box(path, size, where), config.path, rate, smoothing)
 
 

@@ -146,7 +146,7 @@ def test_comments_in_an_image_are_skipped(folder):
         ("trinary", "grey", "mode"),
         ("map.pgm", "other.pgm", r"other\.pgm"),
         ("image: map.pgm\n", "", "image"),
-        ("image", "[", "cannot be read"),
+        ("image", "[", "malformed"),
     ],
 )
 def test_an_invalid_map_yaml_is_refused(folder, old, new, where):

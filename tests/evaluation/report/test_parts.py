@@ -193,7 +193,7 @@ def test_closures_without_evidence_read_back_equal(tmp_path: Path) -> None:
 def test_a_run_without_a_manifest_is_not_finished(tmp_path: Path) -> None:
     assert read_manifest(tmp_path).status == "running"
     (tmp_path / "manifest.json").write_text('{"recording": 3}')
-    with pytest.raises(InputError, match="not a manifest"):
+    with pytest.raises(InputError, match="expected the manifest of a run"):
         read_manifest(tmp_path)
 
 

@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.config.strict_yaml import dump, load, parse, validate
+from ratslam.config.strict_yaml import LARGEST, MOST, SMALLEST, dump, load, parse, validate
 from tactile.base.errors import InputError
 from tests.ratslam.config.example_schema import (
     VALID,
@@ -20,7 +20,7 @@ from tests.ratslam.config.example_schema import (
 )
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
-FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+FLOATS = st.just(0.0) | st.floats(SMALLEST, LARGEST) | st.floats(-LARGEST, -SMALLEST)
 CONFIGS = st.builds(
     Config,
     name=TEXTS
@@ -28,7 +28,7 @@ CONFIGS = st.builds(
     gains=st.dictionaries(TEXTS, FLOATS),
     width=FLOATS | st.tuples(FLOATS, FLOATS),
     weights=st.lists(FLOATS, max_size=5).map(tuple),
-    steps=st.integers(0, (1 << 63) - 1),
+    steps=st.integers(0, MOST),
     metric=st.sampled_from(["l1", "cosine"]),
     others=st.lists(st.builds(Simulation, simulation=st.integers(-9, 9)), max_size=3).map(tuple),
 )

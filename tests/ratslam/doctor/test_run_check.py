@@ -113,4 +113,4 @@ def test_the_advice_is_a_setting_of_the_program(run: Path, capsys: pytest.Captur
 def test_a_folder_that_is_no_run_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "manifest.json").write_text("{}")
     assert main(["doctor", str(tmp_path)]) == 2
-    assert "not a manifest" in capsys.readouterr().err
+    assert "expected the manifest of a run" in capsys.readouterr().err

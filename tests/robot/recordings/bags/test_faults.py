@@ -20,6 +20,7 @@ from robot.recordings.bags.description import describe_bag
 from robot.recordings.bags.suggestion import suggested_topics
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.source import Source
+from tactile.base import bounded
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import Entry, header, odometry, pose, quaternion, scan, tf, transform, write_bag
 
@@ -58,6 +59,20 @@ def test_big_endian_messages_are_read(kind: str, tmp_path: Path) -> None:
         path = write_bag(tmp_path / str(little), kind, BOTH, little_endian=little)
         sources.append([(time, reading.odometry, reading.view.tolist()) for time, reading, _ in opened(path)])
     assert sources[0] == sources[1]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["ros1-bz2", "ros1-lz4", "sqlite3-message", "sqlite3-file", "mcap-message", "mcap-file", "mcap-storage"],
+)
+def test_what_expands_to_too_much_is_refused(
+    kind: str, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beams = [scan(time, np.ones(400_000), -1.5, 1e-6) for time in TIMES[:1]]
+    path = written(tmp_path, kind, sorted([*WHEELS, *beams], key=lambda entry: entry.time))
+    assert describe_bag(path).topics
+    monkeypatch.setattr(bounded, "MOST_BYTES", 1 << 20)
+    refused(lambda: opened(path), "expands to", "at most 1 MiB: 1 MiB, or 32 times what is stored")
 
 
 def test_missing_topics_are_named_with_those_that_exist(tmp_path: Path, refused: Refused) -> None:
