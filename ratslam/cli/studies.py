@@ -22,6 +22,7 @@ from ratslam.cli.common import (
 )
 from ratslam.config.packaged import find_config
 from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file, require_own_folder
 
 REPLACED = {
     "sweep": "study CONFIG",
@@ -184,10 +185,17 @@ def _study(arguments: argparse.Namespace) -> int:
     error = find_error(arguments.error) if arguments.error else None
     if arguments.search:
         search_plan(study)
-    log = RunLog(arguments.output or Path("runs") / study.name)
+    log = RunLog(_folder(arguments, study.name, "runs.jsonl"))
     return (
         _search(arguments, study, log) if arguments.search else _table(arguments, study, log, error, remarks)
     )
+
+
+def _folder(arguments: argparse.Namespace, name: str, mark: str) -> Path:
+    """The folder of a study, which is new or has the mark of an earlier call."""
+    folder: Path = arguments.output or Path("runs") / name
+    require_own_folder(folder, [mark])
+    return folder
 
 
 def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
@@ -218,7 +226,8 @@ def _growth(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.studies.growth_report import read_rows, render_growth, run_growth, save_growth
 
     study = growth_study(find_config(arguments.config), arguments.set)
-    folder = arguments.output or Path("runs") / study.name
+    folder = _folder(arguments, study.name, "growth.jsonl")
+    require_new_file(folder / "growth.jsonl", parents=True)
     try:
         run_growth(study, folder)
     finally:  # an interrupted study has the table of what it measured
@@ -238,7 +247,7 @@ def _cells(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.studies.executor import Executor
 
     study = cell_study(find_config(arguments.config), arguments.set)
-    folder = arguments.output or Path("runs") / study.name
+    folder = _folder(arguments, study.name, "sets")
     with (
         Progress(study.plan.sets, folder / FOLDER, "set") as progress,
         Executor(arguments.workers, arguments.scheduler) as executor,

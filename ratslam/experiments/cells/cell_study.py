@@ -25,7 +25,6 @@ from ratslam.experiments.studies.executor import Executor
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_own_folder
 from tactile.base.random_streams import stream
 
 FOLDER = "sets"
@@ -154,7 +153,6 @@ def run_cell_study(
     Raises:
         InputError: the folder cannot be written to, or the process of a chunk was killed.
     """
-    require_own_folder(folder, [FOLDER])
     files = {task.key: folder / FOLDER / f"{task.key}.npz" for task in tasks_of(study)}
     try:
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)

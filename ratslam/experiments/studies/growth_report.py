@@ -26,7 +26,6 @@ from ratslam.experiments.studies.report import (
 from ratslam.experiments.studies.study_runner import KILLED
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,8 +53,6 @@ def run_growth(study: GrowthStudy, folder: Path) -> None:
     Raises:
         InputError: the folder cannot be made, a session cannot be simulated, or its process was killed.
     """
-    require_new_file(folder / FILE, parents=True)
-    require_own_folder(folder, [FILE])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / FILE).write_bytes(b"")

@@ -13,7 +13,6 @@ from ratslam.experiments.studies.machine import Machine
 from ratslam.experiments.studies.study import Job, run_key
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_own_folder
 
 FILE = "runs.jsonl"  # name of the file of records in a study's directory
 
@@ -57,11 +56,10 @@ class RunLog:
     """The records in a directory. A kill loses at most the record that was being written.
 
     Args:
-        directory: is created if missing; an `InputError` says that it cannot be, or is not of a study.
+        directory: is created if missing; an `InputError` says that it cannot be.
     """
 
     def __init__(self, directory: Path) -> None:
-        require_own_folder(directory, [FILE])
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
