@@ -77,8 +77,8 @@ def _live(arguments: argparse.Namespace) -> int:
     with catch_interrupt("stopping the robot"), monitor() as start_monitor:
         ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
     if card is not None:
-        print(summarise(directory, card, config.backend))
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
+        print(summarise(directory, card, config.backend))
     tell(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED

@@ -51,9 +51,9 @@ def _localise(arguments: argparse.Namespace) -> int:
     with open_viewer(target) as observers:
         card, summary, interrupted = localise(saved, config, directory, observers)
     print(summary.describe())
-    print(summarise(directory, card, f"localising in {arguments.map}"))
     print(f"{directory}/localisation.csv holds the state and the probability of every step,")
     print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
+    print(summarise(directory, card, f"localising in {arguments.map}"))
     return INTERRUPTED if interrupted else 0
 
 

@@ -84,13 +84,13 @@ def _run(arguments: argparse.Namespace) -> int:
         card, interrupted = run(config, directory, arguments.resume, observers)
     if arguments.full:
         print(f"{render_scores(directory, card)}\n")
-    print(summarise(directory, card, config.backend))
     print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
     if not arguments.full:
         print(f"python -m ratslam score {directory} prints all figures")
     if arguments.report:
         report.write_report([directory], directory / report.NAME)
         print(f"{directory / report.NAME} is a page about the run")
+    print(summarise(directory, card, config.backend))
     return INTERRUPTED if interrupted else 0
 
 
