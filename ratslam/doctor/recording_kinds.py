@@ -68,10 +68,10 @@ def describe_file(path: Path) -> FileContents:
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
     if path.name == METADATA:
-        found = _bag(path.parent)
-        if found.recording is None:
-            return found
-        return found._replace(recording={"file": str(path.parent.resolve()), **found.recording})
+        bag = _bag(path.parent)
+        if bag.recording is None:
+            return bag
+        return bag._replace(recording={"file": str(path.parent.resolve()), **bag.recording})
     if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
         return _bag(path)
     describe = KINDS.get(path.suffix.lower())

@@ -46,12 +46,13 @@ def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
     reader = StreamReader(cast(Any, _BoundedFile(file)), emit_chunks=True, validate_crcs=True)
     for record in reader.records:
         if isinstance(record, Chunk):
-            yield from _open_chunk(record)
+            yield from open_chunk(record)
         elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
             yield record
 
 
-def _open_chunk(chunk: Chunk) -> list[McapRecord]:
+def open_chunk(chunk: Chunk) -> list[McapRecord]:
+    """The records in a chunk; raises as `read_records`."""
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
     size = len(chunk.data)
