@@ -56,14 +56,15 @@ def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
         for record in reader.records:
             left = bounded.left
             if isinstance(record, Chunk):
-                yield from _open_chunk(record)
+                yield from open_chunk(record)
             elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
                 yield record
     except EndOfFile as error:
         raise Unclosed if left == 0 else error from None
 
 
-def _open_chunk(chunk: Chunk) -> list[McapRecord]:
+def open_chunk(chunk: Chunk) -> list[McapRecord]:
+    """The records in a chunk; raises as `read_records`."""
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
     size = len(chunk.data)

@@ -284,8 +284,10 @@ def _reason(error: Exception) -> str:
 
 def container_fault(path: Path) -> tuple[str, str] | None:
     """What is wrong with an MCAP file as a container, and the cure; None for others."""
-    from mcap.records import Channel, Header, Message, Schema
+    from mcap.records import Channel, Chunk, Header, Message, Schema
     from mcap.stream_reader import StreamReader
+
+    from robot.recordings.mcap_records import open_chunk
 
     if path.is_dir():
         return next(filter(None, map(container_fault, sorted(path.glob("*.mcap")))), None)
@@ -294,19 +296,20 @@ def container_fault(path: Path) -> tuple[str, str] | None:
     profile, codes = "", set[str]()
     with path.open("rb") as file:
         with suppress(Exception):  # damage
-            for record in StreamReader(file).records:
+            for record in StreamReader(file, emit_chunks=True).records:
                 if isinstance(record, Header):
-                    profile = record.profile
-                elif isinstance(record, (Channel, Schema)):
-                    codes.add(record.message_encoding if isinstance(record, Channel) else record.encoding)
-                elif isinstance(record, Message):
+                    profile = record.profile or "none"
+                for each in open_chunk(record) if isinstance(record, Chunk) else [record]:
+                    if isinstance(each, (Channel, Schema)):
+                        codes.add(each.message_encoding if isinstance(each, Channel) else each.encoding)
+                if isinstance(record, (Chunk, Message)):
                     break
         file.seek(-min(file.seek(0, 2), len(MCAP)), 2)
         whole = file.read() == MCAP
-    if codes and (profile != "ros2" or codes - ROS2_CODES):
-        found = f"an MCAP file of profile {profile!r} with {', '.join(sorted(codes))}, not of ROS 2"
+    if profile and (profile != "ros2" or codes - ROS2_CODES):
+        found = f"an MCAP file of profile {profile} with {', '.join(sorted(codes))}, not of ROS 2"
         return f"cannot be read as a bag: {found}", CONVERT
-    if whole or profile != "ros2":
+    if whole or not profile:
         return None
     return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"
 

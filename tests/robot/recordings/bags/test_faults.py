@@ -378,7 +378,9 @@ def test_other_containers_are_named(case: tuple[str, str, str], tmp_path: Path, 
     path = tmp_path / "other.mcap"
     container(path, *case)
     for read in (opened, describe_bag):
-        refused(lambda read=read: read(path), f"of profile '{case[0]}' with", case[1], "rosbags-convert")
+        refused(
+            lambda read=read: read(path), f"of profile {case[0] or 'none'} with", case[1], "rosbags-convert"
+        )
 
 
 def test_a_cut_mcap_is_called_a_cut_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
