@@ -36,21 +36,20 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
         InputError: the map cannot be read, or a goal is not on it.
     """
     assert config.live is not None
-    goal = config.live.plan.goal
+    live, goal = config.live, config.live.plan.goal
     assert goal is not None
     saved = read_map(goal.map)
     truth = (goal.map if goal.map.is_dir() else goal.map.parent) / "truth.tum"
     if goal.at is None and truth.exists() and truth.stat().st_size:
         x, y, heading = read_tum(truth)[1][-1].tolist()
         goal = goal.model_copy(update={"at": (x, y, float(np.degrees(heading)))})
-        plan = config.live.plan.model_copy(update={"goal": goal})
-        config = config.model_copy(update={"live": config.live.model_copy(update={"plan": plan})})
-        assert config.live is not None
+        live = live.model_copy(update={"plan": live.plan.model_copy(update={"goal": goal})})
+        config = config.model_copy(update={"live": live})
     made = saved.open_session().map
-    planner = GoalPlanner(made.graph(), goal, config.live.plan.motion)
+    planner = GoalPlanner(made.graph(), goal, live.plan.motion)
     drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
     contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
-    route = GoalRoute(drive, config.live, drive.off_way, goal.coast, contacts)
+    route = GoalRoute(drive, live, drive.off_way, goal.coast, contacts)
     return localising_for_goals(config, saved, goal.start), route
 
 
