@@ -133,7 +133,12 @@ TYPED = {path: [command for command in commands(path) if not is_marked(command)]
 @pytest.mark.parametrize(
     ("readme", "slow"),
     [
-        pytest.param(path, slow, marks=pytest.mark.soak if slow else (), id=f"{name(path)}{'-all' * slow}")
+        pytest.param(
+            path,
+            slow,
+            marks=(pytest.mark.soak, pytest.mark.timeout(1800)) if slow else (),
+            id=f"{name(path)}{'-all' * slow}",
+        )
         for path, typed in TYPED.items()
         for slow in (False, True)
         if any(begins(command, SLOW) == slow for command in typed)
