@@ -140,7 +140,8 @@ def range_errors(
         row = int(negative.argmax())
         errors.append(InputError(place(row), f"{what} is {lowest[row]}", "ranges of 0 m or more"))
     if typical > RANGE_UNIT_FACTOR * max_range:
-        cure = f"divide by 1000 if they are millimetres, else raise {key}"
+        unit = "set recording.table.views.unit to mm" if key.startswith("table") else "divide by 1000"
+        cure = f"{unit} if they are millimetres, else raise {key}"
         errors.append(InputError(where, f"half of the ranges are over {typical:.4g} m", "metres", cure))
     return errors
 

@@ -471,7 +471,8 @@ def read_poses(
     if part.quaternion is not None:
         return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
     heading = file.column(part.heading, "angle", units.angle)
-    if faults := heading_errors(heading, time, part.heading, str(file.path), limits):
+    cure = f"set recording.{'table' if key == 'table.pose' else key}.units.angle to deg"
+    if faults := heading_errors(heading, time, part.heading, str(file.path), limits, cure):
         errors += faults
         heading = np.deg2rad(heading)  # or every other check would report it again
     return np.column_stack([x, y, heading]), errors

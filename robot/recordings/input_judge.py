@@ -466,7 +466,12 @@ def _unlike_truth(robot: TypicalMotion, limits: UnitLimits) -> Iterator[tuple[st
 
 
 def heading_errors(
-    heading: np.ndarray, time: np.ndarray, what: str, where: str, limits: UnitLimits = DEFAULT_LIMITS
+    heading: np.ndarray,
+    time: np.ndarray,
+    what: str,
+    where: str,
+    limits: UnitLimits = DEFAULT_LIMITS,
+    cure: str = "multiply by pi/180",
 ) -> list[InputError]:
     """Errors of a heading column [N] that must be in degrees: wider than a turn and too fast for radians."""
     good = np.isfinite(heading) & np.isfinite(time)
@@ -479,7 +484,8 @@ def heading_errors(
     if rate <= limits.turn_rate and _typical(turn, np.ones_like(turn)) <= np.pi:
         return []
     found = f"{what} runs from {heading.min():.4g} to {heading.max():.4g}, mostly at {rate:.3g} a second"
-    return [InputError(where, found, "a heading in radians", f"{_DEGREES}; {_else('turn_rate', limits)}")]
+    cure = f"{cure} if it is degrees; {_else('turn_rate', limits)}"
+    return [InputError(where, found, "a heading in radians", cure)]
 
 
 def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
