@@ -182,13 +182,13 @@ def recover(path: Path, out: Path) -> Recovery:
 
 def _unreadable_recording_error(scanner: McapScanner) -> InputError:
     """The error for a file without a description or without samples."""
-    if is_foreign(scanner.path):
-        found, cure = container_fault(scanner.path) or ("a whole bag of another program", "")
-        return InputError(str(scanner.path), found, "a recording of ratslam", cure)
+    foreign = is_foreign(scanner.path)
+    if foreign and (fault := container_fault(scanner.path)):
+        return InputError(str(scanner.path), fault[0], "a recording of ratslam", fault[1])
     if scanner.description is None:
         found = f"cannot be read as a recording: {scanner.broken or 'it has no ratslam metadata'}"
-        expected = "an MCAP file written by this version of ratslam"
-        return InputError(str(scanner.path), found, expected, "record it again")
+        cure = "`python -m ratslam doctor` says what it is" if foreign else "record it again"
+        return InputError(str(scanner.path), found, "an MCAP file written by this version of ratslam", cure)
     found, cure = f"holds no samples{': ' + scanner.broken if scanner.broken else ''}", "record it again"
     return InputError(str(scanner.path), found, "at least one sample", f"{cure}: nothing can be recovered")
 

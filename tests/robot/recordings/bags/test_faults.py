@@ -236,6 +236,13 @@ def test_touch_that_does_not_fit_is_refused(tmp_path: Path, refused: Refused) ->
     refused(lambda: opened(path, views=None, touch=touch), "message 0: touch is nan", "in over 5% of its")
     path = written(tmp_path, "sqlite3", [*WHEELS, *arrays([700, 800, 900, 900])])
     refused(lambda: opened(path, views=None, touch=touch), "values from 700 to 900", "0 to 1")
+    one = arrays([0.1, 0.2, 0.3, 0.4])
+    for spoilt_by in ([0.1, 0.2, np.nan, 0.4], [0.1]):
+        one[5] = arrays(spoilt_by)[5]
+        told: list[str] = []
+        path = written(tmp_path / str(len(spoilt_by)), "mcap", [*WHEELS, *one])
+        seen = [bool(sample.reading.view_seen) for sample in opened(path, told, views=None, touch=touch)]
+        assert (seen, len(told)) == ([row != 5 for row in range(12)], 1)
 
 
 def test_empty_bags_are_refused(tmp_path: Path, refused: Refused) -> None:
