@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,6 @@ import pytest
 
 from ratslam.__main__ import main
 from robot.recordings.bags.description import describe_bag
-from robot.recordings.bags.suggestion import suggested_topics
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.source import Source
 from tactile.base import bounded
