@@ -30,6 +30,6 @@ def read_pieces(path: Path, steps: int) -> np.ndarray:
     piece = read_text_table(path, dict.fromkeys(COLUMNS, ())).values[:, 1]
     if len(piece) < steps:
         raise InputError(str(path), f"{len(piece)} lines", f"{steps}, one for each step")
-    if not ((piece >= 0) & (piece < len(piece)) & (piece == np.round(piece))).all():
+    if not ((piece >= 0) & (piece < 2**31) & (piece == np.round(piece))).all():
         raise InputError(str(path), "a piece that is no number of one", "whole numbers from 0")
     return piece[:steps].astype(int)

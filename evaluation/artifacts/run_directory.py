@@ -168,7 +168,10 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
 def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not path.exists():
         raise InputError(str(path), "no such file", "a file of a run directory")
-    return read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
+    time, pose = read_tum(path) if path.stat().st_size else (np.zeros(0), np.zeros((0, 3)))
+    if (np.diff(time) < 0).any():
+        raise InputError(str(path), "times that decrease", "a file of a run directory")
+    return time, pose
 
 
 def _doubt(folder: Path) -> tuple[float, str]:

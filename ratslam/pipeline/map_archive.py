@@ -40,8 +40,8 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
                 raise InputError(str(file), "an archive of other arrays", EXPECTED)
             if "format" in members:
                 _check_format(file, *npz.read_arrays(archive, ["format.npy"], str(file)))
-            found = npz.read_arrays(archive, archive.namelist(), str(file))
-            return dict(zip(members, found, strict=True))
+            arrays = npz.read_arrays(archive, archive.namelist(), str(file))
+            return dict(zip(members, arrays, strict=True))
     except InputError:
         raise
     except SPOILT as error:

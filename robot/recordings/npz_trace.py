@@ -29,6 +29,8 @@ from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT, read_arrays
 
 VIEW, ODOMETRY = 1, 2
+FASTEST = 1e6
+"""m/s or rad/s that no wheel, and no damage of a few bits, should reach."""
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
 NEEDED = (*COLUMNS, "in_view", "params_json")
 
@@ -108,7 +110,7 @@ def _value_errors(
     errors = _flag_errors(arrays["in_flags"], place) + nonfinite_errors(track.time, "in_t", place)
     errors += clock_errors(track.time, "in_t", place, track.moved)
     for name in ("in_v", "in_w"):
-        errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved)
+        errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved, FASTEST)
     errors += nonfinite_errors(view, "in_view", place, seen)
     if given_ids:
         errors += _id_errors(view, seen, place)

@@ -17,17 +17,19 @@ RowName = Callable[[int], str]  # position of a row in the user's file, for erro
 
 
 def nonfinite_errors(
-    values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None
+    values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None, most: float = 1e20
 ) -> list[InputError]:
-    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN or infinite."""
+    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or beyond `most`:
+    beyond all measure, so that sums and squares lose or overflow what they are added to."""
     flat = values.reshape(len(values), -1)
-    bad = ~np.isfinite(flat)
+    bad = ~(np.abs(flat) <= most)
     hit = bad.any(axis=1) if rows is None else bad.any(axis=1) & rows
     if not hit.any():
         return []
     row = int(hit.argmax())
     found = f"{what} is {flat[row][bad[row]][0]}{count_others(hit)}"
-    return [InputError(place(row), found, "a finite number", "correct or drop the row")]
+    expected = "a finite number" + (f" up to {most:g}" if np.isfinite(flat[row][bad[row]][0]) else "")
+    return [InputError(place(row), found, expected, "correct or drop the row")]
 
 
 def clock_errors(

@@ -24,7 +24,7 @@ LONG = 25.0
 
 
 class Outcome(NamedTuple):
-    """What a command did: its exit code, or None where it ended in a traceback or was killed, and its text."""
+    """What a command did: its exit code, None after a traceback or if it was killed, and its text."""
 
     code: int | None
     said: str
@@ -34,62 +34,52 @@ class CommandWorker:
     """A process that runs commands; started again when one was killed or it has become large."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
+        self._start()
+
+    def _start(self) -> None:
+        code = "from tests.helpers.command_worker import serve; serve()"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        self._answer(ROOT, 600.0, LONG)  # until it has imported the program
 
     def run(self, folder: Path, *command: object, long: float = LONG) -> Outcome:
-        """Runs one command in a folder.
-
-        Args:
-            long: time after which a run that made steps is interrupted, s.
-        """
-        if self._process is None or self._memory() > MEMORY // 2:
+        """Runs one command in a folder; a run that made steps is interrupted after `long` s."""
+        if self._process.poll() is not None or self._memory() > MEMORY // 2:
             self.close()
-            code = "from tests.helpers.command_worker import serve; serve()"
-            paths = {"PYTHONPATH": str(ROOT)}
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                env=os.environ | paths, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
-            self._answer(folder, 600.0, LONG)  # until it has imported the program
+            self._start()
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps([str(folder), [str(part) for part in command]]).encode() + b"\n")
+        self._process.stdin.write(json.dumps([str(folder), [*map(str, command)]]).encode() + b"\n")
         self._process.stdin.flush()
         return self._answer(folder, SECONDS, long)
 
     def _answer(self, folder: Path, most: float, long: float) -> Outcome:
-        process, begun, told = self._process, time.monotonic(), False
-        end = begun + most
-        assert process is not None
-        assert process.stdout is not None
-        while not select.select([process.stdout], [], [], 0.1)[0]:
-            now, stepped = time.monotonic(), any(file.stat().st_size for file in folder.glob("*/online.tum"))
-            if stepped and not told and now > begun + long:
-                process.send_signal(signal.SIGINT)
-                end, told = now + SECONDS, True
-            if now > end or (self._memory() > MEMORY and not stepped):
-                memory = self._memory() >> 20
+        output, begun, told = self._process.stdout, time.monotonic(), False
+        assert output is not None
+        while not select.select([output], [], [], 0.1)[0]:
+            took = time.monotonic() - begun
+            stepped = any(file.stat().st_size for file in folder.glob("*/online.tum"))
+            if stepped and not told and took > long:
+                self._process.send_signal(signal.SIGINT)
+                most, told = took + SECONDS, True
+            if took > most or (self._memory() > MEMORY and not stepped):
+                found = Outcome(None, f"killed after {took:.0f} s, {self._memory() >> 20} MiB")
                 self.close()
-                return Outcome(None, f"killed after {now - begun:.0f} s, {memory} MiB")
-        line = process.stdout.readline()
-        if not line:
-            self.close()
-            return Outcome(None, "the process died")
-        return Outcome(130, "") if told else Outcome(*json.loads(line))
+                return found
+        line = output.readline()
+        if told or not line:
+            return Outcome(130 if line else None, "" if line else "the process died")
+        return Outcome(*json.loads(line))
 
     def _memory(self) -> int:
-        assert self._process is not None
-        try:
-            pages = int(Path(f"/proc/{self._process.pid}/statm").read_text(encoding="ascii").split()[1])
-        except (OSError, IndexError):
-            return 0
-        return pages * os.sysconf("SC_PAGESIZE")
+        pages = Path(f"/proc/{self._process.pid}/statm").read_text(encoding="ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGESIZE")
 
     def close(self) -> None:
         """Ends the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-            self._process = None
+        self._process.kill()
+        self._process.communicate()
 
 
 def serve() -> None:

@@ -211,9 +211,3 @@ def _fuzz(content: bytes, path: Path, rounds: int, seed: int) -> None:
 
 def test_random_damage(stream: Callable[..., Path], tmp_path: Path) -> None:
     _fuzz(stream().read_bytes(), tmp_path / "bad.npz", rounds=400, seed=1)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(4))
-def test_much_random_damage(stream: Callable[..., Path], tmp_path: Path, seed: int) -> None:
-    _fuzz(stream().read_bytes(), tmp_path / "bad.npz", rounds=20_000, seed=seed + 100)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -451,47 +449,3 @@ def test_many_bad_messages_are_refused(tmp_path: Path, refused: Refused) -> None
     ring = [*spoilt("angles", 0), *spoilt("angles", 1), *RING[2:]]
     path = written(tmp_path, "mcap", [*WHEELS, *ring])
     refused(lambda: opened(path), "/scan, message 0: angle_min is", "in over 5% of its messages")
-
-
-def damaged(content: bytes, random: np.random.Generator) -> bytes:
-    """A copy with a few changed bytes, or cut off."""
-    if random.random() < 0.3:
-        return content[: int(random.integers(len(content)))]
-    spoilt = bytearray(content)
-    for place in random.integers(len(content), size=int(random.integers(1, 9))):
-        spoilt[place] ^= int(random.integers(1, 256))
-    return bytes(spoilt)
-
-
-@pytest.fixture
-def little_memory() -> Any:
-    """Lets any allocation far beyond the size of the bag fail."""
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, limits)
-
-
-FUZZED = ("ros1", "ros1-bz2", "ros1-lz4", "sqlite3", "mcap", "mcap-storage")
-
-
-@pytest.mark.parametrize("rounds", [4, pytest.param(40, marks=pytest.mark.soak)], ids=["few", "many"])
-@pytest.mark.parametrize("kind", FUZZED)
-def test_damaged_bags_are_refused_or_read(
-    kind: str, rounds: int, tmp_path: Path, little_memory: None
-) -> None:
-    """Whatever is read is a recording; most damage is found. Descriptions are made or refused alike."""
-    path = written(tmp_path, kind)
-    file = path if path.is_file() else next(each for each in path.iterdir() if each.suffix != ".yaml")
-    content, random, read = file.read_bytes(), np.random.default_rng(len(kind)), 0
-    for _ in range(rounds):
-        file.write_bytes(damaged(content, random))
-        with suppress(InputError):
-            suggested_topics(describe_bag(path))
-        try:
-            source = opened(path)
-        except InputError:
-            continue
-        read += all(np.isfinite(sample.reading.view).all() for sample in source)
-    assert read < rounds
