@@ -30,7 +30,7 @@ from tactile.base.errors import InputError
 
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
-RATE = "set recording.table.rate={:.6g}, the rows per second"
+RATE = "--set recording.table.rate={:.6g}, the rows per second"
 HOLE = 3
 """Rows one after another that may be left out of velocities and motions; the next row stands for them."""
 MAX_PIXELS = 1 << 26
@@ -113,7 +113,7 @@ def read_csv_recording(
 
 
 def _unit_cure(quantity: str, unit: str) -> str:
-    return f"set recording.table.units.{quantity} to {unit}"
+    return f"--set recording.table.units.{quantity}={unit}"
 
 
 def _within(
@@ -471,7 +471,7 @@ def read_poses(
     if part.quaternion is not None:
         return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
     heading = file.column(part.heading, "angle", units.angle)
-    cure = f"set recording.{'table' if key == 'table.pose' else key}.units.angle to deg"
+    cure = f"--set recording.{'table' if key == 'table.pose' else key}.units.angle=deg"
     if faults := heading_errors(heading, time, part.heading, str(file.path), limits, cure):
         errors += faults
         heading = np.deg2rad(heading)  # or every other check would report it again
