@@ -141,7 +141,7 @@ def _read_series(
     places = values[:, :2] * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict
     errors = _frame_errors(where, numbers, pairs, role, places, report)
     if not errors:
-        faults.tell(where, len(rows), report)
+        errors = faults.errors(where, role, len(rows), report)
     series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body
@@ -211,13 +211,14 @@ class _PoseFaults:
         self._count[fault] += 1
         self._first.setdefault(fault, place)
 
-    def tell(self, where: str, total: int, report: Report) -> None:
-        """Tells each fault once, with its first place."""
+    def errors(self, where: str, role: str, total: int, report: Report) -> list[InputError]:
+        """Tells each doubt once, with its first place; the error for a path in another plane."""
         for fault, count in self._count.items():
             report(f"{self._first[fault]}: {count} of {total} {fault}; look at the publisher")
         if self._plane == "xy" and len(self._places) > 1:
             x, y, z = np.ptp(np.array(self._places), axis=0)
             if z > 0.1 * x and z > FLAT * y:
-                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z"
-                cure = "poses of a camera (z ahead)? --set recording.topics.odometry.plane=xz"
-                report(f"{where}: {found}: it lies in another plane; {cure}")
+                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z: another plane"
+                cure = f"if the poses are a camera's (z ahead), --set recording.topics.{role}.plane=xz"
+                return [InputError(where, found, "a path in the plane of x and y", cure)]
+        return []
