@@ -19,7 +19,7 @@ RowName = Callable[[int], str]  # position of a row in the user's file, for erro
 def nonfinite_errors(
     values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None, most: float = 1e20
 ) -> list[InputError]:
-    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or beyond `most`:
+    """Errors where values [N, ...] in given rows [N] bool (default all) are NaN, infinite or beyond `most`:
     beyond all measure, so that sums and squares lose or overflow what they are added to."""
     flat = values.reshape(len(values), -1)
     bad = ~(np.abs(flat) <= most)
