@@ -167,7 +167,7 @@ def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_
     assert "run: mapper_gone, " in said
     assert "the run was killed" not in said
     (folder / SESSION_REPORT).write_text("{")
-    with pytest.raises(InputError, match="not a report"):
+    with pytest.raises(InputError, match="the report of a live session"):
         RunMonitor(folder).read()
 
 
