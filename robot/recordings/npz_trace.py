@@ -122,9 +122,9 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
             if absent := [name for name in NEEDED if name not in there]:
                 raise_errors([missing_error(str(path), "array", name, there) for name in absent])
             names = [name for name in (*NEEDED, "truth") if name in there]
-            found = read_arrays(archive, [f"{name}.npy" for name in names], str(path))
-            check_size(str(path), 8 * sum(array.size for array in found), len(content))  # as float64
-            return dict(zip(names, found, strict=True))
+            arrays = read_arrays(archive, [f"{name}.npy" for name in names], str(path))
+            check_size(str(path), 8 * sum(array.size for array in arrays), len(content))  # as float64
+            return dict(zip(names, arrays, strict=True))
     except InputError:
         raise
     except SPOILT as error:
