@@ -11,7 +11,7 @@ from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.metrics.text_table import read_text_table
+from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
@@ -133,7 +133,10 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
     try:
         column = header.split(",").index(name)
         cells = [line.split(",")[column] for line in lines]
-        return np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        found = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        if ((np.abs(found) > LARGEST) & np.isfinite(found)).any():
+            raise ValueError
+        return found
     except (ValueError, IndexError):
         raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
 

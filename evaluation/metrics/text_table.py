@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import chain
-from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +12,8 @@ import numpy as np
 from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
 
+LARGEST = 1e20
+"""Magnitude above which a number is damage: squares of others do not overflow."""
 Columns = Mapping[str, tuple[str, ...]]
 """Columns to read, in order: name -> alternative names in a header (compared in lower case)."""
 
@@ -44,7 +45,7 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     rows, at = [], []
     for number, cells, whole in lines if header else chain([(first, fields, ended)], lines):
         row = _numbers(cells)
-        if row is not None and len(row) == len(names) and all(map(isfinite, row)):
+        if row is not None and len(row) == len(names) and all(abs(number) <= LARGEST for number in row):
             rows.append([row[place] for place in where])
             at.append(number)
         elif whole:
