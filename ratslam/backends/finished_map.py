@@ -44,8 +44,8 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.startswith("map/")]
             arrays = read_arrays(archive, names, str(path))
-        known = dict(zip([name.removesuffix(".npy") for name in names], arrays, strict=True))
-        made.restore(with_prefix(known, "map/"))
+        content = dict(zip([name.removesuffix(".npy") for name in names], arrays, strict=True))
+        made.restore(with_prefix(content, "map/"))
     except InputError:
         raise
     except SPOILT as error:

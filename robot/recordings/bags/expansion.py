@@ -18,7 +18,7 @@ def _zstd(file: IO[bytes]) -> IO[bytes]:
 
 
 def _lz4(file: IO[bytes]) -> IO[bytes]:
-    import lz4.frame
+    import lz4.frame  # type: ignore[import-untyped]
 
     return cast(IO[bytes], lz4.frame.open(file))
 
