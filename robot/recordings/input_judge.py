@@ -338,7 +338,8 @@ def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
         return None
     found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
-    cure = "record them in double precision, or take velocities: --set recording.topics.odometry.use=twist"
+    cure = "write them in double precision or from a near origin; of a bag, take velocities: "
+    cure += "--set recording.topics.odometry.use=twist"
     return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
 
 
