@@ -64,7 +64,7 @@ def read_bag(
     if views is not None:
         rows, columns = views.values.shape[1:3]
         shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
-    recording = RecordingRows(odometry.time, odometry.motion, shape, whiskers)
+    recording = RecordingRows(str(path), odometry.time, odometry.motion, shape, whiskers)
     if views is not None:
         part = config.views or config.touch
         _place_views(recording, views, part.tolerance if part else None, report)
@@ -73,7 +73,7 @@ def read_bag(
         recording.truth, faults = interpolated_poses(odometry.time, *given)
         recording.errors += faults
     judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
-    return recording.source(path.stem, bag_digest(path), str(path), judge)
+    return recording.source(path.stem, bag_digest(path), judge)
 
 
 def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
