@@ -40,7 +40,7 @@ class RecordingRows:
             previous row.
         shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
         errors: found so far. held: whether the odometry was recorded as velocities. poses: [N, 3] as
-            recorded, where poses were. place: names a row; None: by its number. cures: what to set for a unit.
+            recorded, where poses were. place: names a row; None: by its number. cures: of wrong units.
         views, seen, label, truth, contact, point: as in `InMemorySource`. sensors: the whiskers that make
             contacts, if any.
     """
