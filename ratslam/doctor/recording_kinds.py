@@ -188,7 +188,7 @@ def clock_notes(name: str, clock: Times) -> list[str]:
     }
     notes = [f"{name}: {count} messages have {words}" for words, count in counts.items() if count]
     if 0.5 < clock.ahead < 1e6:
-        cure = "if those of others are not, set recording.topics.clock to bag"
+        cure = "if those of others are not, --set recording.topics.clock=bag"
         notes.append(f"{name}: stamps are {clock.ahead:.3g} s ahead of their receipt; {cure}")
     if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
         notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")

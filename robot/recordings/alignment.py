@@ -143,7 +143,7 @@ def range_errors(
         row = int(negative.argmax())
         errors.append(InputError(place(row), f"{what} is {lowest[row]}", "ranges of 0 m or more"))
     if typical > RANGE_UNIT_FACTOR * max_range:
-        unit = "set recording.table.views.unit to mm" if key.startswith("table") else "divide by 1000"
+        unit = "--set recording.table.views.unit=mm" if key.startswith("table") else "divide by 1000"
         cure = f"{unit} if they are millimetres, else raise {key}"
         errors.append(InputError(where, f"half of the ranges are over {typical:.4g} m", "metres", cure))
     return errors

@@ -31,7 +31,7 @@ from tactile.base.errors import InputError
 
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
-RATE = "set recording.table.rate={:.6g}, the rows per second"
+RATE = "--set recording.table.rate={:.6g}, the rows per second"
 HOLE = 3
 """Rows one after another that may be left out of velocities and motions; the next row stands for them."""
 SHARED = 0.2
@@ -97,7 +97,7 @@ def read_csv_recording(
         isinstance(part, columns.VelocityColumns),
     )
     recording = RecordingRows(str(path), time, motion, shape, 0, errors + faults, held, poses, place)
-    recording.cures = lambda quantity, unit: f"set recording.table.units.{quantity} to {unit}"
+    recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
     # What belongs to a row that is left out, is left out too.
     files = Files(base, found, _whole_clock(time, kept, len(whole.lines)), warn)
     row_of = np.full(len(files.time), -1)
@@ -450,7 +450,7 @@ def read_poses(
     if part.quaternion is not None:
         return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
     heading = file.column(part.heading, "angle", units.angle)
-    cure = f"set recording.{'table' if key == 'table.pose' else key}.units.angle to deg"
+    cure = f"--set recording.{'table' if key == 'table.pose' else key}.units.angle=deg"
     if faults := heading_errors(heading, time, part.heading, str(file.path), limits, cure):
         errors += faults
         heading = np.deg2rad(heading)  # or every other check would report it again

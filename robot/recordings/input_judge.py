@@ -286,8 +286,9 @@ def _largest(steps: _Steps, wrong: np.ndarray) -> str:
         most = float(amounts[~wrong].max(initial=0))
         beyond = amounts[wrong & (amounts > 2 * most)]
         if len(beyond) and most > 0:
-            words.append(f"recording.odometry.{name} to {min(np.sqrt(most * beyond.min()), 5 * most):.2g}")
-    return f"set {' and '.join(words)}, which repeats the step before instead" if words else "drop these rows"
+            size = min(np.sqrt(most * beyond.min()), 5 * most)
+            words.append(f"--set recording.odometry.{name}={size:.2g}")
+    return f"{' '.join(words)} repeats the step before instead" if words else "drop these rows"
 
 
 def _two_publishers(poses: np.ndarray) -> Finding | None:
@@ -301,7 +302,7 @@ def _two_publishers(poses: np.ndarray) -> Finding | None:
     path, alone = float(once.sum()), float(np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum())
     found = f"{int(back.sum())} of {len(poses)} poses lead back to where the robot was before: the path is "
     found += f"{path:.4g} m, that of every second message {alone:.4g} m, so two nodes publish here"
-    cure = "set recording.topics.odometry.every to 2, or record each node under a topic of its own"
+    cure = "--set recording.topics.odometry.every=2, or record each node under a topic of its own"
     return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
 
 
@@ -315,7 +316,7 @@ def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
         return None
     found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
-    cure = "record them in double precision, or set recording.topics.odometry.use to twist for velocities"
+    cure = "record them in double precision, or take velocities: --set recording.topics.odometry.use=twist"
     return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
 
 
@@ -341,7 +342,7 @@ def unit_cure(quantity: str, unit: str) -> str:
     per = PER_UNIT[quantity][unit]
     if quantity == "time":
         return f"divide the times by {per:g}" if per > 1 else f"multiply the times by {1 / per:g}"
-    return f"set recording.odometry.{'length' if quantity == 'length' else 'turn'}_scale to {1 / per:.6g}"
+    return f"--set recording.odometry.{'length' if quantity == 'length' else 'turn'}_scale={1 / per:.6g}"
 
 
 def unit_errors(
@@ -510,4 +511,4 @@ def _differ_by_unit(a: float, b: float) -> bool:
 
 
 def _else(name: str, limits: UnitLimits) -> str:
-    return f"if it really is so, raise limits.{name} ({getattr(limits, name):g})"
+    return f"if it really is so, raise recording.limits.{name} ({getattr(limits, name):g})"

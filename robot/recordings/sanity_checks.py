@@ -49,8 +49,8 @@ def still_axis(points: np.ndarray) -> str:
 def nonfinite_errors(
     values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None, most: float = 1e20
 ) -> list[InputError]:
-    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or over `most`:
-    beyond all measure, so that sums and squares lose or overflow what they are added to."""
+    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or over `most`,
+    so that sums and squares lose what they are added to."""
     flat = values.reshape(len(values), -1)
     bad = ~(np.abs(flat) <= most)
     hit = bad.any(axis=1) if rows is None else bad.any(axis=1) & rows

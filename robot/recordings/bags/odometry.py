@@ -19,6 +19,8 @@ from tactile.base.se2 import integrate
 
 FLAT = 10.0
 """Extent in z above this many times that in y: the path does not lie in the plane."""
+AGREED = 1.2
+"""Length of the path of all frames over that of each of them, up to which their poses agree."""
 
 
 class BagOdometry(NamedTuple):
@@ -115,10 +117,10 @@ def _read_series(
         known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
         raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
     rows, kept, faults = list[Any](), list[Any](), _PoseFaults(config.plane)
-    wanted = None if config.frames is None else tuple(frame.lstrip("/") for frame in config.frames)
+    wanted = tuple(frame.lstrip("/") for frame in config.frames)
 
     def read(content: Any, place: str) -> Any:
-        if wanted not in (None, _frames_of(content)):
+        if wanted != _frames_of(content)[: len(wanted)]:
             return None
         if not twist:
             value = pose_in_plane(*PARTS[topic.kind](content), place, config.plane)
@@ -135,10 +137,11 @@ def _read_series(
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
     numbers, times, others, pairs = ([row[k] for row in rows] for k in range(4))
-    errors = _frame_errors(where, numbers, pairs, role)
-    if not errors:
-        faults.tell(where, len(rows), report)
     values = np.array(kept).reshape(-1, 3)
+    places = values[:, :2] * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict
+    errors = _frame_errors(where, numbers, pairs, role, places, report)
+    if not errors:
+        errors = faults.errors(where, role, len(rows), report)
     series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body
@@ -151,22 +154,37 @@ def _frames_of(message: Any) -> tuple[str, str]:
 
 
 def _frame_errors(
-    where: str, numbers: list[int], frames: list[tuple[str, str]], role: str
+    where: str,
+    numbers: list[int],
+    frames: list[tuple[str, str]],
+    role: str,
+    places: np.ndarray,
+    report: Report,
 ) -> list[InputError]:
-    """The error for messages of several frames: poses of different frames cannot be compared."""
+    """The error for messages of several frames whose positions [M, 2] disagree; those that agree are told.
+
+    Several nodes that publish in turn make a path longer than that of each; a frame that changes once jumps.
+    """
     counts = Counter(frames)
     if len(counts) < 2:
         return []
-    (usual, _), *others = counts.most_common()
-    parts = [
-        f"{' to '.join(filter(None, pair)) or 'no frame'} ({count})" for pair, count in counts.most_common()
-    ]
-    number = numbers[next(k for k, pair in enumerate(frames) if pair == others[0][0])]
-    found = (
-        f"messages of several frames: {', '.join(parts)}; several nodes publish here, or the frame changes"
-    )
-    cure = f"set recording.topics.{role}.frames to [{', '.join(map(repr, usual))}]"
-    return [InputError(f"{where}, message {number}", found, "one frame and child frame", cure)]
+    (usual, _), (other, _), *_ = counts.most_common()
+    parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
+    found = f"messages of several frames: {', '.join(parts)}"
+    at = f"{where}, message {numbers[frames.index(other)]}"
+    names = np.array([list(counts).index(pair) for pair in frames])
+    alone = [_length(places[names == k]) for k in range(len(counts))]
+    in_turn = (np.diff(names) != 0).sum() > len(counts)
+    if _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+        report(f"{at}: {found}; their poses agree, look at the publisher")
+        return []
+    cure = f"--set recording.topics.{role}.frames='[{', '.join(filter(None, usual))}]'"
+    found += "; several nodes publish here, or it changes"
+    return [InputError(at, found, "one frame and child frame", cure)]
+
+
+def _length(places: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
 class _PoseFaults:
@@ -193,13 +211,14 @@ class _PoseFaults:
         self._count[fault] += 1
         self._first.setdefault(fault, place)
 
-    def tell(self, where: str, total: int, report: Report) -> None:
-        """Tells each fault once, with its first place."""
+    def errors(self, where: str, role: str, total: int, report: Report) -> list[InputError]:
+        """Tells each doubt once, with its first place; the error for a path in another plane."""
         for fault, count in self._count.items():
             report(f"{self._first[fault]}: {count} of {total} {fault}; look at the publisher")
         if self._plane == "xy" and len(self._places) > 1:
             x, y, z = np.ptp(np.array(self._places), axis=0)
             if z > 0.1 * x and z > FLAT * y:
-                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z"
-                cure = "poses of a camera (z ahead)? set recording.topics.odometry.plane to xz"
-                report(f"{where}: {found}: it lies in another plane; {cure}")
+                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z: another plane"
+                cure = f"if the poses are a camera's (z ahead), --set recording.topics.{role}.plane=xz"
+                return [InputError(where, found, "a path in the plane of x and y", cure)]
+        return []

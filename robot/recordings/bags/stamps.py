@@ -124,7 +124,7 @@ def usable_stamps(
 
 def other_clock(clock: Clock) -> str:
     """The setting that takes the other times of the messages."""
-    return f"set recording.topics.clock to {OTHER_CLOCK[clock]}"
+    return f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
 
 
 def leaps(times: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -74,7 +74,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         count = f"{narrow} of {topic.total} messages"
         report(f"{where}: {count} cover less than half of the sectors and are no views")
     if wider := reader.wider_span():
-        cure = f"set {KEY}.span: [{wider[0]:.4f}, {wider[1]:.4f}]"
+        cure = f"--set {KEY}.span='[{wider[0]:.4f}, {wider[1]:.4f}]'"
         report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
     reach = reader.reach
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
@@ -180,7 +180,7 @@ class _RangeReader:
                 mount = mount_of(self._bag, self._body, sensor, self._clock)
             if mount is None:
                 frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
-                cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
+                cure = f"the sensor is taken to look ahead (else --set {KEY}.yaw=ANGLE)"
                 self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
             self._mounts[sensor] = mount or FORWARD
         return self._mounts[sensor]

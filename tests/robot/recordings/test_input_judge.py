@@ -236,11 +236,15 @@ def _faulty(kind: str) -> MotionTrack:
 
 
 JUDGED = {
-    "wild, poses": (True, "row 150: the odometry jumps by 3", "largest_step to 0.2"),
+    "wild, poses": (True, "row 150: the odometry jumps by 3", "largest_step=0.2"),
     "reset, poses": (False, "row 230: the odometry jumps by", "recording.odometry.largest_step"),
-    "two nodes, poses": (True, "two nodes publish", "recording.topics.odometry.every to 2"),
+    "two nodes, poses": (True, "two nodes publish", "recording.topics.odometry.every=2"),
     "single precision, poses": (False, "precision was lost far from the origin", "double precision"),
-    "centimetres, poses": (True, "over 40 m/s", "these are centimetres: set recording.odometry.length_scale"),
+    "centimetres, poses": (
+        True,
+        "over 40 m/s",
+        "these are centimetres: --set recording.odometry.length_scale",
+    ),
     "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
     "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
     "gap, velocities": (True, "row 220: nothing for 60.1 s", "recording.odometry.largest_step"),
@@ -279,7 +283,7 @@ def test_the_printed_cure_repeats_the_step_before(kind: str) -> None:
     told: list[str] = []
     errors = InputJudge(warn=told.append).errors(track, str, "file")
     (said,) = [*map(str, errors), *told]
-    settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+) to ([\d.]+)", said)}
+    settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+)=([\d.]+)", said)}
     correction = OdometryCorrection.model_validate(settings)
     assert InputJudge(correction=correction).errors(track, str, "file") == []
     mended = integrate(replace_steps(correction, track.motion[:, :3]))
@@ -314,7 +318,7 @@ def test_a_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path
 
 def test_limits_can_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
     path = stream(in_v=np.full(12, 40.0), truth=None)
-    refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
+    refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise recording.limits.speed (25)")
     config = RecordingConfig(file=path, limits=UnitLimits(speed=50.0))
     assert open_recording(config).length == 12
 

@@ -125,7 +125,7 @@ def test_one_disorder_is_left_out_and_more_are_cured_by_the_bag_time(
 ) -> None:
     make, pieces = STAMPS[case]
     path, told = written(tmp_path, "sqlite3", with_stamps(make(2))), list[str]()
-    refused(lambda: opened(path, views=None), *pieces, "(so in 2 of 12", "set recording.topics.clock to bag")
+    refused(lambda: opened(path, views=None), *pieces, "(so in 2 of 12", "--set recording.topics.clock=bag")
     assert opened(path, views=None, clock="bag").length == 12
     assert opened(written(tmp_path, "mcap", with_stamps(make(1))), told, views=None).length == 11
     for piece in (*pieces, "1 of 12 messages are left out"):
@@ -142,15 +142,15 @@ def test_equal_stamps_and_jumps_are_reported(tmp_path: Path, refused: Refused) -
     jump = refused(
         lambda: opened(written(tmp_path, "ros1", [*WHEELS, *leap]), views=None),
         "message 12: the odometry jumps by",
-        "set recording.odometry.largest_step to",
+        "--set recording.odometry.largest_step=",
     )
     assert "unit" not in str(jump)
 
 
 LEAPS = {  # messages from number 6 on are 60 s ahead, by the clock in their headers or by that of the bag
-    "header": ("header", "set recording.topics.clock to bag", "bag"),
-    "bag": ("bag", "set recording.topics.clock to header", "header"),
-    "both": ("header", "set recording.odometry.largest_step", ""),
+    "header": ("header", "--set recording.topics.clock=bag", "bag"),
+    "bag": ("bag", "--set recording.topics.clock=header", "header"),
+    "both": ("header", "--set recording.odometry.largest_step", ""),
 }
 
 
@@ -172,22 +172,30 @@ def test_a_velocity_does_not_hold_over_a_gap(leaping: str, tmp_path: Path, refus
         assert suggested_topics(describe_bag(path)).get("clock", "header") == right
 
 
-def test_several_publishers_are_named_and_chosen(tmp_path: Path, refused: Refused) -> None:
+@pytest.mark.parametrize("other", [("odom", "chassis"), ("map", "base_link"), ("odom", "foot")])
+def test_several_publishers_are_named_and_chosen(
+    other: tuple[str, str], tmp_path: Path, refused: Refused
+) -> None:
+    """Poses that agree, those of a foot beside those of the base, are only told."""
+
     def wheels(frame: str, child: str, shift: int) -> list[Entry]:
-        found = [odometry(time + shift, 0.1 * row, 0.0, 0.0) for row, time in enumerate(TIMES)]
+        side = 0.0 if child in ("foot", "base_link") and frame == "odom" else 0.5
+        found = [odometry(time + shift, 0.1 * row, side, 0.0) for row, time in enumerate(TIMES)]
         for entry in found:
             entry.fields["header"]["frame_id"], entry.fields["child_frame_id"] = frame, child
         return found
 
-    for other in (("odom", "chassis"), ("map", "base_link")):
-        both = [*wheels("odom", "base_link", 0), *wheels(*other, STEP // 2)]
-        path = written(tmp_path / "-".join(other), "ros1", sorted(both, key=lambda entry: entry.time))
-        pieces = ("/odom, message 1", "odom to base_link (12)", f"{' to '.join(other)} (12)")
-        refused(
-            lambda path=path: opened(path, views=None), *pieces, "odometry.frames to ['odom', 'base_link']"
-        )
-        one = opened(path, views=None, odometry={"topic": "/odom", "frames": ["odom", "base_link"]})
-        assert one.length == 12
+    both = [*wheels("odom", "base_link", 0), *wheels(*other, STEP // 2)]
+    path, told = written(tmp_path, "ros1", sorted(both, key=lambda entry: entry.time)), list[str]()
+    pieces = ("/odom, message 1", "odom to base_link (12)", f"{' to '.join(other)} (12)")
+    if other[1] == "foot":
+        assert opened(path, told, views=None).length == 24
+        assert all(piece in told[0] for piece in (*pieces, "their poses agree"))
+    else:
+        cure = "--set recording.topics.odometry.frames='[odom, base_link]'"
+        refused(lambda: opened(path, views=None), *pieces, cure)
+    one = opened(path, views=None, odometry={"topic": "/odom", "frames": ["odom", "base_link"]})
+    assert one.length == 12
 
 
 def test_numbers_that_cannot_be_are_refused(tmp_path: Path, refused: Refused) -> None:
