@@ -13,7 +13,7 @@ from robot.recordings.alignment import (
     nearest_rows,
     no_overlap_error,
 )
-from robot.recordings.bags.bag import SPOILT, Bag, bag_digest
+from robot.recordings.bags.bag import Bag, bag_digest
 from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
 from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
@@ -23,6 +23,7 @@ from robot.recordings.bags.views import KEY, read_image_views, read_range_views
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
+from robot.recordings.sanity_checks import SPOILT
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
 from tactile.base.errors import InputError
