@@ -36,29 +36,29 @@ class RecordingRows:
     """Rows of a recording while it is put together; N rows of odometry.
 
     Attributes:
-        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
+        where: names the recording. time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the
+            previous row.
         shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
-        errors: found so far. views, seen, label, truth, contact, point: as in `InMemorySource`.
-        sensors: the whiskers that make contacts, if any.
-        held: whether the odometry was recorded as velocities. poses: [N, 3] as recorded, where poses were.
-        place: names a row; None: by its number. clock: what to do if the clock is at fault. cures: what to
-        set for a unit.
+        errors: found so far. held: whether the odometry was recorded as velocities. poses: [N, 3] as
+            recorded, where poses were. place: names a row; None: by its number. cures: of wrong units.
+        views, seen, label, truth, contact, point: as in `InMemorySource`. sensors: the whiskers that make
+            contacts, if any.
     """
 
+    where: str
     time: np.ndarray
     motion: np.ndarray
     shape: tuple[int, int, int]
     whiskers: int = 0
     errors: list[InputError] = field(default_factory=list)
+    held: bool = False
+    poses: np.ndarray | None = None
+    place: RowName | None = None
+    cures: Cures = unit_cure
     truth: np.ndarray | None = None
     contact: np.ndarray | None = None
     point: np.ndarray | None = None
     sensors: PlanarWhiskersInfo | None = None
-    held: bool = False
-    poses: np.ndarray | None = None
-    place: RowName | None = None
-    clock: str = ""
-    cures: Cures = unit_cure
     views: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
     label: np.ndarray = field(init=False)
@@ -67,7 +67,9 @@ class RecordingRows:
         rows, pixels = len(self.time), prod(self.shape)
         if rows * pixels > MOST_PIXELS:
             found = f"{rows} views of {pixels} pixels"
-            raise InputError("views", found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns")
+            raise InputError(
+                self.where, found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns"
+            )
         self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
         self.label = np.full(rows, -1, np.int32)
 
@@ -80,7 +82,7 @@ class RecordingRows:
         tips = base + sensors.length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.point = tips * self.contact[:, :, None]
 
-    def source(self, name: str, digest: str, where: str, judge: InputJudge) -> InMemorySource:
+    def source(self, name: str, digest: str, judge: InputJudge) -> InMemorySource:
         """The recording as a `Source`, after it was judged.
 
         Raises:
@@ -88,8 +90,9 @@ class RecordingRows:
         """
         everywhere = np.ones(len(self.time), bool)
         track = MotionTrack(self.time, everywhere, self.motion, self.truth, self.held, self.poses)
-        place = self.place or (lambda row: f"{where}, row {row}")
-        raise_errors(self.errors + judge.errors(track, place, where, self.clock, self.cures, not self.errors))
+        place = self.place or (lambda row: f"{self.where}, row {row}")
+        judged = judge.errors(track, place, self.where, cures=self.cures, in_order=not self.errors)
+        raise_errors(self.errors + judged)
         return InMemorySource(
             name=name,
             digest=judge.stretch.digest(digest),

@@ -90,7 +90,7 @@ def describe_csv(path: Path) -> CsvDescription:
     time = time_column(file)
     parts, table, missing = dict[str, str](), dict[str, Any](), list[str]()
     if time is None or not np.isfinite(file.column(time)).any():
-        faults = file.faults(time) if time is not None else []
+        faults = file.judge([time])[1] if time is not None else []
         missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
         return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
@@ -193,7 +193,7 @@ def _units(file: CsvFile, time: str, odometry: dict[str, Any]) -> dict[str, str]
     }
     units = {}
     for kind, names in columns.items():
-        stated = {file.header.units[file.at(name)].removesuffix("/s") for name in names}
+        stated = {file.units[file.at(name)].removesuffix("/s") for name in names}
         unit = next(iter(stated)) if len(stated) == 1 else ""
         if kind == "time" and not unit and file.at(time) not in file.dates:
             first = float(np.nanmin(file.column(time)))

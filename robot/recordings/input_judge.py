@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from robot.recordings.csv_units import PER_UNIT
+from robot.recordings.csv_units import PER_UNIT, WORDS
 from robot.recordings.sanity_checks import RowName, count_others
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.odometry_correction import (
@@ -59,18 +59,6 @@ RETURNS, RETURNING = 0.25, 0.1
 COARSE = 0.1
 """Share of the typical step above which the spacing of numbers spoils it."""
 
-TIMES, LENGTHS, ANGLES = ("ms", "us", "ns", "min", "ks"), ("mm", "cm", "km"), ("deg",)
-"""Units that recordings are found in, besides s, m and rad."""
-UNIT_NAMES = {
-    **{
-        "ms": "milliseconds",
-        "us": "microseconds",
-        "ns": "nanoseconds",
-        "min": "minutes",
-        "ks": "kiloseconds",
-    },
-    **{"mm": "millimetres", "cm": "centimetres", "km": "kilometres", "deg": "degrees"},
-}
 USUAL = np.array([0.1, 0.4, 0.5])
 """Interval (s), speed (m/s) and turn rate (rad/s) of a usual robot, for the choice among units."""
 
@@ -218,7 +206,8 @@ def judge_steps(
     if len(rows) < 4:
         return
     steps = _Steps(track.time[rows], track.motion[rows])
-    gaps = steps.gaps(GAP if track.held else LONG_GAP)
+    intervals = GAP if track.held else LONG_GAP
+    gaps = steps.duration > max(intervals * steps.interval, LEAST_GAP)
     if gaps.any():
         yield _gap(steps, gaps, rows, track.held, clock)
     jumps = steps.jumps() & ~gaps
@@ -242,17 +231,9 @@ class _Steps:
         self.typical_length = _typical(self.length / self._share, np.ones(len(time)))
         self.typical_turn = _typical(self.turn / self._share, np.ones(len(time)))
 
-    def gaps(self, intervals: float) -> np.ndarray:
-        """[N] bool, steps that took more than so many median intervals, and `LEAST_GAP`."""
-        return self.duration > max(intervals * self.interval, LEAST_GAP)
-
     def jumps(self) -> np.ndarray:
         """[N] bool, the few steps that are far longer, or turn far more, than all others."""
         return _outliers(self.length / self._share, 0.0) | _outliers(self.turn / self._share, LEAST_TURN)
-
-    def longest(self, without: np.ndarray) -> tuple[float, float]:
-        """The longest step, m, and the largest turn, rad, of the others."""
-        return float(self.length[~without].max(initial=0)), float(self.turn[~without].max(initial=0))
 
 
 def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
@@ -264,9 +245,7 @@ def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     for place in range(max(first, 1), len(ordered)):
         typical = ordered[np.searchsorted(done, done[place - 1] / 2)]
         if typical > 0 and ordered[place] > max(JUMP * typical, least):
-            found = np.zeros(len(amounts), bool)
-            found[order[place:]] = True
-            return found
+            return np.asarray(amounts >= ordered[place])
     return np.zeros(len(amounts), bool)
 
 
@@ -303,9 +282,8 @@ def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits
 def _largest(steps: _Steps, wrong: np.ndarray) -> str:
     """The setting that repeats the step before each of these steps [N] bool, and of no other."""
     words = []
-    for name, amounts, most in zip(
-        ("largest_step", "largest_turn"), (steps.length, steps.turn), steps.longest(wrong), strict=True
-    ):
+    for name, amounts in (("largest_step", steps.length), ("largest_turn", steps.turn)):
+        most = float(amounts[~wrong].max(initial=0))
         beyond = amounts[wrong & (amounts > 2 * most)]
         if len(beyond) and most > 0:
             size = min(np.sqrt(most * beyond.min()), 5 * most)
@@ -391,35 +369,36 @@ def _absurd(
     robot: TypicalMotion, held: bool, limits: UnitLimits, cures: Cures
 ) -> Iterator[tuple[str, str, str]]:
     """What no robot does: finding, expectation, cure; the cure names the units that explain all of it."""
-    if not _faults(robot, held, limits):
+    faults = _faults(robot, held, limits)
+    if not faults:
         return
-    units = _explanation(robot, held, limits)
     named = {"time": "times in seconds", "length": "odometry in metres", "angle": "odometry in radians"}
     limit = {"time": "interval", "length": "speed", "angle": "turn_rate"}
-    if units:
-        parts = [f"these are {UNIT_NAMES[unit]}: {cures(key, unit)}" for key, unit in units.items()]
+    if units := _explanation(robot, held, limits):
+        typical = (
+            f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
+        )
+        parts = [f"these are {WORDS[unit].split()[0]}: {cures(key, unit)}" for key, unit in units.items()]
         for key in units:
-            words = _faults(robot, held, limits).get(key) or _in_words(robot)
-            yield words, named[key], "; ".join([*parts, _else(limit[key], limits)])
+            yield faults.get(key, typical), named[key], "; ".join([*parts, _else(limit[key], limits)])
         return
-    for key, words in _faults(robot, held, limits).items():
+    for key, words in faults.items():
         yield words, named[key], f"no unit explains it; {_else(limit[key], limits)}"
 
 
 def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, str]:
     """By quantity (time, length, angle) what is absurd, in words."""
     found = {}
-    half = f"half of the steps take over {robot.interval:.4g} s"
     if robot.interval > (min(limits.interval, HELD) if held else limits.interval):
-        found["time"] = f"{half}{', and velocities do not hold so long' * held}"
+        held_words = ", and velocities do not hold so long" * held
+        found["time"] = f"half of the steps take over {robot.interval:.4g} s{held_words}"
     elif 0 < robot.interval < SHORTEST:
         found["time"] = f"half of the steps take less than {robot.interval:.2g} s"
     if robot.speed > limits.speed:
         found["length"] = f"half of the path is driven at over {robot.speed:.4g} m/s"
     if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
-        found["angle"] = (
-            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
-        )
+        turning = f"{robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
+        found["angle"] = f"half of the turning is done at over {turning}"
     return found
 
 
@@ -427,44 +406,38 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
     """The fewest units, of time, length and angle, with which nothing is absurd; of as many, those that make
     the robot most like a usual one. {} if there are none."""
     best: tuple[float, dict[str, str]] = (np.inf, {})
-    for time, length, angle in product(
-        ("", *TIMES), ("", *(LENGTHS if robot.speed > 0 else ())), ("", *(ANGLES if robot.turn > 0 else ()))
-    ):
-        named = {"time": time, "length": length, "angle": angle}
-        seconds, metres, radians = (1 / PER_UNIT[key].get(unit, 1.0) for key, unit in named.items())
+    there = {"time": 1.0, "length": robot.speed, "angle": robot.turn}
+    for chosen in product(*(list(PER_UNIT[key])[: None if most > 0 else 1] for key, most in there.items())):
+        named = dict(zip(there, chosen, strict=True))
+        seconds, metres, radians = (1 / PER_UNIT[key][unit] for key, unit in named.items())
         rate = 1.0 if held else seconds  # velocities have their own unit of time
-        turn = robot.turn * radians * (seconds if held else 1.0)
         changed = robot._replace(
             interval=robot.interval * seconds,
             speed=robot.speed * metres / rate,
             turn_rate=robot.turn_rate * radians / rate,
-            turn=turn,
+            turn=robot.turn * radians * (seconds if held else 1.0),
         )
         if _faults(changed, held, limits):
             continue
         values = np.array([changed.interval, changed.speed, changed.turn_rate])
         unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
-        units = {key: unit for key, unit in named.items() if unit}
+        units = {key: unit for key, unit in named.items() if PER_UNIT[key][unit] != 1}
         best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
     return best[1]
 
 
-def _in_words(robot: TypicalMotion) -> str:
-    return f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
-
-
 def _unlike_truth(robot: TypicalMotion, limits: UnitLimits) -> Iterator[tuple[str, str, str]]:
     """Units of the truth, and of an odometry that disagrees with it."""
-    truth_rushes, fast = robot.true_speed > limits.speed, _else("speed", limits)
-    if truth_rushes:
+    millimetres = "divide by 1000 if it is millimetres"
+    if robot.true_speed > limits.speed:
         found = f"half of the truth's path is driven at over {robot.true_speed:.4g} m/s"
-        yield found, "truth in metres", f"{_MILLIMETRES}; {fast}"
-    if not truth_rushes and _differ_by_unit(*robot.path):
+        yield found, "truth in metres", f"{millimetres}; {_else('speed', limits)}"
+    elif _differ_by_unit(*robot.path):
         found = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
-        yield found, "both in metres", _MILLIMETRES
+        yield found, "both in metres", millimetres
     if _differ_by_unit(*robot.turning):
         found = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
-        yield found, "both in radians", _DEGREES
+        yield found, "both in radians", "multiply by pi/180 if it is degrees"
 
 
 def heading_errors(
@@ -513,10 +486,13 @@ def _compare_with_truth(
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
     length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
     speed = _typical(length[dt > 0], dt[dt > 0])
-    path = _most_of(driven), _most_of(_ruler_steps(truth[:, :2]))
+    turns = np.cumsum(motion[:, 2])[rows], np.unwrap(truth[:, 2])
     ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
-    turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
-    return speed, path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
+    turned = (np.abs(np.diff(angle[ends])) for angle in turns)
+    totals = [
+        float(np.sort(each)[:-GLITCHES].sum()) for each in (driven, _ruler_steps(truth[:, :2]), *turned)
+    ]
+    return speed, (totals[0], totals[1]), (totals[2], totals[3])
 
 
 def _ruler_steps(points: np.ndarray) -> np.ndarray:
@@ -529,10 +505,6 @@ def _ruler_steps(points: np.ndarray) -> np.ndarray:
     return np.array(steps)
 
 
-def _most_of(amounts: np.ndarray) -> float:
-    return float(np.sort(amounts)[:-GLITCHES].sum())
-
-
 def _differ_by_unit(a: float, b: float) -> bool:
     """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
     least, most = min(a, b), max(a, b)
@@ -541,7 +513,3 @@ def _differ_by_unit(a: float, b: float) -> bool:
 
 def _else(name: str, limits: UnitLimits) -> str:
     return f"if it really is so, raise recording.limits.{name} ({getattr(limits, name):g})"
-
-
-_DEGREES = "multiply by pi/180 if it is degrees"
-_MILLIMETRES = "divide by 1000 if it is millimetres"

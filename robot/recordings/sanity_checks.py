@@ -14,12 +14,42 @@ import numpy as np
 from tactile.base.errors import InputError
 
 RowName = Callable[[int], str]  # position of a row in the user's file, for errors
+SPOILT = 0.05
+"""Share of the rows or messages, but at least one, that may be left out; more are an error."""
+UPRIGHT, LEVEL = 10.0, 0.2
+"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
+
+
+def leave_out(
+    count: int, total: int, what: str, first: InputError, warn: Callable[[str], None] | None
+) -> list[InputError]:
+    """Leaves out `count` of `total` rows or messages: told as a warning, or an error if these are too many.
+
+    Args:
+        what: names them. first: why the first cannot be used.
+    """
+    if count > max(1, SPOILT * total) or count == total > 0:
+        found = f"{first.found} (so in {count} of {total} {what})" if count > 1 else first.found
+        return [InputError(first.where, found, first.expected, first.cure)]
+    if count and warn is not None:
+        expected = f"; expected {first.expected}" if first.expected else ""
+        warn(f"{first.where}: {first.found}{expected}; {count} of {total} {what} are left out")
+    return []
+
+
+def still_axis(points: np.ndarray) -> str:
+    """The axis, x or y, along which a path [N, 3] m hardly moves although it does along z; '' for none."""
+    points = points[np.isfinite(points).all(axis=1)]
+    x, y, z = np.ptp(points, axis=0) if len(points) else np.zeros(3)
+    if z <= max(UPRIGHT * min(x, y), LEVEL * max(x, y)):
+        return ""
+    return "x" if x < y else "y"
 
 
 def nonfinite_errors(
     values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None, most: float = 1e20
 ) -> list[InputError]:
-    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or beyond `most`,
+    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or over `most`,
     so that sums and squares lose what they are added to."""
     flat = values.reshape(len(values), -1)
     bad = ~(np.abs(flat) <= most)

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import SPOILT, Bag, Topic
+from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.images import COMPRESSED, IMAGES, RAW, grey_image
 from robot.recordings.bags.motions import POSES, TWISTS, twist_in_plane
 from robot.recordings.bags.scans import (
@@ -24,6 +24,7 @@ from robot.recordings.bags.stamps import leaps, nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
 from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
 from robot.recordings.input_judge import MotionTrack, typical_motion
+from robot.recordings.sanity_checks import SPOILT
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 

@@ -13,7 +13,7 @@ from robot.recordings.alignment import (
     nearest_rows,
     no_overlap_error,
 )
-from robot.recordings.bags.bag import SPOILT, Bag, bag_digest
+from robot.recordings.bags.bag import Bag, bag_digest
 from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
 from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
@@ -23,6 +23,7 @@ from robot.recordings.bags.views import KEY, read_image_views, read_range_views
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
+from robot.recordings.sanity_checks import SPOILT
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import missing_error, raise_errors
 from tactile.base.errors import InputError
@@ -64,7 +65,7 @@ def read_bag(
     if views is not None:
         rows, columns = views.values.shape[1:3]
         shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
-    recording = RecordingRows(odometry.time, odometry.motion, shape, whiskers)
+    recording = RecordingRows(str(path), odometry.time, odometry.motion, shape, whiskers)
     if views is not None:
         part = config.views or config.touch
         _place_views(recording, views, part.tolerance if part else None, report)
@@ -73,7 +74,7 @@ def read_bag(
         recording.truth, faults = interpolated_poses(odometry.time, *given)
         recording.errors += faults
     judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
-    return recording.source(path.stem, bag_digest(path), str(path), judge)
+    return recording.source(path.stem, bag_digest(path), judge)
 
 
 def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import SPOILT, TRANSFORMS, Bag
+from robot.recordings.bags.bag import TRANSFORMS, Bag
 from robot.recordings.bags.motions import yaw_of
 from robot.recordings.bags.stamps import (
     Clock,
@@ -20,7 +20,8 @@ from robot.recordings.bags.stamps import (
     read_usable,
     usable_stamps,
 )
-from robot.sources.input_files import missing_error
+from robot.recordings.sanity_checks import leave_out
+from robot.sources.input_files import missing_error, raise_errors
 from tactile.base.errors import InputError
 
 STATIC, MOVING = "/tf_static", "/tf"
@@ -70,18 +71,18 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
         if topic.kind not in TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
             continue
         where = f"{bag.path}, {topic.name}"
-        spoilt, total = list[InputError](), 0
+        spoilt, total, first = 0, 0, None
         for number, received, content in read_usable(bag, topic, "bag", lambda content, place: content):
             for each in content.transforms:
                 frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
                 move, turn = each.transform.translation, each.transform.rotation
-                shift = float(move.x), float(move.y), float(move.z)
-                quaternion = float(turn.x), float(turn.y), float(turn.z), float(turn.w)
+                shift, quaternion = (move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)
                 total += 1
                 if not (np.isfinite((*shift, *quaternion)).all() and any(quaternion)):
                     place = f"{where}, message {number}, {frames[0]} to {frames[1]}"
                     found = f"the translation is {shift} and the orientation {quaternion}"
-                    spoilt.append(InputError(place, found, "numbers, and a unit quaternion"))
+                    first = first or InputError(place, found, "numbers, and a unit quaternion")
+                    spoilt += 1
                     continue
                 link = links.setdefault(frames, Link([], [], [], []))
                 if name == STATIC:
@@ -91,11 +92,8 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
                 link.shifts.append(shift)
                 link.turns.append(quaternion)
                 link.numbers.append(number)
-        if len(spoilt) > max(1, SPOILT * total) or total == len(spoilt) > 0:
-            raise spoilt[0]
-        if spoilt:
-            count = f"{len(spoilt)} of {total} transforms cannot be used and are left out"
-            bag.warn(f"{where}: {count}; the first: {spoilt[0]}")
+        if first is not None:
+            raise_errors(leave_out(spoilt, total, "transforms", first, bag.warn))
     return links
 
 
