@@ -102,7 +102,7 @@ def read_scorecard(path: Path) -> Scorecard:
         InputError: it is missing or malformed.
     """
     file = path / "scorecard.json"
-    return read_json(file, "the scorecard.json of a scored run", Scorecard.model_validate)
+    return read_json(file, "the directory of a scored run", Scorecard.model_validate)
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
