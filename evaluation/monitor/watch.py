@@ -18,7 +18,7 @@ from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import WATCH_IMAGE, RunMonitor, RunProgress, step_count
 from tactile.base.atomic_write import write_atomically
-from tactile.base.errors import InputError
+from tactile.base.errors import os_errors_of
 
 SILENCE_LIMIT = 300.0
 """A run without output for this long counts as killed, s; compiling and the final plots take less."""
@@ -86,8 +86,5 @@ def path_length(odometry: np.ndarray) -> float:
 
 def _draw(directory: Path, seen: RunProgress) -> None:
     figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
-    try:
+    with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
         write_atomically(file, figure.savefig)
-    except OSError as error:
-        found = f"cannot be written ({error.strerror or error})"
-        raise InputError(str(file), found, "a run directory that can be written to") from None

@@ -1,8 +1,12 @@
-"""Errors in user input: place, finding, expectation and cure."""
+"""What users are told: errors in their input, with place, finding, expectation and cure; and sentences."""
 
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 _CONTROL = re.compile(
@@ -42,10 +46,24 @@ class InputError(ValueError):
         return type(self), (self.where, self.found, self.expected, self.cure)
 
 
+@contextmanager
+def os_errors_of(path: str | Path, found: str, expected: str, cure: str = "") -> Iterator[None]:
+    """Turns an `OSError` into an `InputError` of a path: `found`, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(path), f"{found} ({error.strerror or error})", expected, cure) from None
+
+
 def printable(text: str) -> str:
     """A text whose control characters, but line ends, are written out: those of a terminal, of directions of
     writing, and halves of pairs, as names and contents of files may have them."""
     return _CONTROL.sub(_written_out, text)
+
+
+def tell(sentence: str) -> None:
+    """Prints one sentence beside the results."""
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr, flush=True)
 
 
 def _written_out(found: re.Match[str]) -> str:
