@@ -90,7 +90,11 @@ def _areas(regions: np.ndarray, count: int) -> np.ndarray:
     slots = regions + (count + 1) * np.arange(maps)
     bins = np.bincount(slots.ravel(), minlength=maps * (count + 1)).reshape(maps, count + 1).T
     areas = bins[::-1].cumsum(axis=0)[-2::-1].astype(float)
-    walls = _flood_from_border(regions)
+    # The lowest wall [h, w, n] on the way by sides from each bin to the border; above its level in holes.
+    depth = _TOP - regions
+    seed = depth.copy()
+    seed[1:-1, 1:-1] = 0
+    walls = _TOP - _flood(seed, depth, _sweep_four)
     row, column, index = np.nonzero(walls > regions)
     change = np.zeros((count + 1, maps), int)
     np.add.at(change, (regions[row, column, index], index), 1)
@@ -114,14 +118,6 @@ def _flood_from_centre(levels: np.ndarray) -> np.ndarray:
     centre = levels.shape[0] // 2, levels.shape[1] // 2
     seed[centre] = levels[centre]
     return _flood(seed, levels, _sweep_four)
-
-
-def _flood_from_border(levels: np.ndarray) -> np.ndarray:
-    """The lowest wall [h, w, n] on the way by sides from each bin to the border; above its level in holes."""
-    depth = _TOP - levels
-    seed = depth.copy()
-    seed[1:-1, 1:-1] = 0
-    return _TOP - _flood(seed, depth, _sweep_four)
 
 
 def _flood(

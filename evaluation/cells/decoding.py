@@ -80,7 +80,9 @@ def decode_positions(
     order = np.argsort(time, kind="stable")
     time, truth, decoded = time[order], truth[order], decoded[order]
     error = np.linalg.norm(decoded - truth, axis=1)
-    control = _shifted_errors(truth, decoded, settings.shifts, seed)
+    least = max(len(truth) // 10, 1)
+    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, settings.shifts)
+    control = np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])
     return Decoding(time, truth, decoded, error, float(np.median(error)), control)
 
 
@@ -138,10 +140,3 @@ def _decode_half(
 def _sum_windows(window: np.ndarray, values: np.ndarray) -> np.ndarray:
     """[M, k] sums of values [T, k], whose windows [T] come in order."""
     return np.add.reduceat(values, np.flatnonzero(np.diff(window, prepend=-1)), axis=0)
-
-
-def _shifted_errors(truth: np.ndarray, decoded: np.ndarray, shifts: int, seed: int) -> np.ndarray:
-    """[shifts] median error, m."""
-    least = max(len(truth) // 10, 1)
-    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, shifts)
-    return np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])

@@ -124,7 +124,11 @@ def join_all(
     joins: list[Join] = []
     while (join := _join_some(map, views, tried, report)) is not None:
         joins.append(join)
-        _merge_keyframes(map)
+        # Merges keyframes on ground that the closures of a finished map confirm.
+        config = map.config
+        if config.merge_stood:
+            map.log.confirm(config.merge_stood)
+            map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)
     return joins
 
 
@@ -315,11 +319,3 @@ def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candi
     graph.cut.replace(solution.cut.rows)
     graph.place_pieces(log)
     map.selection.hypotheses.begin(graph.fit(), log.sequences)
-
-
-def _merge_keyframes(map: KeyframeMap) -> None:
-    """Merges keyframes on ground that the closures of a finished map confirm."""
-    config = map.config
-    if config.merge_stood:
-        map.log.confirm(config.merge_stood)
-        map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)

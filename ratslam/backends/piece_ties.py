@@ -91,7 +91,11 @@ def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.
 def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
     """All placements on a ground."""
     graph = views.graph
-    motions = _motions(graph, own)
+    # Odometry into each keyframe of the piece without its systematic errors.
+    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
+    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
+    variance[:, 2] *= graph.heading_noise.further_factor
+    motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
     compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
     places = float(np.log(max(on.ground.places(), 1.0)))
     session = Traverse(compared._replace(gain=PIECE.weigh(compared.gain)), motions)
@@ -105,11 +109,3 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
         )
         for path in find_placements(on.ground, on.odds, session)
     ]
-
-
-def _motions(graph: KeyframeGraph, own: np.ndarray) -> list[Motion]:
-    """Odometry into each keyframe of the piece without its systematic errors."""
-    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
-    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
-    variance[:, 2] *= graph.heading_noise.further_factor
-    return [Motion(*one) for one in zip(motion, variance, strict=True)]

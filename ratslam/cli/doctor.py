@@ -48,7 +48,13 @@ def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.set and not arguments.live:
         raise InputError("--set", "settings without --live", "the configuration of a live session")
     if arguments.live:
-        diagnosis = _check_live(arguments)
+        # Whether a live session could start.
+        from ratslam.config.run_config import load_config
+        from ratslam.doctor.live_check import diagnose_live
+
+        prepare_jax()
+        config = load_config(arguments.path, arguments.set)
+        diagnosis = diagnose_live(config, str(arguments.path), Path("runs"))
     elif (arguments.path / "manifest.json").exists():
         from ratslam.doctor.run_check import diagnose_run
 
@@ -80,13 +86,3 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
-
-
-def _check_live(arguments: argparse.Namespace) -> Diagnosis:
-    """Whether a live session could start."""
-    from ratslam.config.run_config import load_config
-    from ratslam.doctor.live_check import diagnose_live
-
-    prepare_jax()
-    config = load_config(arguments.path, arguments.set)
-    return diagnose_live(config, str(arguments.path), Path("runs"))

@@ -79,7 +79,11 @@ class AcceptByOdds(Acceptance):
 
     def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         self._views_prior = prior
-        self._rate_uncovered(log)
+        # Compares those sequences again whose comparison does not cover the present prior.
+        ratios = self._log_ratio.rows
+        uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
+        for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
+            self._rate(log, sequence)
         believe(graph, log, self._vote(graph, log).result.belief)
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
@@ -167,13 +171,6 @@ class AcceptByOdds(Acceptance):
         for other in np.flatnonzero(np.isfinite(self._log_ratio.rows).any(axis=1)).tolist():
             self._rate(log, other)
         return True
-
-    def _rate_uncovered(self, log: ClosureLog) -> None:
-        """Compares those sequences again whose comparison does not cover the present prior."""
-        ratios = self._log_ratio.rows
-        uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
-        for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
-            self._rate(log, sequence)
 
     def _rate(self, log: ClosureLog, sequence: int) -> None:
         """Compares a sequence, by its middle member, with raw odometry."""

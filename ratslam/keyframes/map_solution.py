@@ -190,17 +190,14 @@ def _select(
     present = graph.fit()._replace(poses=graph.pose.rows.copy())
     starts = [present, *hypotheses.follow(case, sequences)]
     if not graph.config.may_be_carried:
-        return _reconsider(graph, case, select_closures(case, starts))
+        # A selection, or the one from dead reckoning where that is more probable with less noise.
+        found = select_closures(case, starts)
+        noise, start = graph.heading_noise, starting_noise(graph.config)
+        if not seems_noisy(noise, start):
+            return found
+        reckoned = _dead_reckoned(graph, case.measurements.prior, case.place)
+        return reconsidered(case, found, reckoned, noise, start)
     return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
-
-
-def _reconsider(graph: KeyframeGraph, case: SelectionProblem, found: Selection) -> Selection:
-    """A selection, or the one from dead reckoning where that is more probable with less noise."""
-    noise, start = graph.heading_noise, starting_noise(graph.config)
-    if not seems_noisy(noise, start):
-        return found
-    reckoned = _dead_reckoned(graph, case.measurements.prior, case.place)
-    return reconsidered(case, found, reckoned, noise, start)
 
 
 def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior, place: Place) -> MapFit:

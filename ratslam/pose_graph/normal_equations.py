@@ -91,7 +91,10 @@ class ReducedEquations:
         self.fixed = component_roots(size, chains.start, chains.end)
         self.stiff = np.zeros(len(edges.i), bool)
         self.stiff[chains.edge] = True
-        tree = _spanning_tree(chains.start, chains.end, size)
+        # [M] bool: edges a-b of nodes 0..count - 1 that join the same nodes as an edge of a tree from node 0.
+        ties = csr_matrix((np.ones(len(chains.start), np.int8), (chains.start, chains.end)), (size, size))
+        _, parent = breadth_first_order(ties, 0, directed=False)
+        tree = (parent[chains.start] == chains.end) | (parent[chains.end] == chains.start)
         self.stiff[chains.direct[tree[len(chains.first) :]]] = True
 
     def step(self, poses, errors, information, damping) -> np.ndarray | None:
@@ -150,13 +153,6 @@ class ReducedEquations:
         back = _matmul(by_j.swapaxes(0, 1), information)
         # With twice the stiffness and half the residual the wrench is equal and the change half as large.
         return _matmul(back, by_j) * np.where(self.stiff, 1 + damping, 1.0), _matvec(back, residual.T)
-
-
-def _spanning_tree(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """[M] bool: edges a-b of nodes 0..count - 1 that join the same nodes as an edge of a tree from node 0."""
-    ties = csr_matrix((np.ones(len(a), np.int8), (a, b)), (count, count))
-    _, parent = breadth_first_order(ties, 0, directed=False)
-    return (parent[a] == b) | (parent[b] == a)
 
 
 def _transport_twist(twist: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:

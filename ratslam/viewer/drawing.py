@@ -99,7 +99,9 @@ class Drawing:
         self._log("health/lost", self._rr.Scalars(float(step.lost)))
         observation = step.observation
         if observation.view_seen and observation.view.size:
-            self._draw_view(observation.view)
+            pixels = np.rint(255 * np.clip(observation.view, 0.0, 1.0)).astype(np.uint8)
+            shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
+            self._log("view", self._rr.Image(shown))
         if self._run.head is not None:
             self._draw_whiskers(observation)
 
@@ -113,11 +115,6 @@ class Drawing:
             self._place_step.setdefault(step.place, step.number)
             if step.previous >= 0 and step.previous != step.place:
                 self._links.add((step.previous, step.place))
-
-    def _draw_view(self, view: np.ndarray) -> None:
-        pixels = np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
-        shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
-        self._log("view", self._rr.Image(shown))
 
     def _draw_whiskers(self, observation: Any) -> None:
         head = self._run.head
@@ -135,7 +132,11 @@ class Drawing:
         if map.activity is not None:
             self._draw_activity(map.activity)
         if map.path is not None:
-            self._draw_whole_path(map.path)
+            self._path.replace(np.array(map.path))
+            self._whole = len(self._online.rows)
+            self._draw_strip("odometry", self._odometry.rows, GREY)
+            self._draw_strip("online", self._online.rows, BLUE)
+            self._draw_strip("path", map.path, GREEN)
         recent = slice(max(0, self._whole - 1), None)
         self._draw_strip("odometry/recent", self._odometry.rows[recent], GREY)
         self._draw_strip("online/recent", self._online.rows[recent], BLUE)
@@ -143,13 +144,6 @@ class Drawing:
         self._draw_closures(map.closures)
         if map.grid is not None:
             self._draw_grid(map.grid)
-
-    def _draw_whole_path(self, path: np.ndarray) -> None:
-        self._path.replace(np.array(path))
-        self._whole = len(self._online.rows)
-        self._draw_strip("odometry", self._odometry.rows, GREY)
-        self._draw_strip("online", self._online.rows, BLUE)
-        self._draw_strip("path", path, GREEN)
 
     def _draw_strip(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
         if len(poses) > 1:

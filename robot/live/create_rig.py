@@ -90,7 +90,12 @@ class CreateRig:
             raise session_fault(OUTCOMES[stop.reason], stop.detail + self._outlook(stop.reason))
         if fault:
             raise SessionFault(fault)
-        self._check_bumper()
+        reply, now = self.robot.last_reply, time.monotonic()
+        if reply is None or not reply.bumps & Bumps.BUMPED:
+            self._free = now
+        elif now - self._free > self.create.stuck:
+            detail = f"pressed for {now - self._free:.1f} s, although the robot has backed off"
+            raise session_fault(SessionOutcome.BUMPER_STUCK, detail)
         if self._stopped():
             raise OperatorStop
 
@@ -145,14 +150,6 @@ class CreateRig:
         """Records an event."""
         if self.recorder is not None:
             self.recorder.add_event(self.now(), name, text)
-
-    def _check_bumper(self) -> None:
-        reply, now = self.robot.last_reply, time.monotonic()
-        if reply is None or not reply.bumps & Bumps.BUMPED:
-            self._free = now
-        elif now - self._free > self.create.stuck:
-            detail = f"pressed for {now - self._free:.1f} s, although the robot has backed off"
-            raise session_fault(SessionOutcome.BUMPER_STUCK, detail)
 
     def _outlook(self, reason: StopReason) -> str:
         if reason is not StopReason.UNPLUGGED:

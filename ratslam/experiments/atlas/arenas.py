@@ -15,7 +15,6 @@ from ratslam.core.session import Session
 from ratslam.experiments.atlas.arena_sessions import (
     REPORTS,
     ArenaDrive,
-    ArenaMap,
     drive_elsewhere,
     shuffled_contacts,
     store_arena_map,
@@ -58,7 +57,8 @@ class ArenaFigures(NamedTuple):
 def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     """One unknown start in the map of an arena."""
     made, drive = store_arena_map(task.seed, side, task.folder), drive_elsewhere(task.seed, side)
-    session = _session_in(made)
+    saved = read_map(made.path)
+    session = build_session(localising(saved.config, saved), saved.source)
     known = _localise(session, drive)
     mixed = _localise(session, shuffled_contacts(drive, task.seed))
     other = _localise(session, drive_elsewhere(task.seed + 1, side))
@@ -124,11 +124,6 @@ def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
 
 def _both(found: Sequence[ArenaFigures]) -> tuple[list[Judged], list[Judged]]:
     return [one.session for one in found], [one.shuffled for one in found]
-
-
-def _session_in(made: ArenaMap) -> Session:
-    saved = read_map(made.path)
-    return build_session(localising(saved.config, saved), saved.source)
 
 
 def _localise(session: Session, drive: ArenaDrive) -> Localised:

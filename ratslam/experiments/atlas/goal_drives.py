@@ -7,7 +7,6 @@ before ended. In further drives a wall is put across the way.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import networkx
@@ -121,7 +120,9 @@ class ClosedLoop:
     def __init__(self, made: DrivenMap) -> None:
         self._made = made
         self._live = live_config(made.config)
-        self._slam = _localiser_at_end(made.stored.path)
+        # Localises a robot that stands where a map ended, in that map.
+        saved = read_map(made.stored.path)
+        self._slam = Slam(localising_for_goals(saved.config, saved, "here"), saved.source)
         self._frontend = Frontend(made.config.touch)
         self._arm = VirtualArm(self._live, walls_of(made), made.end)
         self._cell = made.config.pose_cells.cell_size
@@ -205,12 +206,6 @@ class ClosedLoop:
         pose = None if estimate.lost else estimate.pose
         points = felt_points(seen, self._made.config.touch.image, self._head)
         return pose, points, sample.truth, self.pose
-
-
-def _localiser_at_end(file: Path) -> Slam:
-    """Localises a robot that stands where a map ended, in that map."""
-    saved = read_map(file)
-    return Slam(localising_for_goals(saved.config, saved, "here"), saved.source)
 
 
 def drive_pairs(
