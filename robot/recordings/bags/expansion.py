@@ -18,7 +18,7 @@ def _zstd(file: IO[bytes]) -> IO[bytes]:
 
 
 def _lz4(file: IO[bytes]) -> IO[bytes]:
-    import lz4.frame  # type: ignore[import-untyped]
+    import lz4.frame
 
     return cast(IO[bytes], lz4.frame.open(file))
 
