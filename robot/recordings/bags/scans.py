@@ -21,8 +21,6 @@ SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 RING_BEAMS = 360  # of a cloud: the nearest point of each degree
 POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types of PointField.datatype."""
-
-
 COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
