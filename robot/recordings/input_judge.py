@@ -223,6 +223,7 @@ class _Steps:
     def __init__(self, time: np.ndarray, motion: np.ndarray) -> None:
         self.time = time
         self.length, self.turn = np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])
+        self.length[0] = self.turn[0] = 0.0  # before the first row nothing is known
         self.duration = np.concatenate([[0.0], np.diff(time)])
         ahead = self.duration[self.duration > 0]
         self.interval = float(np.median(ahead)) if len(ahead) else 0.0
