@@ -212,10 +212,15 @@ def test_a_ring_of_beams_has_its_field_of_view(folder: Path) -> None:
 def test_a_recording_that_cannot_be_read_has_a_fault(
     folder: Path, name: str, fault: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """A fault that a setting cures has a configuration to set it in."""
     output = folder / "mine.yaml"
     assert main(["doctor", str(folder / name), "-o", str(output)]) == 1
     assert fault in capsys.readouterr().out
-    assert not output.exists()
+    assert output.exists() == fault.startswith("--set")
+    if output.exists():
+        cure = ["--set", fault.removeprefix("--set ")]
+        assert main(["run", str(output), "-o", str(folder / "wrong")]) == 2
+        assert main(["run", str(output), "-o", str(folder / "run"), *cure]) == 0
 
 
 @pytest.mark.parametrize(
