@@ -56,7 +56,9 @@ def watch_run(
         if before is not None and seen.status == RUNNING:
             pace = (len(seen.path) - len(before.path)) / (began - last)
         if before is None or (len(seen.path), seen.status) != (len(before.path), before.status):
-            _draw(directory, seen)
+            figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
+            with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
+                write_atomically(file, figure.savefig)
         report(status_line(seen, pace))
         if once or seen.status != RUNNING or seen.silence > patience:
             return seen
@@ -82,9 +84,3 @@ def status_line(seen: RunProgress, pace: float | None) -> str:
 def path_length(odometry: np.ndarray) -> float:
     """Length of the path by odometry [N, 3] from the start of the run, m."""
     return float(np.hypot(*np.diff(odometry[:, :2], axis=0, prepend=np.zeros((1, 2))).T).sum())
-
-
-def _draw(directory: Path, seen: RunProgress) -> None:
-    figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
-    with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
-        write_atomically(file, figure.savefig)
