@@ -129,10 +129,7 @@ def join_all(
 
 
 def _join_some(
-    map: KeyframeMap,
-    views: Views,
-    tried: set[tuple[Stretches, Stretches]],
-    report: Callable[[str], None],
+    map: KeyframeMap, views: Views, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
 ) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
