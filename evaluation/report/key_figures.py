@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.artifacts.manifest import RUNNING
+from evaluation.metrics.scorecard import position_error
 from evaluation.report.run_report import RunReport
 
 LISTED = 6
@@ -77,8 +78,7 @@ def _row(report: RunReport) -> list[str]:
 
 
 def _error(report: RunReport) -> KeyFigure:
-    quantities = report.card.quantities
-    error = quantities.get("ate_within_pieces", quantities["ate_final"])
+    error = position_error(report.card)
     if error.value is None:
         return KeyFigure("Position error", "unknown", "no truth to compare with")
     note = "" if error.odometry is None else f"odometry {error.odometry:.3g} {error.unit}"
@@ -101,13 +101,8 @@ def _grid(report: RunReport) -> list[KeyFigure]:
         return []
     score = report.grid_score.quantities
     skill = score["map_brier_skill"].value
-    return [
-        KeyFigure(
-            "Grid, Brier score",
-            f"{score['map_brier'].value:.3g}",
-            "" if skill is None else f"skill {skill:.3g}",
-        )
-    ]
+    note = "" if skill is None else f"skill {skill:.3g}"
+    return [KeyFigure("Grid, Brier score", f"{score['map_brier'].value:.3g}", note)]
 
 
 def _duration(seconds: float) -> str:

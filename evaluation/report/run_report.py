@@ -107,6 +107,9 @@ def read_run_report(directory: Path) -> RunReport:
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
+    file, score = directory / "gridscore.json", None
+    if file.exists():
+        score = read_json(file, "the scores of a grid", GridScore.model_validate)
     step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
     return RunReport(
         name=name,
@@ -124,7 +127,7 @@ def read_run_report(directory: Path) -> RunReport:
         walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
         truth_lines=lines,
         grid=grid,
-        grid_score=_grid_score(directory / "gridscore.json"),
+        grid_score=score,
         closures=read_closure_table(directory),
         views=read_closure_views(directory),
         files=list_run_files(directory),
@@ -181,10 +184,6 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     if len(path) < len(run.time) or np.array_equal(path, run.final):
         return None
     return arrange_pieces(run._replace(final=path)).final[:, :2]
-
-
-def _grid_score(file: Path) -> GridScore | None:
-    return read_json(file, "the scores of a grid", GridScore.model_validate) if file.exists() else None
 
 
 def _columns(file: Path, *names: str) -> list[np.ndarray]:

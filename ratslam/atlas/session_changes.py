@@ -7,11 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.atlas.change import RADIUS, Change, Signs, find_changes, learn_chance
-from ratslam.atlas.contact_signs import (
-    ContactMap,
-    contact_map,
-    contact_signs,
-)
+from ratslam.atlas.contact_signs import ContactMap, contact_map, contact_signs
 from ratslam.atlas.localiser import Place, Visits
 from ratslam.keyframes.appearance import WhiskerAppearance
 from tactile.whiskers.head_geometry import Head

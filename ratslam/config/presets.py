@@ -53,9 +53,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # (robot/recordings/camera/README.md). Patch normalisation is that of RatSLAM (Ball et al. 2013).
     "visual_odometry": {
         "templates": {"patch": 2},
-        "keyframes": {
-            "noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1},
-        },
+        "keyframes": {"noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1}},
     },
     # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
     "create": {},

@@ -17,12 +17,7 @@ import numpy as np
 
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.core.growable_array import GrowableArray
-from ratslam.keyframes.closure_selection import (
-    Selection,
-    SelectionProblem,
-    cut_odometry,
-    optimise_with_cuts,
-)
+from ratslam.keyframes.closure_selection import Selection, SelectionProblem, cut_odometry, optimise_with_cuts
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses

@@ -16,12 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.closure_selection import (
-    ACCEPTED_WEIGHT,
-    Selection,
-    SelectionProblem,
-    select_closures,
-)
+from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT, Selection, SelectionProblem, select_closures
 from ratslam.keyframes.odometry_noise import HeadingNoise, learn_heading_noise, log_posterior
 from ratslam.keyframes.optimizer import MapFit, System
 

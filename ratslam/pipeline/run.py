@@ -69,8 +69,7 @@ def process_source(runner: Runner, source: Source) -> bool:
     """
     samples = islice(iter(source), runner.skipped, None)
     total = None if source.length is None else source.length - runner.skipped
-    bar = tqdm(total=total, unit="step", desc=printable(source.name), file=sys.stderr, mininterval=0.5)
-    with bar, catch_interrupt(LAST_TASK) as interrupted:
+    with _bar(source, "step", total) as bar, catch_interrupt(LAST_TASK) as interrupted:
         begun = False
         while not interrupted() and (chunk := list(islice(samples, CHUNK - runner.session.steps % CHUNK))):
             begun, steps = True, runner.process(chunk)
@@ -99,22 +98,20 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     raw = config.simulation is None or config.simulation.raw
     frontend = None if raw else Frontend(config.touch, source.info.calibration)
     recorder = open_recorder(path, source)
-    bar = tqdm(
-        source,
-        unit="whisk",
-        desc=printable(source.name),
-        file=sys.stderr,
-        mininterval=0.5,
-        total=source.length,
-    )
+    bar = _bar(source, "whisk", source.length)
     with recorder, bar, catch_interrupt("closing the file") as interrupted:
-        for sample in bar:
+        for sample in source:
             if frontend is not None and isinstance(sample.reading, Cycle | Whisk):
                 sample = sample._replace(reading=frontend.features(sample.reading))
             recorder.write(sample)
+            bar.update()
             if interrupted():
                 break
         return recorder.count, interrupted()
+
+
+def _bar(source: Source, unit: str, total: int | None) -> tqdm:
+    return tqdm(total=total, unit=unit, desc=printable(source.name), file=sys.stderr, mininterval=0.5)
 
 
 def open_recorder(path: Path, source: Source) -> Recorder:

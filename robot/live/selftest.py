@@ -39,9 +39,8 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
     free = shutil.disk_usage(there).free
     if free < config.room:
         found = f"{free / 1e9:.2g} GB free"
-        raise InputError(
-            str(directory), found, f"{config.room / 1e9:.2g} GB", "make room, or choose another disk with -o"
-        )
+        cure = "make room, or choose another disk with -o"
+        raise InputError(str(directory), found, f"{config.room / 1e9:.2g} GB", cure)
     return f"disk: {free / 1e9:.0f} GB free"
 
 

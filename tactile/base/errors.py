@@ -14,10 +14,6 @@ _CONTROL = re.compile(
 )
 
 
-def _short(text: str, most: int = 600) -> str:
-    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
-
-
 class InputError(ValueError):
     """Invalid user input. The program prints the error without a traceback and exits with code 2.
 
@@ -33,7 +29,8 @@ class InputError(ValueError):
         self.found = found
         self.expected = expected
         self.cure = cure
-        found = _short(found)
+        if len(found) > 600:
+            found = f"{found[:300]} ... {found[-300:]}"
         parts = [f"{where}: {found}" if where else found]
         if expected:
             parts.append(f"expected {expected}")

@@ -79,14 +79,7 @@ class CellPlan(Settings):
     """Floating-point type of the networks."""
 
 
-PARAMETERS = (
-    "excite_sigma",
-    "inhibit_sigma",
-    "global_inhibition",
-    "energy",
-    "speed_noise",
-    "heading_noise",
-)
+PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "speed_noise", "heading_noise")
 """Columns of parameter sets, and the ranges of a `CellPlan`."""
 
 

@@ -12,12 +12,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ratslam.experiments.real.annotations import FOLDER, Label, merge_marks, read_annotators, score_contacts
-from ratslam.experiments.real.contact_page import (
-    ContactResult,
-    MarkResult,
-    draw_contacts,
-    list_contacts,
-)
+from ratslam.experiments.real.contact_page import ContactResult, MarkResult, draw_contacts, list_contacts
 from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
 from ratslam.experiments.real.spliced_hours import (
     Decide,

@@ -11,12 +11,7 @@ from robot.drivers.head.protocol import Command
 from robot.emulators.create.config import CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
 from robot.emulators.head.sensor_array import Block, block_samples
-from robot.simulation.create.strain_sensors import (
-    BodyVibration,
-    base_strains,
-    bend_whiskers,
-    fixed_whiskers,
-)
+from robot.simulation.create.strain_sensors import BodyVibration, base_strains, bend_whiskers, fixed_whiskers
 from robot.world.polygons import segment_distance
 
 
