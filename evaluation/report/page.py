@@ -10,10 +10,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
+
 from evaluation.artifacts.manifest import RUNNING
 from evaluation.metrics.scorecard import scorecard_lines
 from evaluation.report.charts import error_chart, overlay_chart, run_charts
-from evaluation.report.citation import read_citations
 from evaluation.report.closure_records import closure_records, view_records
 from evaluation.report.key_figures import compare_figures, key_figures
 from evaluation.report.palette import GRID_SCALES, PALETTE
@@ -157,3 +158,28 @@ def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str,
         "settings": run.settings,
         "files": report.files,
     }
+
+
+def read_citations(text: str) -> list[str]:
+    """The program and its references, a line each: authors, year, title, place, identifier.
+
+    Args:
+        text: the content of a CITATION.cff.
+    """
+    content = yaml.safe_load(text)
+    return [_line(entry) for entry in (content, *content.get("references", []))]
+
+
+def _line(entry: dict[str, Any]) -> str:
+    authors = [_name(author) for author in entry.get("authors", [])]
+    some = [*authors[:-1], f"and {authors[-1]}"] if len(authors) > 1 else authors
+    written = (", " if len(authors) > 2 else " ").join(some)
+    year = f" ({entry['year']})" if "year" in entry else ""
+    version = f" Version {entry['version']}." if "version" in entry else ""
+    place = entry.get("collection-title") or entry.get("journal") or ""
+    identifier = f" doi:{entry['doi']}" if "doi" in entry else ""
+    return f"{written}{year}. {entry['title']}.{version}{f' {place}.' if place else ''}{identifier}".strip()
+
+
+def _name(author: dict[str, str]) -> str:
+    return author.get("name") or f"{author.get('family-names', '')}, {author.get('given-names', '')[:1]}."

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def write_map_results(folder: Path, made: Map, time: np.ndarray) -> None:
     final, own, piece = (path[first:] for path in (made.trajectory(), made.map_trajectory(), made.pieces()))
     write_atomically(folder / "trajectory.tum", lambda path: write_tum(path, time, final))
     write_atomically(folder / "map.tum", lambda path: write_tum(path, time, own))
-    files = dict(made.files())
+    files: dict[str, Callable[[Path], Any]] = dict(made.files())
     if made.pieces().any():
         files[PIECES] = lambda path: write_pieces(path, time, piece)
     doubt, reason, pairs = made.final_doubt(), made.unjudged(), made.closures()
