@@ -7,7 +7,14 @@ it is retraced once on all keyframes and once on the earlier ones alone: two str
 each other out, but the first of them has to fit what was there before. Each map is aligned by closures along
 its own poses (`track_closures`): bent, the right one would look less likely than a wrong one. Of all these
 maps and the one before, the one that the views and the measurements together find most likely is given. The
-method is ours."""
+method is ours.
+
+Closure sequences along the poses of a map, where its views fit.
+
+Recall proposes few sequences on a stretch between two cuts of the odometry, so the stretch is bent and its
+views look as if it were elsewhere. Where the poses of two keyframes are near each other and the view fits,
+they are a closure. The rule is ours.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +22,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.gain_odds import BINS, GainOdds, learn_gain_odds
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.closure_selection import Selection, SelectionProblem, cut_odometry, optimise_with_cuts
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import ClosureLog, Verdict
+from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
 from ratslam.keyframes.optimizer import MapFit, MapProblem, System
 from ratslam.keyframes.pose_tracks import SelfTraverse
 from ratslam.keyframes.retracing import JUMP, retrace
-from ratslam.keyframes.track_closures import add_closures_along
-from ratslam.keyframes.view_fits import earlier_fits, learn_odds, view_fits
 
 ROUNDS = 3
 """Number of times that the robot is retraced."""
@@ -190,3 +195,77 @@ def _uncut(graph: KeyframeGraph) -> GrowableArray:
     cut = GrowableArray((), np.int64)
     cut.replace(np.full(graph.count, -1))
     return cut
+
+
+LONGEST = 10
+"""Largest number of closures of one sequence, which is accepted or refused as a whole."""
+
+
+def add_closures_along(log: ClosureLog, session: SelfTraverse, cuts: np.ndarray, max_gap: int) -> None:
+    """Adds to the log the earlier keyframe that fits best at the pose of each keyframe, where any fits better
+    than a new place.
+
+    Args:
+        cuts: keyframes [n], ascending, before which the odometry is cut; no sequence lies across one.
+            max_gap: largest number of keyframes between two closures of a sequence.
+    """
+    part = np.searchsorted(cuts, np.arange(session.size), side="right")
+    before, length = -1, 0
+    for frame, pose in enumerate(session.poses):
+        earlier = session.ground._replace(poses=session.poses[:frame])
+        best = earlier.best_match(pose, session.fits[frame])
+        if best is None:
+            continue
+        near = before >= 0 and frame - before <= max_gap and part[frame] == part[before]
+        follows = bool(near and length < LONGEST)
+        posterior = float(1 / (1 + np.exp(-best.gain)))
+        log.add(Candidate(frame, best.frame, best.shift, posterior, best.gain), follows)
+        before, length = frame, length + 1 if follows else 1
+
+
+SAMPLES = 60
+"""Number of stretches by which the odds of false poses are learned."""
+FIRST, FURTHER = 8, 16
+"""Keyframes by which alike places are chosen, and those after them whose fits there count."""
+ALIKE = 4
+"""Number of alike places for each stretch."""
+ELSEWHERE = 2.0
+"""Least distance of another place, as a multiple of the reach of a keyframe."""
+EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
+"""Odds that say nothing."""
+
+
+def view_fits(graph: KeyframeGraph) -> np.ndarray:
+    """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
+    (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
+    count, shifts = graph.count, 2 if np.cos(graph.sector_angle) < 0 else 1
+    fits = np.empty((count, shifts, count), np.float32)
+    every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
+    for frame in range(count):
+        fits[frame] = graph.log_odds(frame, every, reversed).reshape(shifts, count)
+        fits[frame, :, max(frame - graph.guard, 0) : frame + graph.guard + 1] = -np.inf
+    return fits
+
+
+def earlier_fits(fits: np.ndarray) -> np.ndarray:
+    """The fits [N, S, N] at earlier keyframes, -inf at later ones."""
+    later = np.triu(np.ones((len(fits), len(fits)), bool))
+    return np.where(later[:, None], np.float32(-np.inf), fits)
+
+
+def learn_odds(session: SelfTraverse) -> GainOdds:
+    """The log-odds of a fit, from those at the map's own poses and on tracks from other places that look
+    alike."""
+    true, false = session.own_fits(), [np.zeros(0)]
+    places = session.places()
+    frames = np.arange(FIRST, session.size - FIRST - FURTHER, max(session.size // SAMPLES, 1))
+    for frame in frames.tolist():
+        fits = session.scan(frame, places, FIRST)
+        apart = np.hypot(*(places - session.poses[frame])[:, :2].T)
+        facing = np.cos(places[:, 2] - session.poses[frame, 2]) > np.cos(2 * session.ground.reach_heading)
+        fits[(apart < ELSEWHERE * session.ground.reach) & facing] = -np.inf
+        for place in np.argsort(-fits, kind="stable")[:ALIKE].tolist():
+            *_, found, _ = session.follow(frame, places[place], frame + FIRST + FURTHER, EVEN)
+            false.append(found[FIRST:])
+    other = np.concatenate(false)
+    return learn_gain_odds(true[np.isfinite(true)], other[np.isfinite(other)])

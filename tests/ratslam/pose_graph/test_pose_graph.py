@@ -23,7 +23,7 @@ from ratslam.pose_graph import (
 from ratslam.pose_graph.chains import find_chains
 from ratslam.pose_graph.edges import information_matrices
 from ratslam.pose_graph.io import write_g2o
-from ratslam.pose_graph.normal_equations import ReducedEquations
+from ratslam.pose_graph.least_squares import ReducedEquations
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 from tests.helpers.g2o import read_g2o
 
