@@ -13,32 +13,6 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.cells.information import information
-from evaluation.cells.rate_map import box_samples, sum_into
-
-
-def joint_maps(
-    time: np.ndarray,
-    truth: np.ndarray,
-    activity: np.ndarray,
-    x_edges: np.ndarray,
-    y_edges: np.ndarray,
-    heading_bins: int = 8,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rates [C, B, H, W] over heading and place, NaN where the rat was not, and seconds [B, H, W].
-
-    Use few bins: 10 x 10 places and 8 headings are 800 bins for the path to fill.
-
-    Args:
-        time: [T] s. truth: [T, 3] m, m, rad. activity: [T, C]. x_edges: [W + 1] m. y_edges: [H + 1] m.
-
-    Raises:
-        InputError: lengths differ, no pose is known or no time is spent inside the edges.
-    """
-    samples = box_samples(time, truth, activity, x_edges, y_edges, heading_bins)
-    shape = (heading_bins, len(y_edges) - 1, len(x_edges) - 1)
-    flat = samples.heading * (shape[1] * shape[2]) + samples.place
-    seconds, sums = sum_into(flat, samples.seconds, samples.activity, shape)
-    return sums / np.where(seconds > 0, seconds, np.nan), seconds
 
 
 def conjunctive_information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
