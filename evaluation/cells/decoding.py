@@ -92,7 +92,7 @@ def log_posterior(
     Args:
         counts: [M, n] spikes. seconds: [M] length of each window, s. rates: [n, H, W] spikes/s, NaN where
             unknown.
-        log_prior: [H, W], zeros for a flat one; `log_occupancy` for the time spent at each place.
+        log_prior: [H, W], zeros for a flat one.
     """
     places = rates.shape[1:]
     flat = rates.reshape(len(rates), -1)
@@ -103,12 +103,6 @@ def log_posterior(
     posterior = np.full((len(counts), flat.shape[1]), -np.inf)
     posterior[:, known] = counts @ np.log(level) - np.multiply.outer(seconds, level.sum(axis=0))
     return posterior.reshape(-1, *places) + log_prior
-
-
-def log_occupancy(seconds: np.ndarray) -> np.ndarray:
-    """[H, W] logarithm of the share of time at each place, -inf where none was spent."""
-    share = seconds / seconds.sum()
-    return np.where(share > 0, np.log(np.where(share > 0, share, 1.0)), -np.inf)
 
 
 def _decode_half(

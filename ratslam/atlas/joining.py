@@ -26,8 +26,7 @@ from ratslam.alignment.following import STILL, Motion, Supposed, advance
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
 from ratslam.alignment.paths import Path, at_undriven_headings, counted_beside, keyframe_odds
-from ratslam.atlas.cross_closures import closures_along
-from ratslam.atlas.placement import Stretch, Traverse, find_placements
+from ratslam.atlas.placement import Stretch, Traverse, closures_along, find_placements
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap

@@ -19,8 +19,8 @@ from ratslam.atlas.localiser import Place, Visits
 from ratslam.keyframes.appearance import WhiskerAppearance
 from ratslam.recall.whisker_likelihood import PixelLayout, level_heights
 from tactile.base.se2 import compose
-from tactile.whiskers.contact_points import image_points
 from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.planar_whiskers import image_points
 
 
 class Touch(NamedTuple):

@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ratslam.alignment.following import Motion
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.gain_odds import PIECE, GainOdds, LearnedOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.learned_odds import LearnedOdds
 from ratslam.alignment.paths import less_where_dependent
-from ratslam.alignment.weighing import PIECE
-from ratslam.atlas.cross_closures import closures_along
-from ratslam.atlas.placement import Traverse, find_placements
+from ratslam.atlas.placement import Traverse, closures_along, find_placements
 from ratslam.backends.map_views import MapViews
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph

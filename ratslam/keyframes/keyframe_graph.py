@@ -13,14 +13,15 @@ from copy import copy, deepcopy
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.appearance import Appearance
-from ratslam.keyframes.calibration import starting_calibration, starting_noise
+from ratslam.keyframes.calibration import learn_heading_noise, starting_calibration, starting_noise
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.loop_closures import ClosureLog
-from ratslam.keyframes.odometry_noise import learn_heading_noise
 from ratslam.keyframes.optimizer import (
     NO_LINKS,
     CalibrationPrior,
@@ -31,7 +32,6 @@ from ratslam.keyframes.optimizer import (
     OdometryChain,
     solve,
 )
-from ratslam.keyframes.pieces import number_pieces
 from ratslam.pose_graph import Edges
 from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion, integrate, inverse
 
@@ -427,3 +427,22 @@ class PiecePlacement(NamedTuple):
         if of_later:
             return compose(compose(poses[i], turn), inverse(poses[j]))
         return compose(compose(poses[j], -turn), inverse(poses[i]))
+
+
+def number_pieces(broken: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    """[N] the piece of each keyframe, numbered from 0 in the order of their first keyframes.
+
+    Args:
+        broken: [N] bool, no odometry leads to the keyframe: it is cut before it, or a piece begins there.
+            closures: [M, 2] keyframes joined by accepted closures.
+    """
+    if not len(broken):
+        return np.zeros(0, int)
+    stretch = np.cumsum(broken)
+    stretch = stretch - stretch[0]  # a stretch is a run of keyframes without a break
+    later, earlier = stretch[closures].T
+    count = int(stretch[-1]) + 1
+    joined = coo_array((np.ones(len(closures), bool), (later, earlier)), shape=(count, count))
+    _, piece = connected_components(joined, directed=False)
+    _, first, number = np.unique(piece[stretch], return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number]

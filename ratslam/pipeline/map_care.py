@@ -13,7 +13,7 @@ import numpy as np
 from ratslam.atlas.crop import crop_map
 from ratslam.atlas.difference import MapContent, difference, keyframe_content
 from ratslam.backends.recall import RecallBackend
-from ratslam.config.flat_settings import flat_settings
+from ratslam.config.changed_settings import flat_settings
 from ratslam.config.strict_yaml import dump
 from ratslam.core.backend import Map
 from ratslam.core.session import Session

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ratslam.backends.registry import BACKENDS, LOCALISING
-from ratslam.config.flat_settings import flat_settings
+from ratslam.config.changed_settings import flat_settings
 from ratslam.config.run_config import RunConfig
 from tactile.base.errors import InputError
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ratslam.config.flat_settings import flat_settings
+from ratslam.config.changed_settings import flat_settings
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.map_settings import assignments
 from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES

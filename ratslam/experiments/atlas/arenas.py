@@ -22,9 +22,8 @@ from ratslam.config.run_config import RunConfig
 from ratslam.core.localisation import Localisation
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.localising import Judged, judge
-from ratslam.experiments.atlas.methods import Localised
 from ratslam.experiments.atlas.pictures import Panel, draw_panels
-from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.sessions import draw_seed
 from ratslam.experiments.trials.arena_trial import simulate_session
 from ratslam.grid.localiser import GridLocaliser

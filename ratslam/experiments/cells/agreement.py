@@ -29,7 +29,7 @@ from evaluation.cells.information import (
 from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps, tuning_curves
 from evaluation.cells.recording import BinnedSums
 from ratslam.experiments.cells.figure import CellFigure, CellTask
-from ratslam.experiments.cells.rat_recording import SECONDS, record_rat, with_active_cells
+from ratslam.experiments.cells.rat_sessions import SECONDS, record_rat, with_active_cells
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from tactile.base.errors import InputError
 

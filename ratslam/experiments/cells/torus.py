@@ -17,15 +17,21 @@ import numpy as np
 
 from evaluation.cells.autocorrelogram import autocorrelogram
 from evaluation.cells.fields import count_by_cell, find_fields
-from evaluation.cells.grid_score import HEXAGONAL, SQUARE, Lattice, lattice_scores
-from evaluation.cells.grid_spacing import LatticeShape, measure_lattice
+from evaluation.cells.grid_score import (
+    HEXAGONAL,
+    SQUARE,
+    Lattice,
+    LatticeShape,
+    lattice_scores,
+    measure_lattice,
+)
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
 from evaluation.plots import style
 from ratslam.core.precision import prepare_precision
+from ratslam.experiments.cells.boxes import choose_columns, one_of_each, sum_columns
 from ratslam.experiments.cells.figure import CellFigure, CellTask
-from ratslam.experiments.cells.place_columns import choose_columns, one_of_each, sum_columns
 from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 

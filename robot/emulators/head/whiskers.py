@@ -7,7 +7,7 @@ A whisk starts at the start of a block of samples or at the end of the previous 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,14 +20,16 @@ from robot.drivers.head.protocol import (
     CommandKind,
     FeedbackMode,
 )
+from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.emulators.head.sensor_array import Block, block_samples
 from robot.simulation.head.baseline import Baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
 from robot.simulation.head.quasistatic import WhiskerBalance, advance_balance, whiskers_at_rest
 from robot.simulation.head.whisk_stream import WallSweep, draw_noise, sensor_readings, sweep_walls
+from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, ur10_head
@@ -298,3 +300,53 @@ class ServoDrives:
         if samples < 2:
             return None
         return WhiskCommand(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))
+
+
+AHEAD = 0.1
+"""Longest extrapolation of a pose by the arm's speed, s; after that the head stands still."""
+
+
+class PoseSource(Protocol):
+    """Pose of the head over time."""
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        """Pose in the map [3] (m, m, rad) and lift above working height, m.
+
+        Args:
+            time: s, host's monotonic clock.
+        """
+        ...
+
+
+class CarriedByArm:
+    """The newest pose of an arm, extrapolated by its speed."""
+
+    def __init__(self, arm: PoseListener, placing: BaseTransformConfig) -> None:
+        self.arm, self.placing = arm, placing
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        newest = self.arm.latest()
+        if newest is None:
+            return np.zeros(3), np.inf
+        ahead = min(max(time - newest.time, -AHEAD), AHEAD)
+        tool = np.array(newest.tcp, float)
+        tool[:3] += ahead * newest.speed[:3]
+        pose, lift = pose_from_tcp(self.placing, tool)
+        # The rotation axes of the arm and of the map's headings are both vertical.
+        return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
+
+
+class AlongPath:
+    """A motion along a path that starts at the time given to `begin`; before, the path's first pose."""
+
+    def __init__(self, path: HeadPath) -> None:
+        self.path = path
+        self.began: float | None = None
+
+    def begin(self, time: float) -> None:
+        """Starts the motion at a time, s; later calls have no effect."""
+        self.began = time if self.began is None else self.began
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        since = 0.0 if self.began is None else time - self.began
+        return poses_at(self.path, np.array(since)), 0.0

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from evaluation.cells.coherence import coherence, correlate, neighbour_means
-from evaluation.cells.conjunctive import conjunctive_information, exceeds_both
 from evaluation.cells.information import (
+    conjunctive_information,
+    exceeds_both,
     information,
     information_above_mean,
     information_rate,

@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 
 from evaluation.artifacts.manifest import RUNNING
 from evaluation.artifacts.run_directory import SESSION_REPORT, read_run, read_walls
-from evaluation.monitor.plot import draw_watch
 from evaluation.monitor.progress import RunMonitor, RunProgress
-from evaluation.monitor.watch import path_length, status_line, watch_run
+from evaluation.monitor.watch import draw_watch, path_length, status_line, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor
 from ratslam.config.run_config import load_config
