@@ -17,7 +17,7 @@ from ratslam.backends.registry import BACKENDS, LOCALISING
 from ratslam.config.other_files import MAP, kind_of
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
-from ratslam.core.checkpoint import with_prefix
+from ratslam.core.checkpoint import fill_odometry, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
@@ -40,8 +40,6 @@ TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND = "estimate/", "frontend/"
-ODOMETRY = {"map/steps/odometry": "map/steps/frame", "map/odometry": "map/step_node"}
-"""Odometry of the steps, which files did not always hold, and an array with as many rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +218,7 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
         raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
-    for name, like in ODOMETRY.items():
-        if like in session:
-            session.setdefault(name, np.full((len(session[like]), 3), np.nan))
+    fill_odometry(session)
     return SavedMap(
         file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
         with_prefix(arrays, FRONTEND),
