@@ -165,9 +165,9 @@ def _bag(path: Path) -> FileContents:
         recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
         notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
-    fov = shape.fov if isinstance(shape, ScanShape) else None
-    if isinstance(shape, ScanShape) and shape.ring:
-        fov = 2 * np.pi
+    fov = None
+    if isinstance(shape, ScanShape):
+        fov = 2 * np.pi if shape.extent.ring else shape.extent.width
     if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
         recording["image"] = size
@@ -199,7 +199,8 @@ def in_words(shape: Shape | None) -> str:
     """What the messages of a topic hold."""
     match shape:
         case ScanShape():
-            turn = "all around" if shape.ring else f"over {np.degrees(abs(shape.fov)):.0f} degrees"
+            width = np.degrees(abs(shape.extent.width))
+            turn = "all around" if shape.extent.ring else f"over {width:.0f} degrees"
             return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
         case CloudShape():
             return f"{shape.points} points, median {shape.reach:.2g} m away"

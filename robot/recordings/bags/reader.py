@@ -70,8 +70,9 @@ def read_bag(
         part = config.views or config.touch
         _place_views(recording, views, part.tolerance if part else None, report)
     if truth is not None:
-        given = truth.time, truth.values, "time", truth.where
-        recording.truth, faults = interpolated_poses(odometry.time, *given)
+        recording.truth, faults = interpolated_poses(
+            odometry.time, truth.time, truth.values, "time", truth.where
+        )
         recording.errors += faults
     judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
     return recording.source(path.stem, bag_digest(path), judge)
@@ -79,16 +80,14 @@ def read_bag(
 
 def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
     """Judges the odometry as recorded, each step by the number of its message."""
-    everywhere = np.ones(len(odometry.time), bool)
-    track = MotionTrack(odometry.time, everywhere, odometry.motion, None, odometry.held, odometry.poses)
-
-    def place(row: int) -> str:
-        return f"{odometry.where}, message {odometry.numbers[row]}"
+    time, motion, where = odometry.time, odometry.motion, odometry.where
+    track = MotionTrack(time, np.ones(len(time), bool), motion, None, odometry.held, odometry.poses)
 
     def cures(quantity: str, unit: str) -> str:
         return odometry.clock or other_clock("header") if quantity == "time" else unit_cure(quantity, unit)
 
-    return judge.errors(track, place, odometry.where, odometry.clock, cures)
+    place = lambda row: f"{where}, message {odometry.numbers[row]}"  # noqa: E731
+    return judge.errors(track, place, where, odometry.clock, cures)
 
 
 def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
@@ -175,12 +174,8 @@ def _place_views(recording: RecordingRows, views: Series, tolerance: float | Non
     use = np.sort(order[first])
     beaten = near.copy()
     beaten[use] = False
-    _report_unused(
-        views,
-        beaten,
-        "farther from their sample than another (or set recording.topics.samples: views)",
-        report,
-    )
+    why = "farther from their sample than another (or set recording.topics.samples: views)"
+    _report_unused(views, beaten, why, report)
     recording.views[found.rows[use]], recording.seen[found.rows[use]] = views.values[use], True
 
 
