@@ -93,13 +93,13 @@ def _csv(path: Path) -> FileContents:
     )
     notes, faults = list(found.parts.values()), []
     what = f"{path}: a CSV file, {counted(found.rows, 'row')}"
-    if found.clock is not None:
-        clock = found.clock
-        what += f" over {clock.last - clock.first:.6g} s"
-        if clock.step <= 0 or not clock.gap > 0:
+    if found.time is not None:
+        what += f" over {found.time[-1] - found.time[0]:.6g} s"
+        steps = np.diff(found.time) if len(found.time) > 1 else np.zeros(1)
+        if np.median(steps) <= 0 or not steps.max() > 0:
             faults.append("its times do not increase")
-        elif clock.gap > 10 * clock.step:
-            notes.append(f"longest gap: {clock.gap:.3g} s after t = {clock.gap_at:.6g} s")
+        elif steps.max() > 10 * np.median(steps):
+            notes.append(f"longest gap: {steps.max():.3g} s after t = {found.time[steps.argmax()]:.6g} s")
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
     table = {"table": found.table} if found.table else None
