@@ -12,7 +12,7 @@ from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
-from tactile.base.plugins import PluginConfig, Registry, read_settings
+from tactile.base.plugins import Registry, read_settings
 from tactile.base.types import Observation
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
@@ -110,20 +110,16 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
     """
     info = source.info
     if config.frontend is not None:
-        return _with_registered_frontend(source, config.frontend)
+        where = "touch.frontend"
+        entry = TOUCH.get(config.frontend.plugin, f"{where}.plugin")
+        settings = read_settings(entry.config_class, config.frontend.settings, f"{where}.settings")
+        return TouchSource(source, lambda: entry.build(settings, source.info), where)
     if not info.raw_whiskers:
         return source
     if info.planar_whiskers is not None:
         templates = strain_templates_of(source, config.reports)
         return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
     return TouchSource(source, lambda: Frontend(config, info.calibration), "touch.head")
-
-
-def _with_registered_frontend(source: Source, config: PluginConfig) -> TouchSource:
-    where = "touch.frontend"
-    entry = TOUCH.get(config.plugin, f"{where}.plugin")
-    settings = read_settings(entry.config_class, config.settings, f"{where}.settings")
-    return TouchSource(source, lambda: entry.build(settings, source.info), where)
 
 
 def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:

@@ -14,7 +14,7 @@ from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.metrics.text_table import read_text_table
+from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
@@ -102,7 +102,7 @@ def read_scorecard(path: Path) -> Scorecard:
         InputError: it is missing or malformed.
     """
     file = path / "scorecard.json"
-    return read_json(file, "the scorecard.json of a scored run", Scorecard.model_validate)
+    return read_json(file, "the directory of a scored run", Scorecard.model_validate)
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
@@ -160,7 +160,10 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
     try:
         column = header.split(",").index(name)
         cells = [line.split(",")[column] for line in lines]
-        return np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        found = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        if ((np.abs(found) > LARGEST) & np.isfinite(found)).any():
+            raise ValueError
+        return found
     except (ValueError, IndexError):
         raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
 

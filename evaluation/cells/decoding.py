@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from evaluation.cells.rate_map import (
-    BoxSamples,
-    arena_edges,
-    box_samples,
-    rate_maps,
-    sum_samples,
-)
+from evaluation.cells.rate_map import BoxSamples, arena_edges, box_samples, rate_maps, sum_samples
 from evaluation.cells.recording import CellRecording
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
@@ -80,7 +74,9 @@ def decode_positions(
     order = np.argsort(time, kind="stable")
     time, truth, decoded = time[order], truth[order], decoded[order]
     error = np.linalg.norm(decoded - truth, axis=1)
-    control = _shifted_errors(truth, decoded, settings.shifts, seed)
+    least = max(len(truth) // 10, 1)
+    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, settings.shifts)
+    control = np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])
     return Decoding(time, truth, decoded, error, float(np.median(error)), control)
 
 
@@ -96,7 +92,7 @@ def log_posterior(
     Args:
         counts: [M, n] spikes. seconds: [M] length of each window, s. rates: [n, H, W] spikes/s, NaN where
             unknown.
-        log_prior: [H, W], zeros for a flat one; `log_occupancy` for the time spent at each place.
+        log_prior: [H, W], zeros for a flat one.
     """
     places = rates.shape[1:]
     flat = rates.reshape(len(rates), -1)
@@ -107,12 +103,6 @@ def log_posterior(
     posterior = np.full((len(counts), flat.shape[1]), -np.inf)
     posterior[:, known] = counts @ np.log(level) - np.multiply.outer(seconds, level.sum(axis=0))
     return posterior.reshape(-1, *places) + log_prior
-
-
-def log_occupancy(seconds: np.ndarray) -> np.ndarray:
-    """[H, W] logarithm of the share of time at each place, -inf where none was spent."""
-    share = seconds / seconds.sum()
-    return np.where(share > 0, np.log(np.where(share > 0, share, 1.0)), -np.inf)
 
 
 def _decode_half(
@@ -138,10 +128,3 @@ def _decode_half(
 def _sum_windows(window: np.ndarray, values: np.ndarray) -> np.ndarray:
     """[M, k] sums of values [T, k], whose windows [T] come in order."""
     return np.add.reduceat(values, np.flatnonzero(np.diff(window, prepend=-1)), axis=0)
-
-
-def _shifted_errors(truth: np.ndarray, decoded: np.ndarray, shifts: int, seed: int) -> np.ndarray:
-    """[shifts] median error, m."""
-    least = max(len(truth) // 10, 1)
-    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, shifts)
-    return np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])

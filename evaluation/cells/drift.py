@@ -65,16 +65,3 @@ def torus_sides(recording: CellRecording) -> tuple[float, float, float]:
     """Periods of the torus over x, y (m) and heading (rad)."""
     _, height, width = recording.shape
     return width * recording.cell_size, height * recording.cell_size, 2 * np.pi
-
-
-def rms_drift(drift: Drift, edges: np.ndarray) -> np.ndarray:
-    """[M, 2] root mean square drift of position (m) and heading (rad) between successive `edges` [M + 1] s;
-    NaN without a known pose there."""
-    known = np.isfinite(drift.error).all(axis=1)
-    squared = np.stack([(drift.error[:, :2] ** 2).sum(axis=1), drift.error[:, 2] ** 2], axis=1)[known]
-    window = np.searchsorted(edges, drift.time[known], side="right") - 1
-    inside = (window >= 0) & (window < len(edges) - 1)
-    total = np.zeros((len(edges) - 1, 2))
-    np.add.at(total, window[inside], squared[inside])
-    count = np.bincount(window[inside], minlength=len(edges) - 1)
-    return np.sqrt(total / np.where(count > 0, count, np.nan)[:, None])

@@ -66,11 +66,6 @@ def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> F
     return Fields(label_, cell, bins[large], highest)
 
 
-def count_fields(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """[n] number of fields of `find_fields` with its defaults; `seconds` [H, W] is not used."""
-    return count_by_cell(find_fields(rates), len(rates)).astype(float)
-
-
 def largest_field(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] size of the largest field, bins, 0 without; `seconds` [H, W] is not used."""
     return largest_by_cell(find_fields(rates), len(rates)).astype(float)

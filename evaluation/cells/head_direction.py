@@ -29,12 +29,6 @@ def preferred_direction(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     return np.angle(_mean_vector(rates, seconds)) % (2 * np.pi)
 
 
-def peak_direction(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """[n] heading of the highest rate, rad in [0, 2 pi), NaN without activity."""
-    bins = np.nan_to_num(rates).argmax(axis=1)
-    return np.where(peak_rate(rates, seconds) > 0, 2 * np.pi * bins / rates.shape[1], np.nan)
-
-
 def peak_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] highest rate at any heading or place, in the unit of the rates."""
     filled, _ = weigh_bins(rates, seconds)

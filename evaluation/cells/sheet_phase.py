@@ -20,7 +20,7 @@ from evaluation.cells.rate_map import (
     sum_into,
     weigh_bins,
 )
-from evaluation.cells.recording import BinnedSums, CellRecording
+from evaluation.cells.recording import CellRecording
 from tactile.base.se2 import wrap
 
 
@@ -65,19 +65,6 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     spent = sample_seconds(recording.time)[known]
     seconds, sums = sum_into(row * bins + column, spent, recording.activity[known], (bins, bins))
     return sums / np.where(seconds > 0, seconds, np.nan), seconds
-
-
-def fold_sums(sums: BinnedSums, sides: tuple[float, float], bins: int = 21) -> tuple[np.ndarray, np.ndarray]:
-    """As `folded_maps`, for all cells from sums over the box; `sides`: of the torus over x and y, m.
-
-    Right only if the axes of the box are those of the sheet: if truth and packet start with equal headings.
-    Each bin of the box is folded as a whole.
-    """
-    x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (sums.x_edges, sums.y_edges))
-    column, row = (circle_bin(2 * np.pi * at / side, bins) for at, side in zip((x, y), sides, strict=True))
-    across, down = np.eye(bins)[column], np.eye(bins)[row]
-    seconds = down.T @ sums.seconds @ across
-    return down.T @ sums.place @ across / np.where(seconds > 0, seconds, np.nan), seconds
 
 
 def map_phases(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.alignment.following import STILL, Motion, Supposed, advance_all
-from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
+from ratslam.alignment.gain_odds import PLAIN, GainOdds, Weighing, learn_gain_odds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.weighing import PLAIN, Weighing
 from tactile.base.se2 import between, wrap
 
 STRETCHES = 24

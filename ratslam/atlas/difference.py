@@ -60,7 +60,12 @@ def keyframe_content(map: KeyframeMap) -> MapContent:
 
 def difference(first: MapContent, second: MapContent) -> Difference:
     """What differs between two maps."""
-    a, b = _common(first.names, second.names)
+    # Numbers of the common places in both; of places with one name, in order.
+    places: dict[bytes, list[int]] = defaultdict(list)
+    for number in range(len(second.names) - 1, -1, -1):
+        places[second.names[number]].append(number)
+    pairs = [(number, places[name].pop()) for number, name in enumerate(first.names) if places.get(name)]
+    a, b = np.array([a for a, _ in pairs], int), np.array([b for _, b in pairs], int)
     ours, theirs = _pairs(first.closures, a, len(first.names)), _pairs(second.closures, b, len(second.names))
     closures = len(ours & theirs)
     moved, turned = _moved(first.poses[a], second.poses[b])
@@ -74,15 +79,6 @@ def difference(first: MapContent, second: MapContent) -> Difference:
         *_largest(moved),
         *_largest(turned),
     )
-
-
-def _common(first: list[bytes], second: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the common places in both; of places with one name, in order."""
-    places: dict[bytes, list[int]] = defaultdict(list)
-    for number in range(len(second) - 1, -1, -1):
-        places[second[number]].append(number)
-    pairs = [(number, places[name].pop()) for number, name in enumerate(first) if places.get(name)]
-    return np.array([a for a, _ in pairs], int), np.array([b for _, b in pairs], int)
 
 
 def _pairs(closures: np.ndarray, common: np.ndarray, count: int) -> set[tuple[int, int]]:

@@ -4,7 +4,14 @@ beyond doubt.
 A placement of one piece in the other has to explain all its views, be more likely than any other by far, and
 be found from either side. Its keyframes on common ground then give closure sequences, which are selected
 together with all others; the pieces are joined if most of their evidence stands. Anchoring whole sessions is
-Kim et al. 2010; the rule is ours."""
+Kim et al. 2010; the rule is ours.
+
+A piece of a finished map over the ground of another one.
+
+The piece is solved: as a whole it lies on the ground nearly as a rigid body. So where the robot comes back
+from a way that the other map does not have, its pose follows from all places confirmed so far, and not from a
+long way of odometry.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +22,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ratslam.alignment.comparison import Comparison
-from ratslam.alignment.following import Motion
+from ratslam.alignment.following import STILL, Motion, Supposed, advance
 from ratslam.alignment.gain_odds import GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.paths import Path, at_undriven_headings, counted_beside
-from ratslam.atlas.cross_closures import closures_along
-from ratslam.atlas.map_traverse import MapTraverse
-from ratslam.atlas.placement import find_placements
+from ratslam.alignment.paths import Path, at_undriven_headings, counted_beside, keyframe_odds
+from ratslam.atlas.placement import Stretch, Traverse, closures_along, find_placements
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map import KeyframeMap
@@ -124,15 +129,16 @@ def join_all(
     joins: list[Join] = []
     while (join := _join_some(map, views, tried, report)) is not None:
         joins.append(join)
-        _merge_keyframes(map)
+        # Merges keyframes on ground that the closures of a finished map confirm.
+        config = map.config
+        if config.merge_stood:
+            map.log.confirm(config.merge_stood)
+            map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)
     return joins
 
 
 def _join_some(
-    map: KeyframeMap,
-    views: Views,
-    tried: set[tuple[Stretches, Stretches]],
-    report: Callable[[str], None],
+    map: KeyframeMap, views: Views, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
 ) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
@@ -206,7 +212,8 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     best, *others = paths
     on = (best.odds != 0) & np.array([ground.is_near(pose) for pose in best.poses])
     common = float(on.sum() / max(session.views.shows.sum(), 1))
-    rivals = [float(path.odds.sum()) for path in others if not _is_like(ground, best, path, on)]
+    apart = [(path, between(best.poses[on], path.poses[on])) for path in others]
+    rivals = [float(path.odds.sum()) for path, moved in apart if not _is_small(ground, moved)]
     if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
     moved = fit_rigid_motion(own[on], best.poses[on])
@@ -234,11 +241,6 @@ def _weighed(ground: Ground, path: Path) -> Path:
     odds = counted_beside(ground, path)
     undriven = at_undriven_headings(ground, path)
     return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))
-
-
-def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
-    """Whether two paths place the keyframes `on` the ground [n] alike."""
-    return _is_small(ground, between(path.poses[on], other.poses[on]))
 
 
 def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
@@ -317,9 +319,61 @@ def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candi
     map.selection.hypotheses.begin(graph.fit(), log.sequences)
 
 
-def _merge_keyframes(map: KeyframeMap) -> None:
-    """Merges keyframes on ground that the closures of a finished map confirm."""
-    config = map.config
-    if config.merge_stood:
-        map.log.confirm(config.merge_stood)
-        map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)
+UNCONFIRMED = 6
+"""Keyframes without evidence for a pose, after which it is that of the piece as a rigid body."""
+TOGETHER = 20
+"""Least number of keyframes with evidence for their poses that one rigid motion brings there."""
+
+
+class MapTraverse(NamedTuple):
+    """A solved piece of n keyframes over a ground.
+
+    Attributes:
+        views: compared with the ground. poses: [n, 3] in the piece, m, m, rad. motions: [n] into each
+            keyframe, the first one's not used. hopeless: log-odds of the way to either end below which a
+            placement is dropped.
+    """
+
+    views: Comparison
+    poses: np.ndarray
+    motions: list[Motion]
+    hopeless: float
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path with keyframe k at `pose` [3]: of the whole piece as a rigid body if many places agree on
+        one; else as odometry leads, as far as it is not hopeless."""
+        way = Traverse(self.views, self.motions, self.hopeless).follow(ground, odds, k, pose)
+        confirmed = np.flatnonzero(way.path.odds > 0)
+        own, found = self.poses[way.first + confirmed], way.path.poses[confirmed]
+        together = _largest_rigid_part(ground, own, found)
+        if together.sum() < TOGETHER:
+            return way
+        moved = fit_rigid_motion(own[together], found[together])
+        return Stretch(0, self._along(ground, odds, moved))
+
+    def _along(self, ground: Ground, odds: GainOdds, moved: np.ndarray) -> Path:
+        """The path of the piece moved by `moved` [3], corrected by the views."""
+        rigid, loose = compose(moved, self.poses), np.diag(ground.variance)
+        at, inside, unconfirmed = Supposed(rigid[0], loose), False, UNCONFIRMED
+        poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
+        for k, motion in enumerate(self.motions):
+            if unconfirmed >= UNCONFIRMED:
+                at, motion = Supposed(rigid[k], loose), STILL
+            at, gain = advance(ground, at, motion, self.views.gains(k))
+            gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
+            poses[k], covariances[k] = at
+            unconfirmed = 0 if gained[k] > 0 else unconfirmed + 1
+        return Path(poses, covariances, gained)
+
+
+def _largest_rigid_part(ground: Ground, own: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """[n] bool: the most poses `own` [n, 3] that one rigid motion brings to within the ground's reaches of
+    those `found` [n, 3]."""
+    best = np.zeros(len(own), bool)
+    for k in range(len(own)):
+        apart = between(compose(compose(found[k], inverse(own[k])), own), found)
+        near = np.hypot(*apart[:, :2].T) < ground.reach
+        together = near & (np.abs(wrap(apart[:, 2])) < ground.reach_heading)
+        if together.sum() > best.sum():
+            best = together
+    return best

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ratslam.alignment.following import Motion, Supposed, move
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.gain_odds import DISTINCT, GainOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.hypotheses import Hypotheses, Recalled, SessionViews
-from ratslam.alignment.interruptions import LONGEST
-from ratslam.alignment.weighing import DISTINCT
+from ratslam.alignment.hypotheses import LONGEST, Hypotheses, Recalled, SessionViews
 from ratslam.atlas.placement import NOTHING_RECALLED
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed

@@ -13,7 +13,7 @@ import numpy as np
 from ratslam.alignment.comparison import Comparison
 from ratslam.alignment.following import Motion, Supposed
 from ratslam.alignment.gain_odds import GainOdds
-from ratslam.alignment.ground import Ground
+from ratslam.alignment.ground import Ground, Match
 from ratslam.alignment.hypotheses import HOPELESS, same_pose
 from ratslam.alignment.paths import Path, follow
 from tactile.base.se2 import between, compose
@@ -135,3 +135,19 @@ def _proposals(ground: Ground, session: Followed) -> Iterator[tuple[int, np.ndar
         newest = newest.onwards(ground, moved, *claim, float(views.posterior[k]))
         if newest.is_confirmed:
             yield k, newest.pose
+
+
+def closures_along(ground: Ground, views: Comparison, path: Path) -> list[tuple[int, Match]]:
+    """Keyframes of a session, by number, and where on the ground each fits best at its pose of a path, if it
+    fits anything there better than a new place.
+
+    Args:
+        views: of the session's n keyframes. path: of the same.
+    """
+    found = []
+    for k, pose in enumerate(path.poses):
+        gain = views.gains(k)
+        match = ground.best_match(pose, gain) if gain is not None else None
+        if match is not None:
+            found.append((k, match))
+    return found

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.alignment.weighing import DISTINCT
+from ratslam.alignment.gain_odds import DISTINCT
 from ratslam.atlas.localiser import Localiser, Place
 from ratslam.backends.config import LocaliseBackendConfig
 from ratslam.backends.finished_map import map_file, restore_map

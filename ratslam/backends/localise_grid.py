@@ -15,12 +15,11 @@ from ratslam.backends.config import GridLocaliseBackendConfig
 from ratslam.backends.finished_map import map_file, restore_map
 from ratslam.core.backend import Backend
 from ratslam.core.types import Action, Estimate, Scalar
-from ratslam.grid.agreement import counted_agreement
 from ratslam.grid.contact_features import contact_features
 from ratslam.grid.expectation import expect
 from ratslam.grid.localiser import GridLocaliser, SavedGrid
 from ratslam.grid.map import GridMap
-from ratslam.grid.search import Search, Supposed
+from ratslam.grid.search import Search, Supposed, counted_agreement
 from ratslam.grid.surfaces import draw_surfaces
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation

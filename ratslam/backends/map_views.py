@@ -10,10 +10,9 @@ import numpy as np
 from jax import lax
 
 from ratslam.alignment.comparison import Comparison
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.gain_odds import PLAIN, GainOdds, Weighing
 from ratslam.alignment.ground import Ground, ground_of
 from ratslam.alignment.self_comparison import compare_with_itself
-from ratslam.alignment.weighing import PLAIN, Weighing
 from ratslam.core.session import capacity_at
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.recall import filter
@@ -181,9 +180,7 @@ class MapViews:
                 motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
             )
             return lax.cond(
-                real,
-                lambda: self.look(moved, view, label),
-                lambda: (memory, self.no_look(memory)),
+                real, lambda: self.look(moved, view, label), lambda: (memory, self.no_look(memory))
             )
 
         return lax.scan(look, memory, (views, labels, motions, real))

@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ratslam.alignment.following import Motion
-from ratslam.alignment.gain_odds import GainOdds
+from ratslam.alignment.gain_odds import PIECE, GainOdds, LearnedOdds
 from ratslam.alignment.ground import Ground
-from ratslam.alignment.learned_odds import LearnedOdds
 from ratslam.alignment.paths import less_where_dependent
-from ratslam.alignment.weighing import PIECE
-from ratslam.atlas.cross_closures import closures_along
-from ratslam.atlas.placement import Traverse, find_placements
+from ratslam.atlas.placement import Traverse, closures_along, find_placements
 from ratslam.backends.map_views import MapViews
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -91,7 +88,11 @@ def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.
 def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
     """All placements on a ground."""
     graph = views.graph
-    motions = _motions(graph, own)
+    # Odometry into each keyframe of the piece without its systematic errors.
+    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
+    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
+    variance[:, 2] *= graph.heading_noise.further_factor
+    motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
     compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
     places = float(np.log(max(on.ground.places(), 1.0)))
     session = Traverse(compared._replace(gain=PIECE.weigh(compared.gain)), motions)
@@ -105,11 +106,3 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
         )
         for path in find_placements(on.ground, on.odds, session)
     ]
-
-
-def _motions(graph: KeyframeGraph, own: np.ndarray) -> list[Motion]:
-    """Odometry into each keyframe of the piece without its systematic errors."""
-    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
-    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
-    variance[:, 2] *= graph.heading_noise.further_factor
-    return [Motion(*one) for one in zip(motion, variance, strict=True)]

@@ -35,9 +35,7 @@ def add_commands(commands: Commands) -> None:
         "that the recording can be localised in it or continue it",
     )  # fmt: skip
     doctor.add_argument(
-        "--live",
-        action="store_true",
-        help="check the robot of a live session; moves nothing",
+        "--live", action="store_true", help="check the robot of a live session; moves nothing"
     )
     add_set(doctor)
 
@@ -48,7 +46,13 @@ def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.set and not arguments.live:
         raise InputError("--set", "settings without --live", "the configuration of a live session")
     if arguments.live:
-        diagnosis = _check_live(arguments)
+        # Whether a live session could start.
+        from ratslam.config.run_config import load_config
+        from ratslam.doctor.live_check import diagnose_live
+
+        prepare_jax()
+        config = load_config(arguments.path, arguments.set)
+        diagnosis = diagnose_live(config, str(arguments.path), Path("runs"))
     elif (arguments.path / "manifest.json").exists():
         from ratslam.doctor.run_check import diagnose_run
 
@@ -80,13 +84,3 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
-
-
-def _check_live(arguments: argparse.Namespace) -> Diagnosis:
-    """Whether a live session could start."""
-    from ratslam.config.run_config import load_config
-    from ratslam.doctor.live_check import diagnose_live
-
-    prepare_jax()
-    config = load_config(arguments.path, arguments.set)
-    return diagnose_live(config, str(arguments.path), Path("runs"))

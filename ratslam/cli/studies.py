@@ -18,10 +18,9 @@ from ratslam.cli.common import (
     positive_integer,
     prepare_jax,
     read_config,
-    tell,
 )
 from ratslam.config.packaged import find_config
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, tell
 from tactile.base.new_file import require_new_file, require_own_folder
 
 REPLACED = {
@@ -129,8 +128,7 @@ class Progress:
     ) -> None:
         self._bar.close()
         if kind is KeyboardInterrupt:
-            kept = f"{self._bar.n} {self._bar.unit}s are kept in {self._path}"
-            print(f"ratslam: {kept}; the same command continues", file=sys.stderr)
+            tell(f"{self._bar.n} {self._bar.unit}s are kept in {self._path}; the same command continues")
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
@@ -142,10 +140,7 @@ class Progress:
             for line in record.error.splitlines():
                 print(f"ratslam: error: {where}: {line}", file=sys.stderr)
         if self.failed:
-            print(
-                f"ratslam: {len(self.failed)} runs failed; delete their lines in {self._path} to repeat them",
-                file=sys.stderr,
-            )
+            tell(f"{len(self.failed)} runs failed; delete their lines in {self._path} to repeat them")
         return INPUT_ERROR if self.failed else 0
 
 
@@ -305,10 +300,10 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
-    tell("trial runs take a minute or two, and several on a busy machine")
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)
+    tell("trial runs take a minute or two, and several on a busy machine")
     print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
     runs = try_settings(config, found, arguments.cycles)
     print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")

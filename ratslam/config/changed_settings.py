@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,3 +60,16 @@ def _text(value: Any) -> str:
 
 def _plain(value: Any) -> Any:
     return value.model_dump(mode="json") if isinstance(value, BaseModel) else str(value)
+
+
+def flat_settings(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings as a configuration file nests them, each by its dotted name; an empty section is a value.
+
+    Args:
+        before: what the names begin with.
+    """
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        section = isinstance(value, dict) and value
+        flat |= flat_settings(value, f"{before}{name}.") if section else {before + name: value}
+    return flat

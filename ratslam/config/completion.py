@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ratslam.config.presets import PRESETS, PresetName
+from ratslam.config.packaged import PRESETS, PresetName
 from ratslam.config.run_config import RunConfig
 from robot.sources.odometry import odometry_extent
 from robot.sources.source import Source

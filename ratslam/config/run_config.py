@@ -13,9 +13,8 @@ from evaluation.metrics.experience_metric import ExmConfig
 from ratslam.attractor.recording_config import CellsConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.config.includes import merge_includes
-from ratslam.config.packaged import find_config
+from ratslam.config.packaged import PresetName, find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin
-from ratslam.config.presets import PresetName
 from ratslam.config.renamed_keys import RENAMED
 from ratslam.config.strict_yaml import load, validate
 from ratslam.config.strict_yaml.document import Document
@@ -103,7 +102,7 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
     backend_settings: dict[str, Any] = Field(default_factory=dict)
     """Settings of a registered method."""
     presets: tuple[PresetName, ...] | None = None
-    """Presets for the settings that are left open (`ratslam.config.presets`), the first before the others;
+    """Presets for the settings that are left open (`ratslam.config.packaged`), the first before the others;
     null: those that suit the source. The file in the run directory names those that were used."""
     session: SessionConfig = SessionConfig()
     """Precision, seed and memory."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.config.completion import complete
-from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
+from ratslam.config.other_files import BAG_PART, FOLDER, RECORDING, kind_of, refuse_other_files
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
@@ -61,6 +61,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     Raises:
         InputError: it is missing, or of no known format.
     """
+    path = path.parent if kind_of(path) == BAG_PART else path
     refuse_other_files(path, "a recording", (RECORDING, FOLDER))
     if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"

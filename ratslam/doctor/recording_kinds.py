@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import METADATA
 from robot.recordings.bags.description import (
     BagDescription,
     CloudShape,
@@ -67,11 +66,6 @@ def describe_file(path: Path) -> FileContents:
     """
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
-    if path.name == METADATA:
-        bag = _bag(path.parent)
-        if bag.recording is None:
-            return bag
-        return bag._replace(recording={"file": str(path.parent.resolve()), **bag.recording})
     if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
         return _bag(path)
     describe = KINDS.get(path.suffix.lower())
@@ -87,12 +81,10 @@ def _csv(path: Path) -> FileContents:
     from robot.recordings.csv_description import describe_csv
 
     found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
-    rows = (
-        ("column", "from", "to"),
-        *((name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns),
-    )
+    columns = [(name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns]
+    rows = (("column", "from", "to"), *columns)
     notes, faults = list(found.parts.values()), []
-    what = f"{path}: a CSV file, {counted(found.rows, 'row')}"
+    what = f"{path}: a CSV file, {found.rows} row{'s' * (found.rows != 1)}"
     if found.time is not None:
         what += f" over {found.time[-1] - found.time[0]:.6g} s"
         steps = np.diff(found.time) if len(found.time) > 1 else np.zeros(1)
@@ -139,7 +131,7 @@ def _bag(path: Path) -> FileContents:
     moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
     if found.links:
         fixed = len(found.links) - len(moving)
-        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {counted(fixed, 'fixed link')}")
+        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {fixed} fixed link{'s' * (fixed != 1)}")
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
@@ -172,11 +164,6 @@ def _bag(path: Path) -> FileContents:
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
         recording["image"] = size
     return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
-
-
-def counted(number: int, noun: str) -> str:
-    """A number of things."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def clock_notes(name: str, clock: Times) -> list[str]:

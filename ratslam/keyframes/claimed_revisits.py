@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.keyframes.appearance import near_facing
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.view_differences import near_facing
 
 RADIUS = 2.0
 """Distance within which keyframes are near each other, cells."""

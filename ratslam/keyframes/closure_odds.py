@@ -3,7 +3,29 @@
 The odds of a sequence are those of its score under the null of this session (`null_model`), times how well
 odometry foretold its place among all others (`odometry_scan`), with the calibration for which the other
 sequences vote (`calibration_vote`); or how well the map foretells it where its covariance is narrow enough to
-be linear. The rule is ours."""
+be linear. The rule is ours.
+
+The vote of all closure sequences on the calibration of the odometry, before any of them is accepted.
+
+Each sequence is true with some odds, and if it is true it favours the heading biases and turn errors with
+which odometry leads to its place. A false sequence favours none that others favour as well. Nothing is
+linearised.
+
+The null: scores of closure sequences that are false by construction, and the odds that follow.
+
+The control of recall recognises places in mirror images (`ratslam.recall.mirror`). Its sequences have the
+number and the scores of the false sequences of this world. A sequence of score s is then true with odds
+
+    true sequences per score / false sequences per score = (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t)
+
+with n sequences of the control above s0 and their mean excess t. The method is ours.
+
+How well raw odometry foretold a place among all others, for every possible calibration of the odometry.
+
+A heading bias or an error of the turns bends a long path so much that no linearisation holds. So the path is
+dead reckoned anew for each point of a grid of both. Its covariance is that of the odometry's noise alone,
+summed over the steps between two keyframes. The method is ours.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +36,10 @@ import numpy as np
 from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.acceptance import Acceptance, believe
-from ratslam.keyframes.calibration_vote import CalibrationVote, vote
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, cheapest_map, solved_map
-from ratslam.keyframes.null_model import estimate_null, log_odds
 from ratslam.keyframes.odometry_breaks import break_odometry
-from ratslam.keyframes.odometry_scan import OdometryScan
 from ratslam.keyframes.optimizer import CalibrationPrior
 from ratslam.keyframes.piece_joining import spans_beginnings, spans_pieces
 from ratslam.keyframes.verification import continues_sequence, judge_by_map
@@ -41,6 +60,79 @@ CONFIRMED_WEIGHT = 0.5
 """Least robust weight of a sequence that counts as true in the null."""
 REVIEWS = 4
 """Largest number of reviews when the final map is made."""
+
+SHRINK = 2.0
+"""Standard deviations of the vote by which its mean must differ from the prior's to count."""
+LEAST_TURN_ERROR = 0.002
+"""Least standard deviation of the turn error, rad/rad."""
+
+
+class CalibrationVote(NamedTuple):
+    """Result of a vote.
+
+    Attributes:
+        belief: heading bias and turn error, shrunk towards the prior. mean: the same, not shrunk. odds: [R]
+            log odds that each sequence is true, with the calibration that the prior and the others vote for.
+    """
+
+    belief: CalibrationPrior
+    mean: CalibrationPrior
+    odds: np.ndarray
+
+
+def vote(
+    grid: np.ndarray,
+    prior: CalibrationPrior,
+    log_ratios: np.ndarray,
+    score_odds: np.ndarray,
+    least_bias_sd: float,
+) -> CalibrationVote:
+    """The vote of R sequences on the calibrations of `grid` [G, 2], rad/m and rad/rad.
+
+    Args:
+        log_ratios: [R, G] of `OdometryScan`. score_odds: [R] log odds by their scores. least_bias_sd: least
+            standard deviation of the belief in the bias, rad/m.
+    """
+    votes = np.logaddexp(0.0, score_odds[:, None] + log_ratios)
+    total = log_prior(grid, prior) + votes.sum(axis=0)
+    others = total - votes
+    others = others - _log_sum(others)[:, None]
+    share = np.exp(total - _log_sum(total))
+    bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_bias_sd)
+    turn, turn_mean, turn_sd = _belief(share, grid[:, 1], prior.turn_error, LEAST_TURN_ERROR)
+    turn_sd = turn_sd if prior.turn_error_sd > 0 else 0.0
+    return CalibrationVote(
+        CalibrationPrior(bias, bias_sd, turn, turn_sd),
+        CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd),
+        score_odds + _log_sum(others + log_ratios),
+    )
+
+
+def log_prior(grid: np.ndarray, prior: CalibrationPrior) -> np.ndarray:
+    """[G] log prior density of the calibrations `grid` [G, 2], up to a constant."""
+    log = -0.5 * ((grid[:, 0] - prior.bias) / prior.bias_sd) ** 2
+    if prior.turn_error_sd > 0:
+        log = log - 0.5 * ((grid[:, 1] - prior.turn_error) / prior.turn_error_sd) ** 2
+    return log
+
+
+def _log_sum(values: np.ndarray) -> np.ndarray:
+    """[...] logarithm of the sum of the exponentials of finite values [..., G]; scipy's function, which also
+    handles other values, needs several times as long for few of them."""
+    largest = values.max(axis=-1)
+    return largest + np.log(np.exp(values - largest[..., None]).sum(axis=-1))
+
+
+def _belief(
+    share: np.ndarray, values: np.ndarray, prior: float, least_sd: float
+) -> tuple[float, float, float]:
+    """Mean of values [G] with weights [G], shrunk towards the prior's; the mean itself; and the standard
+    deviation about the shrunk mean."""
+    mean = float(share @ values)
+    sd = float(np.sqrt(share @ (values - mean) ** 2))
+    off = mean - prior
+    kept = prior + (off * max(0.0, 1 - (SHRINK * sd / off) ** 2) if off else 0.0)
+    return kept, mean, max(float(np.hypot(sd, mean - kept)), least_sd)
 
 
 class Ballot(NamedTuple):
@@ -79,7 +171,11 @@ class AcceptByOdds(Acceptance):
 
     def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         self._views_prior = prior
-        self._rate_uncovered(log)
+        # Compares those sequences again whose comparison does not cover the present prior.
+        ratios = self._log_ratio.rows
+        uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
+        for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
+            self._rate(log, sequence)
         believe(graph, log, self._vote(graph, log).result.belief)
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
@@ -168,13 +264,6 @@ class AcceptByOdds(Acceptance):
             self._rate(log, other)
         return True
 
-    def _rate_uncovered(self, log: ClosureLog) -> None:
-        """Compares those sequences again whose comparison does not cover the present prior."""
-        ratios = self._log_ratio.rows
-        uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
-        for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
-            self._rate(log, sequence)
-
     def _rate(self, log: ClosureLog, sequence: int) -> None:
         """Compares a sequence, by its middle member, with raw odometry."""
         members = log.members(sequence)
@@ -204,3 +293,165 @@ def finds_true_places(control: ClosureLog, log: ClosureLog, gap: int) -> np.ndar
     found[accepted[:, 0]] = accepted[:, 1]
     same = np.abs(match - found[frame]) <= gap
     return 2 * np.bincount(sequence, same, control.sequences) > control.sizes()
+
+
+LEAST_SCORE = 2.0
+"""Least score, s0, of the sequences of the control that count."""
+PRIOR_COUNT, PRIOR_EXCESS = 5.0, 7.0
+"""The prior of the excess: the number of sequences that it counts as, and their mean excess over s0."""
+PRIOR_SEQUENCES, PRIOR_KEYFRAMES = 3.0, 16.0
+"""The gamma prior of the rate of the control's sequences: as many sequences in as many keyframes."""
+TRUE_MEAN = 30.0
+"""Mean score, m, of true sequences."""
+MIN_TRUE = 5.0
+"""Least number of true sequences, T, that is expected in a session."""
+
+
+class NullModel(NamedTuple):
+    """Number of false sequences above `LEAST_SCORE`, and their mean excess over it."""
+
+    number: float
+    excess: float
+
+
+def estimate_null(scores: np.ndarray, keyframes: int) -> NullModel:
+    """The null from the scores [n] of the control's sequences in a session of so many keyframes."""
+    above = scores[scores >= LEAST_SCORE] - LEAST_SCORE
+    excess = (above.sum() + PRIOR_COUNT * PRIOR_EXCESS) / (len(above) + PRIOR_COUNT)
+    keyframes = max(keyframes, 1)
+    number = keyframes * (PRIOR_SEQUENCES + len(above)) / (PRIOR_KEYFRAMES + keyframes)
+    # A control stronger than true sequences would let evidence lower the odds.
+    return NullModel(number, min(float(excess), TRUE_MEAN))
+
+
+def log_odds(score: np.ndarray, null: NullModel, true_count: float) -> np.ndarray:
+    """[n] log odds that sequences with these scores [n] are true, before the map is asked.
+
+    Args:
+        true_count: number of true sequences known so far.
+    """
+    true = np.log(max(true_count, MIN_TRUE) / TRUE_MEAN) - score / TRUE_MEAN
+    return true - np.log(null.number / null.excess) + (score - LEAST_SCORE) / null.excess
+
+
+BIAS_SPAN, BIAS_STEPS = 0.06, 241
+"""Largest difference of a heading bias of the grid from the prior's, rad per cell, and number of biases."""
+TURN_SPAN, TURN_STEPS = 3.0, 9
+"""Largest difference of a turn error of the grid from the prior's, standard deviations, and number of turn
+errors."""
+REACH = 3.7
+"""Standard deviations of the prior beyond which points of the grid are left out."""
+UNLIKELY = -60.0
+"""Log ratio of a place that odometry excludes."""
+POINTS = 64
+"""Points of the grid that are computed together: few enough that their paths stay in the processor's
+cache."""
+
+
+class OdometryScan:
+    """Dead-reckoned paths of a keyframe graph for all calibrations of the grid. Holds nothing that does not
+    follow from the graph, so a checkpoint leaves it out.
+
+    Attributes:
+        grid: [G, 2] heading biases, rad/m, and turn errors, rad/rad.
+    """
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._graph = graph
+        prior, spans = graph.prior, np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS)
+        bias = prior.bias + np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / graph.cell
+        turn = prior.turn_error + (spans * prior.turn_error_sd if prior.turn_error_sd > 0 else np.zeros(1))
+        self.grid = np.stack(np.meshgrid(bias, turn, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets all paths; they are computed anew from the graph."""
+        self._count = 1
+        self._total = np.zeros((1, 3))  # sums of heading, distance and net turn of the odometry
+        self._end = np.zeros(len(self.grid), complex)
+        self._position = np.zeros((1, len(self.grid)), np.complex64)  # half the memory; 1e-7 of the distance
+
+    def near(self, prior: CalibrationPrior, reach: float = REACH) -> np.ndarray:
+        """Points of the grid within `reach` standard deviations of the prior, of bias and turn error
+        together; at least three biases."""
+        bias, turn_error = np.abs(self.grid - (prior.bias, prior.turn_error)).T
+        third = float(np.sort(np.abs(np.unique(self.grid[:, 0]) - prior.bias))[2])
+        apart = bias / max(reach * prior.bias_sd, third)
+        if prior.turn_error_sd > 0:
+            apart = np.hypot(apart, turn_error / (reach * prior.turn_error_sd))
+        return np.flatnonzero(apart <= 1)
+
+    def log_ratios(self, member: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """[G] log of the probability density that odometry gave to the place of a closure, over its mean
+        density at all keyframes that could be recalled.
+
+        Args:
+            member: keyframe, match and shift of the closure. near: points of the grid to compute; elsewhere
+                NaN.
+        """
+        self._extend()
+        ratios = np.full(len(self.grid), np.nan)
+        for first in range(0, len(near), POINTS):
+            points = near[first : first + POINTS]
+            ratios[points] = self._ratios_at(member, points)
+        return ratios
+
+    def _ratios_at(self, member: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """[g] of `log_ratios` at these points of the grid."""
+        j, i, shift = (int(value) for value in member[:3])
+        heading = self._total[: j + 1, :1] + self._total[: j + 1, 1:] @ self.grid[points].T
+        position = self._position[: j + 1, points].astype(complex)
+        root = np.linalg.cholesky(np.linalg.inv(self._covariance(i, j, position)))  # of the information
+        old = max(j - self._graph.guard, 1)
+        x, y = position.real[:old] - position.real[j], position.imag[:old] - position.imag[j]
+        turned = heading[:old] - shift * self._graph.sector_angle - heading[j]
+        turned -= 2 * np.pi * np.rint(turned / (2 * np.pi))
+        along = root[:, 0, 0] * x + root[:, 1, 0] * y + root[:, 2, 0] * turned
+        across = root[:, 1, 1] * y + root[:, 2, 1] * turned
+        distance = along**2 + across**2 + (root[:, 2, 2] * turned) ** 2
+        total = np.maximum(np.exp(-distance / 2).sum(axis=0), 1.0)
+        return np.maximum(np.log(old) - distance[i] / 2 - np.log(total), UNLIKELY)
+
+    def _covariance(self, i: int, j: int, position: np.ndarray) -> np.ndarray:
+        """[g, 3, 3] covariance of the motion from keyframe i to j in the frame of the path, with the gate.
+
+        Args:
+            position: [j + 1, g] of all keyframes up to j.
+        """
+        config, graph = self._graph.config, self._graph
+        variance = graph.variances(graph.cut)[i + 1 : j + 1, 1:]
+        along, heading = variance.sum(axis=0)
+        lever = position[j] - position[i + 1 : j + 1]
+        x, y = lever.real, lever.imag
+        gate = (config.gate_sd * graph.cell) ** 2 + along
+        covariance = np.empty((position.shape[1], 3, 3))
+        covariance[:, 0, 0] = variance[:, 1] @ y**2 + gate
+        covariance[:, 1, 1] = variance[:, 1] @ x**2 + gate
+        covariance[:, 0, 1] = covariance[:, 1, 0] = -(variance[:, 1] @ (x * y))
+        covariance[:, 0, 2] = covariance[:, 2, 0] = -(variance[:, 1] @ y)
+        covariance[:, 1, 2] = covariance[:, 2, 1] = variance[:, 1] @ x
+        covariance[:, 2, 2] = heading + config.gate_heading**2
+        return covariance
+
+    def _extend(self) -> None:
+        """Dead reckons the keyframes added since the last call, one at a time, so that every path has the
+        same bits whenever it is computed."""
+        graph = self._graph
+        self._reserve(graph.count)
+        for k in range(self._count, graph.count):
+            motion, length = graph.motion.rows[k], graph.length.rows[k]
+            before, step = self._total[k - 1], np.array([motion[2], length, motion[2]])
+            self._total[k] = before + step
+            middle = before[0] + (before[1:] + step[1:] / 2) @ self.grid.T
+            self._end = self._end + complex(motion[0], motion[1]) * np.exp(1j * middle)
+            self._position[k] = self._end
+        self._count = max(graph.count, 1)
+
+    def _reserve(self, count: int) -> None:
+        if count <= len(self._total):
+            return
+        for name in ("_total", "_position"):
+            old = getattr(self, name)
+            new = np.zeros((max(256, 2 * count), *old.shape[1:]), old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)

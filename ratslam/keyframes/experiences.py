@@ -71,7 +71,10 @@ class Experiences(Checkpointed):
             action = Action.SET if known or previous < 0 else Action.LINK
         self._place.append(place)
         if place != previous and previous >= 0:
-            self._traverse(previous, place)
+            if (previous, place) not in self._link_of:
+                self._link_of[previous, place] = len(self._link.rows)
+                self._link.append((previous, place, 0))
+            self._link.rows[self._link_of[previous, place], 2] += 1
         self._current = place
         return ExperienceChange(place, previous, action)
 
@@ -145,12 +148,6 @@ class Experiences(Checkpointed):
             return self._current
         best = int(np.argmin(far))
         return best if reliable and far[best] <= 1 else -1
-
-    def _traverse(self, a: int, b: int) -> None:
-        if (a, b) not in self._link_of:
-            self._link_of[a, b] = len(self._link.rows)
-            self._link.append((a, b, 0))
-        self._link.rows[self._link_of[a, b], 2] += 1
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ratslam.alignment.learned_odds import LearnedOdds
+from ratslam.alignment.gain_odds import LearnedOdds
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.types import Estimate
@@ -159,7 +159,7 @@ class KeyframeMap(Checkpointed, Map):
         return np.column_stack([step[judged[:, :2]], judged[:, 2]])
 
     def pieces(self) -> np.ndarray:
-        """[T] the piece of each step, see `ratslam.keyframes.pieces`."""
+        """[T] the piece of each step, see `ratslam.keyframes.keyframe_graph`."""
         return self._steps.of_keyframes(self.keyframe_pieces())
 
     def keyframe_pieces(self) -> np.ndarray:

@@ -19,7 +19,13 @@ def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None
     middle = members[len(members) // 2]
     found = turn_on_spot(pose[middle[1]], -middle[2] * graph.sector_angle)
     carried = compose(found, inverse(pose[middle[0]]))
-    at = _find_first_carried(graph, log, carried, int(members[0, 0]))
+    # The first keyframe whose views fit better at the poses moved by `carried` [3].
+    first = int(members[0, 0])
+    anchored = log.table()[log.accepted_rows(), 0]
+    began = int(np.flatnonzero(graph.begins.rows[: first + 1]).max(initial=0))
+    since = max(int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap, began)
+    frames = np.arange(max(since, first - SEARCH, 1), first + 1)
+    at = _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
     graph.cut.rows[at] = sequence
     pose[at:] = compose(carried, pose[at:])
     log.strike(at, sequence)
@@ -32,15 +38,6 @@ def find_break(
     """The keyframe before which the odometry is cut; see `closure_selection.FindCut`."""
     frames = np.arange(since + 1, since + 1 + len(onwards))[-SEARCH:]
     return _find_turning_point(graph, frames, poses, onwards[-SEARCH:], carried)
-
-
-def _find_first_carried(graph: KeyframeGraph, log: ClosureLog, carried: np.ndarray, first: int) -> int:
-    """The first keyframe whose views fit better at the poses moved by `carried` [3]."""
-    anchored = log.table()[log.accepted_rows(), 0]
-    began = int(np.flatnonzero(graph.begins.rows[: first + 1]).max(initial=0))
-    since = max(int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap, began)
-    frames = np.arange(max(since, first - SEARCH, 1), first + 1)
-    return _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
 
 
 def _find_turning_point(

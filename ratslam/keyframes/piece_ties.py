@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.alignment.learned_odds import LearnedOdds
+from ratslam.alignment.gain_odds import LearnedOdds
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict

@@ -14,13 +14,13 @@ import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.calibration import HeadingNoise
 from ratslam.keyframes.closure_selection import FINE, STEPS
 from ratslam.keyframes.delayed_job import DelayedJob
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.map_hypotheses import MapHypotheses
 from ratslam.keyframes.map_solution import selected_solution
-from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import MapFit, solve
 from tactile.base.se2 import compose, inverse
 

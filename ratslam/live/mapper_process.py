@@ -296,7 +296,10 @@ def _map(line: Connection) -> None:
         fed.calibrate()
         source = open_touch_source(fed, config.touch)
         with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
-            _redirect_stderr(job.directory / LOG)
+            # Sends the output of the process, including tracebacks, to a file: the terminal is the parent's.
+            path = job.directory / LOG
+            with path.open("ab") as file:
+                os.dup2(file.fileno(), sys.stderr.fileno())
             line.send(True)
             for sample in source:
                 (step,) = runner.process([sample])
@@ -322,9 +325,3 @@ def _mapped_sample(
 def _send(line: Connection, message: Any) -> None:
     with suppress(OSError):  # the parent has ended: results go to the disk only
         line.send(message)
-
-
-def _redirect_stderr(path: Path) -> None:
-    """Sends the output of the process, including tracebacks, to a file: the terminal is the parent's."""
-    with path.open("ab") as file:
-        os.dup2(file.fileno(), sys.stderr.fileno())

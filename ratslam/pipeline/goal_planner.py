@@ -28,8 +28,8 @@ from robot.world.head_trajectory import MotionConfig
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tactile.features.whisker_image import ImageConfig
-from tactile.whiskers.contact_points import image_points
 from tactile.whiskers.head_geometry import Head
+from tactile.whiskers.planar_whiskers import image_points
 
 if TYPE_CHECKING:
     import networkx

@@ -13,7 +13,7 @@ import numpy as np
 from ratslam.atlas.crop import crop_map
 from ratslam.atlas.difference import MapContent, difference, keyframe_content
 from ratslam.backends.recall import RecallBackend
-from ratslam.config.flat_settings import flat_settings
+from ratslam.config.changed_settings import flat_settings
 from ratslam.config.strict_yaml import dump
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
@@ -24,6 +24,7 @@ from ratslam.pipeline.folder_change import change_folder, finish_change, unfinis
 from ratslam.pipeline.map_results import holds_results, rewrite_results
 from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.pipeline.sensor import disagreement
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file, require_writable
 
@@ -211,12 +212,9 @@ def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
     session, made = _keyframe_session(saved, "crop")
     backend = session.backend
     assert isinstance(backend, RecallBackend)
-    try:
-        inside = choose(made)
-        cropped = crop_map(made, backend.new_map(), inside)
-    except ValueError as error:
-        cure = "`ratslam map info` says where the map lies and how many steps and pieces it has"
-        raise InputError(str(saved.path), str(error), "a part of the map", cure) from None
+    cure = "`ratslam map info` says where the map lies and how many steps and pieces it has"
+    with malformed(saved.path, "a part of the map", cure, "{}", (ValueError,)):
+        cropped = crop_map(made, backend.new_map(), choose(made))
     steps = len(made.pieces())
     session.change_rows(cropped.rows.rows, steps, lambda state: backend.crop_rows(state, cropped))
     if cropped.elsewhere:

@@ -5,9 +5,16 @@ logarithmic error), Carlone et al. 2014 (headings first, then positions).
 """
 
 from ratslam.pose_graph.edges import Edges, ErrorFunction, difference_error, logmap_error
-from ratslam.pose_graph.least_squares import Solution, Termination, least_squares
+from ratslam.pose_graph.least_squares import (
+    Kernel,
+    Solution,
+    Termination,
+    geman_mcclure,
+    huber,
+    least_squares,
+    no_kernel,
+)
 from ratslam.pose_graph.linear_init import linear_initialization
-from ratslam.pose_graph.robust_kernels import Kernel, geman_mcclure, huber, no_kernel
 
 __all__ = [
     "Edges",

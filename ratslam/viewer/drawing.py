@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import GridDrawing, PoseCellActivity
 from ratslam.pipeline.progress import MapReport, RunDescription, StepReport
-from ratslam.viewer.judgements import VERDICTS, VerdictLog
-from ratslam.viewer.layout import blueprint
-from ratslam.viewer.whisker_shapes import whisker_curves
+from tactile.whiskers.head_geometry import Head
 
 APPLICATION = "ratslam"
 GREY, BLUE, GREEN, RED, ORANGE = (128, 128, 128), (60, 120, 216), (30, 160, 60), (200, 30, 30), (230, 140, 30)
@@ -99,7 +97,9 @@ class Drawing:
         self._log("health/lost", self._rr.Scalars(float(step.lost)))
         observation = step.observation
         if observation.view_seen and observation.view.size:
-            self._draw_view(observation.view)
+            pixels = np.rint(255 * np.clip(observation.view, 0.0, 1.0)).astype(np.uint8)
+            shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
+            self._log("view", self._rr.Image(shown))
         if self._run.head is not None:
             self._draw_whiskers(observation)
 
@@ -113,11 +113,6 @@ class Drawing:
             self._place_step.setdefault(step.place, step.number)
             if step.previous >= 0 and step.previous != step.place:
                 self._links.add((step.previous, step.place))
-
-    def _draw_view(self, view: np.ndarray) -> None:
-        pixels = np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
-        shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
-        self._log("view", self._rr.Image(shown))
 
     def _draw_whiskers(self, observation: Any) -> None:
         head = self._run.head
@@ -135,7 +130,11 @@ class Drawing:
         if map.activity is not None:
             self._draw_activity(map.activity)
         if map.path is not None:
-            self._draw_whole_path(map.path)
+            self._path.replace(np.array(map.path))
+            self._whole = len(self._online.rows)
+            self._draw_strip("odometry", self._odometry.rows, GREY)
+            self._draw_strip("online", self._online.rows, BLUE)
+            self._draw_strip("path", map.path, GREEN)
         recent = slice(max(0, self._whole - 1), None)
         self._draw_strip("odometry/recent", self._odometry.rows[recent], GREY)
         self._draw_strip("online/recent", self._online.rows[recent], BLUE)
@@ -143,13 +142,6 @@ class Drawing:
         self._draw_closures(map.closures)
         if map.grid is not None:
             self._draw_grid(map.grid)
-
-    def _draw_whole_path(self, path: np.ndarray) -> None:
-        self._path.replace(np.array(path))
-        self._whole = len(self._online.rows)
-        self._draw_strip("odometry", self._odometry.rows, GREY)
-        self._draw_strip("online", self._online.rows, BLUE)
-        self._draw_strip("path", path, GREEN)
 
     def _draw_strip(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
         if len(poses) > 1:
@@ -210,3 +202,86 @@ class Drawing:
 def _on_floor(poses: np.ndarray) -> np.ndarray:
     """Points [n, 3] of poses [n, 3] at height 0."""
     return np.column_stack([poses[:, :2], np.zeros(len(poses))]) if len(poses) else np.zeros((0, 3))
+
+
+VERDICTS = {1: "accepted", 0: "open", -1: "removed"}
+
+
+class Judgement(NamedTuple):
+    """A new verdict on a candidate: the earlier and the later step, and the verdict by name."""
+
+    earlier: int
+    later: int
+    verdict: str
+
+
+class VerdictLog:
+    """The last verdict on each candidate."""
+
+    def __init__(self) -> None:
+        self._verdict: dict[tuple[int, int], int] = {}
+
+    def changes(self, closures: np.ndarray) -> list[Judgement]:
+        """The judgements since the last call; `dropped` is the verdict on one that was accepted before.
+
+        Args:
+            closures: [n, 3], see `Map.judged_closures`.
+        """
+        found = []
+        for earlier, later, sign in closures.tolist():
+            before = self._verdict.get((earlier, later))
+            if before == sign:
+                continue
+            self._verdict[earlier, later] = sign
+            name = "dropped" if before == 1 else VERDICTS[sign]
+            found.append(Judgement(earlier, later, name))
+        return found
+
+
+def blueprint(run: RunDescription) -> Any:
+    """The map and the loop closures on the left; on the right what the run has of pose cells, view and
+    whiskers, and its health."""
+    import rerun.blueprint as rrb
+
+    left = rrb.Vertical(
+        rrb.Spatial3DView(origin="world", name="map", line_grid=True),
+        rrb.TextLogView(origin="judgements", name="loop closures"),
+        row_shares=[4, 1],
+    )
+    cells = rrb.Horizontal(
+        rrb.Spatial2DView(origin="pose_cells/activity", name="pose cells, x and y"),
+        rrb.BarChartView(origin="pose_cells/heading", name="pose cells, heading"),
+    )
+    view: Any = rrb.Spatial2DView(origin="view", name="view")
+    if run.head is not None:
+        whiskers = rrb.Spatial3DView(origin="world/robot/head", name="whiskers", line_grid=False)
+        view = rrb.Horizontal(view, whiskers)
+    health = rrb.TimeSeriesView(origin="health", name="health")
+    right = rrb.Vertical(*([cells] if run.pose_cells else []), view, health)
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline="step", state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+    )
+
+
+POINTS = 9
+"""Points along a drawn whisker."""
+
+
+def whisker_curves(head: Head, contact: np.ndarray, point: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Curves [W, POINTS, 3] in base_link, m.
+
+    A whisker in contact is a parabola from its base, where it keeps its direction at rest, to the point that
+    it touches.
+
+    Args:
+        contact: [W] bool. point: [W, 2] contact points, m. height: [W] of the contacts above the floor, m.
+    """
+    rest = head.base + head.length[:, None] * head.rest
+    end = np.where(contact[:, None], np.column_stack([point, height]), rest)
+    middle = (head.base + rest) / 2
+    share = np.linspace(0.0, 1.0, POINTS)[None, :, None]
+    base, middle, end = (corner[:, None] for corner in (head.base, middle, end))
+    return (1 - share) ** 2 * base + 2 * share * (1 - share) * middle + share**2 * end

@@ -29,7 +29,12 @@ def main(target: str, source: BinaryIO) -> int:
                 message = pickle.load(source)
             except (EOFError, pickle.UnpicklingError):
                 break
-            _draw(drawing, message)
+            if isinstance(message, RunDescription):
+                drawing.begin(message)
+            elif isinstance(message, MapReport):
+                drawing.finish(message)
+            else:
+                drawing.update(*message)
             _flush(recording)
         if target.endswith(".rrd"):
             recording.disconnect()  # completes the file; with a viewer this may wait for ever
@@ -41,15 +46,6 @@ def main(target: str, source: BinaryIO) -> int:
         )
         return GONE
     return 0
-
-
-def _draw(drawing: Drawing, message: Any) -> None:
-    if isinstance(message, RunDescription):
-        drawing.begin(message)
-    elif isinstance(message, MapReport):
-        drawing.finish(message)
-    else:
-        drawing.update(*message)
 
 
 def _flush(recording: Any) -> None:

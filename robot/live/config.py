@@ -7,16 +7,35 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
+from robot.drivers.create.config import CreateConfig
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.ur10.config import ArmConfig
-from robot.live.create_config import CreateLiveConfig
 from robot.live.goal_config import GoalConfig
+from robot.simulation.create.session import CreateSimulationConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.sources.odometry import OdometryConfig
 from tactile.base.config import Settings
 
 ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "budget", "grace")
 """Settings without a meaning for a Create."""
+
+
+class CreateLiveConfig(CreateConfig):
+    """A Create on a serial port with fixed whiskers; `live.head` is the link to the whiskers."""
+
+    plan: CreateSimulationConfig = CreateSimulationConfig()
+    """Behaviour, whiskers and duration (`minutes` or `reports`), as in a simulated session. The arena bounds
+    the map; the emulator moves in it, with the errors in `wheels`."""
+    strain_per_radian: PositiveFloat = 0.01
+    """Strain at the base of a whisker for each radian that its sensor reports."""
+    stuck: PositiveFloat = 3.0
+    """Time for which the bumper may stay pressed, s; the robot backs off at once."""
+    budget: PositiveFloat = 2.0
+    """Lag of the mapper above which the robot waits for it, s."""
+
+    def resolved(self, folder: Path) -> CreateLiveConfig:
+        """A copy with relative paths taken from the folder; the port's name stays as it is."""
+        return self.model_copy(update={"plan": self.plan.resolved(folder)})
 
 
 class LivePlanConfig(SimulationConfig):

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.head.address import Address
+from robot.drivers.head.config import Address
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.emulators.create.config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.live.config import LiveConfig
-from robot.live.create_config import CreateLiveConfig
+from robot.live.config import CreateLiveConfig, LiveConfig
 from robot.live.route import plan_path
 from robot.simulation.head.beam import StreamConfig
 from tactile.base.errors import InputError

@@ -103,7 +103,11 @@ class GoalRoute:
         if self.drive.state is DriveState.REACHED and not self.drive.finished:
             self.drive.next_goal()
         self._target = None
-        self._move_with_arm(arm_pose)
+        if self.pose is not None and self._arm_pose is not None:
+            step = between(self._arm_pose, arm_pose)
+            self.pose = compose(self.pose, step)
+            self._unseen += float(np.hypot(step[0], step[1]))
+        self._arm_pose = arm_pose
         self._recent = [*self._recent, (arm_pose, points)][-RECENT:]
         if estimate is not None and not self._correct(estimate, self._recent_points(arm_pose)):
             estimate = None
@@ -145,13 +149,6 @@ class GoalRoute:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
         seen = [points_in_map(between(arm_pose, before), points) for before, points in self._recent]
         return np.concatenate(seen)
-
-    def _move_with_arm(self, arm_pose: np.ndarray) -> None:
-        if self.pose is not None and self._arm_pose is not None:
-            step = between(self._arm_pose, arm_pose)
-            self.pose = compose(self.pose, step)
-            self._unseen += float(np.hypot(step[0], step[1]))
-        self._arm_pose = arm_pose
 
     def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
         """Moves the pose towards the estimate, unless only the pose as it is agrees with the last contacts
@@ -195,13 +192,10 @@ class GoalRoute:
             except TargetRefused:
                 if arm.fault is not None:
                     raise
-                self._refuse()
+                self._target = None
+                if self.pose is not None:
+                    self.drive.refuse(self.pose)
         return False
-
-    def _refuse(self) -> None:
-        self._target = None
-        if self.pose is not None:
-            self.drive.refuse(self.pose)
 
     def resend_last(self) -> None:
         """Sends the target again with the next `advance`, after a stop."""

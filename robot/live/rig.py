@@ -68,7 +68,9 @@ class Rig:
         Raises:
             SessionFault, OperatorStop: the session must end.
         """
-        self._take_frames()
+        for frames, arrival in self.stream.take():
+            if self.recorder is not None:
+                self.recorder.add_frames(frames, arrival - self.epoch)
         self._take_states()
         fault = self.arm.fault or self.stream.fault or (self.recorder and self.recorder.fault)
         if fault:
@@ -104,11 +106,6 @@ class Rig:
         """Records an event."""
         if self.recorder is not None:
             self.recorder.add_event(self.now(), name, text)
-
-    def _take_frames(self) -> None:
-        for frames, arrival in self.stream.take():
-            if self.recorder is not None:
-                self.recorder.add_frames(frames, arrival - self.epoch)
 
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)

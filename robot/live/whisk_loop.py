@@ -79,7 +79,8 @@ def run_whisk_loop(
     while not arrived and number != most:
         sequence, life = next_sequence(rig, number), rig.stream.restarts
         while rig.stream.streaming and rig.stream.restarts == life:
-            _poll(rig, mapper)
+            rig.poll()
+            check_mapper(mapper)
             arrived = arrived or _advance(rig, route)
             handed = _hand_on(rig, sequence, number, mapper)
             if handed is None:
@@ -187,11 +188,6 @@ def _advance(rig: Rig, route: ArmRoute) -> bool:
         if rig.arm.fault is not None:
             raise SessionFault(rig.arm.fault) from error
         raise session_fault(SessionOutcome.OUT_OF_BOX, str(error)) from error
-
-
-def _poll(rig: Rig, mapper: AsyncMapper) -> None:
-    rig.poll()
-    check_mapper(mapper)
 
 
 def _has_arrived(rig: Rig, last: int) -> bool:

@@ -115,10 +115,10 @@ def read_csv_recording(
     if config.views is not None:
         rows, values = placed(config.views.file, _views(files, config.views, recording.shape))
         recording.views[rows], recording.seen[rows] = values.reshape(-1, *recording.shape), True
-    if (part := config.contacts) is not None:
-        rows, values = placed(part.file, _contacts(files, part))
-        mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
-        recording.set_contacts(rows, values, PlanarWhiskersInfo(mounts=mounts, length=part.distance))
+    if (touch := config.contacts) is not None:
+        rows, values = placed(touch.file, _contacts(files, touch))
+        mounts = tuple((0.0, 0.0, direction) for direction in touch.directions.values())
+        recording.set_contacts(rows, values, PlanarWhiskersInfo(mounts=mounts, length=touch.distance))
     if config.pairs is not None:
         rows, recording.label[rows] = placed(config.pairs.file, _pairs(files, config.pairs))
     elif config.labels is not None:

@@ -223,6 +223,7 @@ class _Steps:
     def __init__(self, time: np.ndarray, motion: np.ndarray) -> None:
         self.time = time
         self.length, self.turn = np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])
+        self.length[0] = self.turn[0] = 0.0  # before the first row nothing is known
         self.duration = np.concatenate([[0.0], np.diff(time)])
         ahead = self.duration[self.duration > 0]
         self.interval = float(np.median(ahead)) if len(ahead) else 0.0
@@ -316,7 +317,8 @@ def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
         return None
     found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
-    cure = "record them in double precision, or take velocities: --set recording.topics.odometry.use=twist"
+    cure = "write them in double precision or from a near origin; of a bag, take velocities: "
+    cure += "--set recording.topics.odometry.use=twist"
     return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
 
 

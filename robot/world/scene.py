@@ -183,7 +183,12 @@ def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings
     surroundings = Surroundings(boxes, head)
     if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
         return surroundings  # at rest, whiskers are above all walls
-    time = _fine_times(path)
+    # Times (s) along a path with a motion of at most `POSE_STEP` in between.
+    step = np.abs(np.diff(path.pose, axis=0))
+    parts = np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP)
+    parts = np.maximum(parts, 1).astype(int)
+    ends = zip(path.time[:-1], path.time[1:], parts, strict=True)
+    time = np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in ends), path.time[-1:]])
     pose = poses_at(path, time)
     met = surroundings.contact(pose)
     inside = met.angle <= 0
@@ -268,12 +273,3 @@ def _plan_route(
         way = exploration_route(maze, first, cells, stream(seed, "path"), config.within)
     check_route(maze, way)
     return way
-
-
-def _fine_times(path: HeadPath) -> np.ndarray:
-    """Times (s) along a path with a motion of at most `POSE_STEP` in between."""
-    step = np.abs(np.diff(path.pose, axis=0))
-    parts = np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP)
-    parts = np.maximum(parts, 1).astype(int)
-    ends = zip(path.time[:-1], path.time[1:], parts, strict=True)
-    return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in ends), path.time[-1:]])

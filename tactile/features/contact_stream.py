@@ -196,7 +196,14 @@ def _continue_block(
     """Decides samples within a block. Returns [T, W] bool, contact."""
     known = np.concatenate([state.recent, samples])
     deviation = (known - state.baseline) / plan.noise
-    departure = _departure(plan, state, deviation, len(samples))
+    # [count, W] least deviation of a window on one side of both baselines, in noise; the largest channel.
+    count = len(samples)
+    low = high = deviation[plan.window - 1 :]
+    for earlier in range(plan.window - 1):
+        part = deviation[earlier : earlier + count]
+        low, high = np.minimum(low, part), np.maximum(high, part)
+    home = np.where(state.bent[:, None], 0.0, (state.home - state.baseline) / plan.noise)
+    departure = np.maximum(low - np.maximum(home, 0.0), np.minimum(home, 0.0) - high).max(axis=-1)
     sums = np.concatenate([state.total[None], deviation[plan.window - 1 :]])
     later = state._replace(
         row=state.row + len(samples), recent=known[len(samples) :], total=np.add.accumulate(sums)[-1]
@@ -204,25 +211,11 @@ def _continue_block(
     begins = departure > plan.on + state.allowance
     if not (state.contact.any() or begins.any()):
         return later, begins
-    contact = _with_hysteresis(begins, departure < plan.off + state.allowance, state.contact)
-    return _count_contacts(later, contact, departure, moving), contact
-
-
-def _departure(plan: StreamPlan, state: StreamState, deviation: np.ndarray, count: int) -> np.ndarray:
-    """[count, W] least deviation of a window on one side of both baselines, in noise; the largest channel."""
-    low = high = deviation[plan.window - 1 :]
-    for earlier in range(plan.window - 1):
-        part = deviation[earlier : earlier + count]
-        low, high = np.minimum(low, part), np.maximum(high, part)
-    home = np.where(state.bent[:, None], 0.0, (state.home - state.baseline) / plan.noise)
-    return np.maximum(low - np.maximum(home, 0.0), np.minimum(home, 0.0) - high).max(axis=-1)
-
-
-def _with_hysteresis(begins: np.ndarray, ends: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """[T, W] state that each beginning sets and each end clears, from the state [W] before."""
-    latest = np.where(begins | ends, np.arange(len(begins))[:, None], -1)
+    # [T, W] state that each beginning sets and each end clears, from the state [W] before.
+    latest = np.where(begins | (departure < plan.off + state.allowance), np.arange(len(begins))[:, None], -1)
     latest = np.maximum.accumulate(latest, axis=0)
-    return np.where(latest >= 0, np.take_along_axis(begins, np.maximum(latest, 0), axis=0), before)
+    contact = np.where(latest >= 0, np.take_along_axis(begins, np.maximum(latest, 0), axis=0), state.contact)
+    return _count_contacts(later, contact, departure, moving), contact
 
 
 def _count_contacts(

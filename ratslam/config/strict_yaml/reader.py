@@ -2,19 +2,24 @@
 
 Duplicate keys, anchors and tags are refused: every value has one place, and no file expands into a larger
 one.
+
+Values of unquoted YAML words: YAML 1.2, and stricter.
+
+Only `true` and `false` are booleans (`no` is text), `1e-3` is a number, `12:30` is text, and `010`, which
+other readers read as eight or as ten, is refused.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from ratslam.config.strict_yaml.document import KeyPath, Place, describe, join_keys, label
-from ratslam.config.strict_yaml.scalars import Refused, read_word
 from tactile.base.errors import InputError, InputErrors
 
 _MAX_DEPTH = 32
@@ -36,11 +41,7 @@ class Reader:
     """
 
     def __init__(
-        self,
-        text: str,
-        place: Callable[[int, int], str],
-        root: KeyPath = (),
-        replaced: Sequence[str] = (),
+        self, text: str, place: Callable[[int, int], str], root: KeyPath = (), replaced: Sequence[str] = ()
     ) -> None:
         self.places: dict[KeyPath, Place] = {}
         self._replaced = replaced
@@ -183,3 +184,34 @@ class Reader:
             cure = _RECORDINGS if name == "RATSLAM_DATA" else f"set {name} or write the value out"
             self._errors.append(self._error(path, f"the environment variable {name} is not set", cure=cure))
         return value
+
+
+_WORDS: dict[str, float | None] = {"": None, "~": None, "null": None, "true": True, "false": False}
+_WORDS |= {".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan}
+_INTEGER = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_LEADING_ZERO = re.compile(r"[-+]?0[0-9]")
+
+
+class Refused(NamedTuple):
+    """A word that is refused because readers disagree about it."""
+
+    found: str
+    expected: str
+    cure: str = ""
+
+
+def read_word(word: str) -> Any:
+    """Value of an unquoted word: None, bool, int, float, str or `Refused`."""
+    if word in _WORDS:
+        return _WORDS[word]
+    integer = _INTEGER.fullmatch(word)
+    if not integer and not _FLOAT.fullmatch(word):
+        return word
+    if _LEADING_ZERO.match(word):
+        return Refused(f"{word:.60}", "a number without leading zeros", "quote it if it is a name")
+    if integer and len(word) <= 20 and -(1 << 63) <= int(word, 0) < 1 << 63:
+        return int(word, 0)
+    if not integer and math.isfinite(float(word)):
+        return float(word)
+    return Refused(f"{word:.60}", "a number that fits 64 bits")

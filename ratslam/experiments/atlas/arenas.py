@@ -1,7 +1,14 @@
-"""Rows: a whiskered Create that wakes up in a known arena, and in another one of the same size."""
+"""Rows: a whiskered Create that wakes up in a known arena, and in another one of the same size.
+
+Sessions of a whiskered Create in random arenas, and the grid maps of them on the disk.
+
+The map is that of 900 reports. Later sessions have random streams of their own: another start, another drive,
+another error of the wheels.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -9,26 +16,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation import RIGHT, WRONG, is_within
+from evaluation.metrics.localisation import RIGHT, WRONG, MapSteps, is_within, known_steps
+from ratslam.config.completion import complete
+from ratslam.config.run_config import RunConfig
 from ratslam.core.localisation import Localisation
 from ratslam.core.session import Session
-from ratslam.experiments.atlas.arena_sessions import (
-    REPORTS,
-    ArenaDrive,
-    ArenaMap,
-    drive_elsewhere,
-    shuffled_contacts,
-    store_arena_map,
-)
 from ratslam.experiments.atlas.localising import Judged, judge
-from ratslam.experiments.atlas.methods import Localised
 from ratslam.experiments.atlas.pictures import Panel, draw_panels
-from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.sessions import draw_seed
+from ratslam.experiments.trials.arena_trial import simulate_session
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.localise import localising
-from ratslam.pipeline.saved_map import read_map
+from ratslam.pipeline.saved_map import describe_readings, read_map, write_map
+from ratslam.pipeline.source import open_observations
+from robot.touch_source import observation_of, open_touch_source
+from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
+from tactile.base.types import Observation
 
 SOON = 300
 """Reports of a short session: about two minutes, 20 contacts."""
@@ -58,7 +64,8 @@ class ArenaFigures(NamedTuple):
 def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     """One unknown start in the map of an arena."""
     made, drive = store_arena_map(task.seed, side, task.folder), drive_elsewhere(task.seed, side)
-    session = _session_in(made)
+    saved = read_map(made.path)
+    session = build_session(localising(saved.config, saved), saved.source)
     known = _localise(session, drive)
     mixed = _localise(session, shuffled_contacts(drive, task.seed))
     other = _localise(session, drive_elsewhere(task.seed + 1, side))
@@ -126,11 +133,6 @@ def _both(found: Sequence[ArenaFigures]) -> tuple[list[Judged], list[Judged]]:
     return [one.session for one in found], [one.shuffled for one in found]
 
 
-def _session_in(made: ArenaMap) -> Session:
-    saved = read_map(made.path)
-    return build_session(localising(saved.config, saved), saved.source)
-
-
 def _localise(session: Session, drive: ArenaDrive) -> Localised:
     session.restart()
     steps = list(session.replay(drive.observations))
@@ -145,3 +147,84 @@ GRID = MapRow("Localise in a grid map from an unknown start", 20, measure_arena,
 GRID_LARGE = MapRow(
     "The same in arenas of 2.5 m", 6, partial(measure_arena, side=LARGE), arena_lines, draw_arenas
 )
+
+
+REPORTS = 900
+"""Reports of a session; a little more than six minutes."""
+MAP_SIDE = 2.0
+"""Side of the map over that of the arena: it is centred on the start."""
+
+
+class ArenaDrive(NamedTuple):
+    """A session of T reports: the observations, the true poses [T, 3], and the motions by odometry [T, 3]."""
+
+    observations: list[Observation]
+    truth: np.ndarray
+    motion: np.ndarray
+
+
+class ArenaMap(NamedTuple):
+    """A grid map on the disk, and its steps."""
+
+    path: Path
+    steps: MapSteps
+
+
+def arena_config(arena: int, side: float, seed: int) -> RunConfig:
+    """The configuration of a session in an arena.
+
+    Args:
+        arena: its seed. side: of the arena, m. seed: of everything else.
+    """
+    wheels = {"noise": "bias", "level": 0.05}
+    simulation = {"arena": {"side": side, "seed": arena}, "wheels": wheels, "reports": REPORTS, "seed": seed}
+    return RunConfig.model_validate(
+        {
+            "create_simulation": simulation,
+            "backend": "grid",
+            "session": {"precision": "float32"},
+            "grid": {"side": MAP_SIDE * side},
+        }
+    )
+
+
+def drive_elsewhere(arena: int, side: float) -> ArenaDrive:
+    """A further session in an arena, from another start."""
+    config = arena_config(arena, side, draw_seed(arena, "arena start"))
+    assert config.create_simulation is not None
+    session = simulate_session(config.create_simulation)
+    touch = complete(config, session.source).touch
+    seen = [observation_of(sample) for sample in open_touch_source(session.source, touch)]
+    motion = np.array([[float(value) for value in one.odometry[:3]] for one in seen])
+    return ArenaDrive(seen, session.truth, motion)
+
+
+def shuffled_contacts(drive: ArenaDrive, seed: int) -> ArenaDrive:
+    """The same drive with what the whiskers met at another of its reports."""
+    order = stream(seed, "control.shuffled").permutation(len(drive.observations))
+    names = ("contact", "alive", "point", "wall", "wall_point", "wall_sd")
+    mixed = [
+        one._replace(**{name: getattr(drive.observations[k], name) for name in names})
+        for one, k in zip(drive.observations, order.tolist(), strict=True)
+    ]
+    return drive._replace(observations=mixed)
+
+
+def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
+    """The map of an arena; made and written to `folder` unless it is there."""
+    path = folder / f"arena_{arena}_{side:g}.npz"
+    beside = path.with_suffix(".steps.npz")
+    if not (path.exists() and beside.exists()):
+        folder.mkdir(parents=True, exist_ok=True)
+        with open_observations(arena_config(arena, side, arena)) as (config, source):
+            samples = list(source)
+            session = build_session(config, source)
+            for _ in session.replay(observation_of(sample) for sample in samples):
+                pass
+            write_map(path, session, config, describe_readings(source), recording=source.digest)
+        truth = np.array([sample.truth for sample in samples])
+        unfinished = beside.with_name(f".{os.getpid()}.npz")
+        np.savez(unfinished, trajectory=session.map.trajectory(), truth=truth)
+        unfinished.replace(beside)
+    with np.load(beside) as saved:
+        return ArenaMap(path, known_steps(saved["trajectory"], saved["truth"]))

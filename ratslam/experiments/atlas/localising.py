@@ -18,9 +18,8 @@ from evaluation.metrics.localisation import (
     localisation_errors,
 )
 from evaluation.metrics.trajectory import align
-from ratslam.experiments.atlas.methods import Localised
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
-from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.scenarios import (
     FOREIGN,
     LOCALISED,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ratslam.atlas.localiser import Localisation, Localiser
 from ratslam.core.session import Session
-from ratslam.experiments.atlas.methods import Localised, Methods
+from ratslam.experiments.atlas.row import Localised, Methods
 from ratslam.experiments.atlas.sessions import Recorded
 from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, StoredMap
 from ratslam.experiments.trials.touch_trial import capacity_for

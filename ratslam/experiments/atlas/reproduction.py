@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ratslam.experiments.atlas.methods import Methods
 from ratslam.experiments.atlas.registry import ROWS
-from ratslam.experiments.atlas.row import MapTask
+from ratslam.experiments.atlas.row import MapTask, Methods
 from ratslam.experiments.studies.executor import run_tasks
 from tactile.base.atomic_write import write_text_atomically
 

@@ -9,20 +9,22 @@ maps of all cells are therefore compared as they are and after the best turn and
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
+from evaluation.plots import style
+from ratslam.attractor.config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
-from ratslam.experiments.cells.boxes_plot import MapPairs, draw_boxes
 from ratslam.experiments.cells.figure import CellFigure, CellTask
-from ratslam.experiments.cells.place_columns import choose_columns, one_of_each, sum_columns
 from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
-from ratslam.experiments.cells.torus_alignment import Alignment, align_maps, correlate_shifts, lay_on_torus
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
 RATE = 10.0
@@ -49,6 +51,95 @@ ANGLES = np.radians(np.arange(0, 360, 5))
 """Common turns tried, rad; of shifts all are tried, in steps of a cell."""
 USUAL = 1
 """Sessions."""
+
+_FLAT = 1e-12
+"""A variance below this share of the mean square is rounding: the map is flat."""
+
+
+class Alignment(NamedTuple):
+    """The turn and shift common to all cells at which the mean correlation of their maps is highest.
+
+    Attributes:
+        angle: of the second box, rad anticlockwise. shift: (x, y) added afterwards, bins, from 0 to below the
+            bins of the torus. correlation: [C] of each cell there; NaN where one of its maps is flat.
+    """
+
+    angle: float
+    shift: tuple[int, int]
+    correlation: np.ndarray
+
+
+def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequence[float]) -> Alignment:
+    """The best common turn and shift of the second maps onto the first.
+
+    Args:
+        first, second: [C, H, W] rates, NaN where unknown; bins of one size. bins: along a side of the torus,
+            in bins of the maps: shifts wrap round it. angles: to try, rad.
+    """
+    laid = lay_on_torus(first, bins, 0.0)
+    best = Alignment(np.nan, (0, 0), np.full(len(first), -np.inf))
+    for angle in angles:
+        fits = correlate_shifts(laid, lay_on_torus(second, bins, angle))
+        known = np.isfinite(fits)
+        mean = np.where(known, fits, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        y, x = np.unravel_index(mean.argmax(), mean.shape)
+        if mean[y, x] > mean_correlation(best.correlation):
+            best = Alignment(float(angle), (int(x), int(y)), fits[:, y, x])
+    return best
+
+
+def mean_correlation(correlation: np.ndarray) -> float:
+    """Mean over the cells [C] that have one; NaN if none has."""
+    known = correlation[~np.isnan(correlation)]
+    return float(known.mean()) if known.size else np.nan
+
+
+def lay_on_torus(maps: np.ndarray, bins: int, angle: float) -> np.ndarray:
+    """[C, N, N] maps [C, H, W] turned round the middle of the box and laid on a torus of N bins a side.
+
+    Each bin goes to the nearest bin of the torus; the mean is taken where several meet, NaN where none.
+    """
+    height, width = maps.shape[1:]
+    y, x = (np.mgrid[:height, :width].reshape(2, -1).T - [(height - 1) / 2, (width - 1) / 2]).T
+    column = np.cos(angle) * x - np.sin(angle) * y + (width - 1) / 2
+    row = np.sin(angle) * x + np.cos(angle) * y + (height - 1) / 2
+    at = np.round(row).astype(int) % bins * bins + np.round(column).astype(int) % bins
+    flat = maps.reshape(len(maps), -1)
+    known = np.isfinite(flat)
+    sums, count = (np.zeros((len(maps), bins * bins)) for _ in range(2))
+    for cell in range(len(maps)):
+        sums[cell] = np.bincount(at[known[cell]], flat[cell, known[cell]], bins * bins)
+        count[cell] = np.bincount(at[known[cell]], minlength=bins * bins)
+    return (sums / np.where(count > 0, count, np.nan)).reshape(-1, bins, bins)
+
+
+def correlate_shifts(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[C, N, N] Pearson correlations of maps on a torus [C, N, N] with others shifted by (y, x) bins.
+
+    The bins that both maps have take part; NaN where one of them is flat there.
+    """
+    f, g = fft.rfft2(_parts(first)), fft.rfft2(_parts(second))
+    side = first.shape[-2:]
+
+    def sums(a: int, b: int) -> np.ndarray:
+        return fft.irfft2(f[a] * np.conj(g[b]), side)
+
+    count = np.maximum(np.round(sums(0, 0)), 1)
+    mean, shifted_mean = sums(1, 0) / count, sums(0, 1) / count
+    square, shifted_square = sums(2, 0) / count, sums(0, 2) / count
+    variance, shifted_variance = square - mean**2, shifted_square - shifted_mean**2
+    flat = (variance <= _FLAT * square) | (shifted_variance <= _FLAT * shifted_square)
+    product = np.where(flat, np.nan, variance * shifted_variance)
+    return np.clip((sums(1, 1) / count - mean * shifted_mean) / np.sqrt(product), -1.0, 1.0)
+
+
+def _parts(maps: np.ndarray) -> np.ndarray:
+    """[3, C, N, N] mask, values and squares, of maps scaled to a peak of 1."""
+    known = np.isfinite(maps)
+    values = np.where(known, maps, 0.0)
+    peak = np.abs(values).max(axis=(1, 2), keepdims=True)
+    values = values / np.where(peak > 0, peak, 1.0)
+    return np.array([known.astype(float), values, values**2])
 
 
 class MapFit(NamedTuple):
@@ -230,3 +321,103 @@ def _range(fits: list[MapFit], field: str) -> str:
 
 
 FIGURE = CellFigure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
+
+
+SHOWN = 7
+"""Columns whose maps are drawn."""
+SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
+"""Inches: of a map, between maps, left of them."""
+HEIGHT, LOW = 1.7, 0.95
+"""Inches: of a histogram, below it."""
+COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
+BINS = np.linspace(-1.0, 1.0, 41)
+
+
+class MapPairs(NamedTuple):
+    """Correlations [n] of pairs of maps, by name."""
+
+    title: str
+    correlations: Mapping[str, np.ndarray]
+
+
+def draw_boxes(
+    title: str, line: str, rows: Mapping[str, np.ndarray], torus: float, pairs: Sequence[MapPairs], png: Path
+) -> None:
+    """Draws rows of maps [n, N, N] on the torus and a histogram for each of the pairs.
+
+    Args:
+        torus: side of the torus, m.
+    """
+    step = SIDE + GAP
+    height = style.TOP + 0.2 + len(rows) * step + 0.75 + HEIGHT + LOW
+    figure = style.new_figure(height, title, line)
+    for k, (name, maps) in enumerate(rows.items()):
+        bottom = height - style.TOP - 0.2 - SIDE - k * step
+        figure.text(
+            (MARGIN - 0.12) / style.WIDTH, (bottom + SIDE / 2) / height, name, ha="right", va="center",
+            fontsize=9, color=style.INK,
+        )  # fmt: skip
+        for column, rates in enumerate(maps[:SHOWN]):
+            axes = style.add_axes(figure, MARGIN + column * step, bottom, SIDE, SIDE)
+            peak = max(np.nanmax(rates), np.finfo(float).tiny)
+            image = axes.imshow(
+                rates / peak, origin="lower", extent=(0, torus, 0, torus), cmap="viridis", vmin=0, vmax=1
+            )
+            axes.set(xticks=[], yticks=[])
+            if k == 0:
+                axes.set_title(f"column {column + 1}", fontsize=7.5, color=style.LABEL_GREY, pad=3)
+    top = height - style.TOP - 0.2 - len(rows) * step
+    bar = style.add_axes(figure, MARGIN + SHOWN * step - GAP + 0.06, top + GAP, 0.08, len(rows) * step - GAP)
+    figure.colorbar(image, cax=bar, ticks=(0, 1))
+    bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
+    figure.text(
+        MARGIN / style.WIDTH, (top - 0.08) / height,
+        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited or outside the box",
+        fontsize=7.5, color=style.LABEL_GREY,
+    )  # fmt: skip
+    axes = _draw_histograms(figure, pairs)
+    style.add_legend(figure, axes, columns=3)
+    figure.savefig(png)
+
+
+def _draw_histograms(figure: style.Figure, pairs: Sequence[MapPairs]) -> style.Axes:
+    gap = 0.7
+    width = (style.WIDTH - style.LEFT - style.RIGHT - (len(pairs) - 1) * gap) / len(pairs)
+    for k, pair in enumerate(pairs):
+        axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
+        for (name, values), colour in zip(pair.correlations.items(), COLOURS, strict=True):
+            axes.hist(values, BINS.tolist(), color=colour, alpha=0.65, label=name)
+            if len(values):
+                axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
+        axes.grid(color=style.LINE_GREY, lw=0.7)
+        axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
+        axes.set_title(f"{pair.title}", fontsize=9.5, color=style.INK, loc="left")
+        style.name_axes(
+            axes, "correlation of two maps of a column (dashed: mean)", "columns" if k == 0 else ""
+        )
+    return axes
+
+
+EVERY = 3
+"""Every third heading is recorded: the packet is wider than the gap."""
+
+
+def choose_columns(config: PoseCellConfig, count: int, seed: int) -> list[list[int]]:
+    """Indices [x, y, heading] of the cells of `count` columns, drawn without repeats; a setting
+    `cells.chosen`."""
+    side = config.cells_xy
+    drawn = stream(seed, "cells.columns").permutation(side * side)[:count].tolist()
+    headings = range(0, config.cells_heading, EVERY)
+    return [[at % side, at // side, heading] for at in drawn for heading in headings]
+
+
+def sum_columns(activity: np.ndarray, columns: int) -> np.ndarray:
+    """[T, columns] activity of columns, from that of their cells [T, C]."""
+    return activity.reshape(len(activity), columns, -1).sum(axis=2)
+
+
+def one_of_each(activity: np.ndarray, columns: int) -> np.ndarray:
+    """[T, columns] activity of one cell of each column, at a heading that differs from column to column."""
+    split = activity.reshape(len(activity), columns, -1)
+    at = np.arange(columns)
+    return split[:, at, at % split.shape[2]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.session import Session, Step
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.cell_plan import RecordingPlan, levels_of, plan_recording
-from ratslam.pipeline.cell_sums import CellSums
-from ratslam.pipeline.source import read_observations
+from ratslam.pipeline.cell_recorder import CellSums
+from ratslam.pipeline.source import open_observations, read_observations
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Sample, Source
 from tactile.base.errors import InputError
@@ -114,3 +114,32 @@ def _sums(
         if step.seldom is not None:
             sums.add(sample.time, sample.truth, *active_cells(levels, step.seldom))
     return sums
+
+
+Way = Literal["rat", "random walk"]
+"""The path of a real rat (Sargolini et al. 2006, packaged), or a random walk."""
+SECONDS = 599.0
+"""Duration of a session, s: nearly that of the packaged path."""
+
+
+def record_rat(
+    way: Way, chosen: int, sums: bool = False, seconds: float = SECONDS, seed: int = 0
+) -> CellRecording:
+    """The pose cells of a session at 20 Hz with views at 10 Hz and errors of the odometry.
+
+    Args:
+        chosen: cells, drawn from the whole network. sums: whether all cells are summed at 10 Hz. seed: of the
+            cells, the errors and the random walk.
+    """
+    own = [f"rat_simulation.seconds={seconds}", f"rat_simulation.seed={seed}", f"session.seed={seed}"]
+    own += [f"cells.chosen={chosen}", "session.reserve=1024"]
+    own += ["cells.sums={}"] if sums else []
+    own += ["rat_simulation.walk={}"] if way == "random walk" else []
+    with open_observations(load_config("rat_box", own)) as (config, source):
+        return RatSessions(config).run(source).recording
+
+
+def with_active_cells(recording: CellRecording, cells: int) -> CellRecording:
+    """The recording with the first so many chosen cells that were ever active."""
+    kept = np.flatnonzero(recording.activity.any(axis=0))[:cells]
+    return recording._replace(cell=recording.cell[kept], activity=recording.activity[:, kept])

@@ -9,11 +9,16 @@ import numpy as np
 from evaluation.cells.autocorrelogram import autocorrelogram
 from evaluation.cells.border import border_score
 from evaluation.cells.coherence import coherence
-from evaluation.cells.conjunctive import conjunctive_information
 from evaluation.cells.fields import largest_field
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_z
-from evaluation.cells.information import information, information_rate, selectivity, sparsity
+from evaluation.cells.information import (
+    conjunctive_information,
+    information,
+    information_rate,
+    selectivity,
+    sparsity,
+)
 from evaluation.cells.rate_map import (
     arena_edges,
     heading_index,

@@ -10,7 +10,7 @@ import numpy as np
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, calibrate, shuffled_scores
 from ratslam.experiments.cells.figure import CellFigure, CellTask
-from ratslam.experiments.cells.rat_recording import SECONDS, Way, record_rat, with_active_cells
+from ratslam.experiments.cells.rat_sessions import SECONDS, Way, record_rat, with_active_cells
 from ratslam.experiments.cells.shuffled import BINS
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row

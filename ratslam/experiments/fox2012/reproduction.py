@@ -19,7 +19,6 @@ from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.revisits import path_metrics
 from evaluation.metrics.trajectory import position_error
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.fox2012.plots import draw_reproduction
 from ratslam.experiments.fox2012.protocols import (
     FILTERED,
     PROTOCOLS,
@@ -28,7 +27,7 @@ from ratslam.experiments.fox2012.protocols import (
     Protocol,
     session_config,
 )
-from ratslam.experiments.fox2012.report import render_results
+from ratslam.experiments.fox2012.report import draw_reproduction, render_results
 from ratslam.experiments.trials.arena_trial import (
     ArenaSession,
     FilterResult,

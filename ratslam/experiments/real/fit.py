@@ -11,7 +11,7 @@ from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
 from ratslam.config.run_config import load_config
 from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
-from ratslam.fit.revisits import RevisitFit, fit_revisits
+from ratslam.fit.record import RevisitFit, fit_revisits
 from ratslam.fit.wheels import WheelFit, fit_wheels
 from ratslam.fit.whiskers import read_signals_of_reach
 from ratslam.pipeline.source import open_source

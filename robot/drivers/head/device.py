@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from robot.drivers.head.address import Address
+from robot.drivers.head.config import Address
 from robot.drivers.head.protocol import (
     ENDPOINT_IN,
     ENDPOINT_OUT,

@@ -8,19 +8,25 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.command_queue import CommandQueue
 from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.decoder import Decoder, FrameDecoder, Frames
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, read_identity
-from robot.drivers.head.overload import OverloadDetector
-from robot.drivers.head.protocol import CHANNELS, Command, Request, pack_command
-from robot.drivers.head.ring_buffer import RingBuffer
+from robot.drivers.head.protocol import (
+    ANGLE,
+    CHANNELS,
+    KEEP_ALIVE,
+    Command,
+    CommandKind,
+    Request,
+    pack_command,
+)
 from robot.drivers.outcome import Fault, SessionOutcome
 from tactile.base.errors import InputError
 
@@ -246,3 +252,138 @@ class HeadReader:
         except Stalled:
             self.stalls += 1
             self._ending.wait(0.005)
+
+
+KEEP_ALIVE_PERIOD = 0.2
+"""Longest time between commands, s; a head retracts 0.5 s after the last one."""
+PERSISTENT = (CommandKind.CENTRE, CommandKind.DRIVE)
+"""Commands that stay valid until replaced, in the order in which they are sent again."""
+
+
+class CommandQueue:
+    """Any thread adds commands; the reader's thread sends them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: deque[Command] = deque()
+        self._lasting: dict[CommandKind, Command] = {}
+        self._awake = False
+        self._sent = -float("inf")
+
+    def put(self, command: Command) -> None:
+        """Adds a command. Amplitudes replace queued ones."""
+        with self._lock:
+            if command.kind == CommandKind.AMPLITUDES:
+                self._waiting = deque(other for other in self._waiting if other.kind != command.kind)
+            if command.kind in PERSISTENT:
+                self._lasting[command.kind] = command
+            self._waiting.append(command)
+            self._awake = True
+
+    def rest(self) -> None:
+        """Ends the keep-alive commands, so that the head retracts."""
+        with self._lock:
+            self._waiting.clear()
+            self._lasting.clear()
+            self._awake = False
+
+    def resend_persistent(self) -> None:
+        """Queues the persistent commands again, which a restarted head has lost."""
+        with self._lock:
+            self._waiting = deque(self._lasting[kind] for kind in PERSISTENT if kind in self._lasting)
+
+    def next(self, now: float) -> Command | None:
+        """The command to send at a host time, s, or None; a keep-alive if the queue is empty."""
+        with self._lock:
+            if self._waiting:
+                return self._waiting[0]
+            return KEEP_ALIVE if self._awake and now - self._sent >= KEEP_ALIVE_PERIOD else None
+
+    def mark_sent(self, command: Command, now: float) -> None:
+        """Removes a command sent at a host time, s."""
+        with self._lock:
+            self._sent = now
+            if self._waiting and self._waiting[0] is command:
+                self._waiting.popleft()
+
+
+FULL_SCALE = 32767
+"""Least counts at the end of the sensor's range."""
+
+
+class OverloadDetector:
+    """Finds whiskers overloaded in two consecutive samples; a single one is a transmission error or a knock.
+
+    Args:
+        limit: deflection of x or y, rad. alive: [W] bool, whiskers to check.
+    """
+
+    def __init__(self, limit: float, alive: np.ndarray) -> None:
+        self._limit = min(limit / ANGLE, FULL_SCALE)
+        self._alive = np.asarray(alive, bool)
+        self._before = np.zeros(len(self._alive), bool)
+
+    def check(self, values: np.ndarray) -> int | None:
+        """The first whisker overloaded in values [N, W, 3], int16 counts, or between these and the previous
+        ones; None without one."""
+        if not len(values):
+            return None
+        size = np.abs(values.astype(np.int32))  # int16 has no 32768
+        beyond = ((size[..., 0] >= FULL_SCALE) | (size[..., 1:] >= self._limit).any(axis=-1)) & self._alive
+        twice = beyond & np.concatenate([self._before[None], beyond[:-1]])
+        self._before = beyond[-1]
+        return int(np.flatnonzero(twice.any(axis=0))[0]) if twice.any() else None
+
+
+SIZE = 2**16
+"""Number of samples: 33 s at 2 kHz."""
+EMPTY = -(2**62)
+
+
+class RingBuffer:
+    """The last samples. Any thread may read while another appends; results are copies.
+
+    Args:
+        whiskers, channels: of the head. size: number of samples, a power of two.
+    """
+
+    def __init__(self, whiskers: int, channels: int = CHANNELS, size: int = SIZE) -> None:
+        if size & (size - 1):
+            raise ValueError(f"size {size}: must be a power of two")
+        self._size = size
+        self._sequence = np.full(size, EMPTY, np.int64)
+        self._time = np.zeros(size, np.int64)
+        self._flags = np.zeros(size, np.uint8)
+        self._values = np.zeros((size, whiskers, channels), np.int16)
+        self._newest, self._latest, self._arrival = EMPTY, EMPTY, -np.inf
+        self._lock = threading.Lock()
+
+    @property
+    def newest(self) -> tuple[int, int, float] | None:
+        """Highest number, its device time (us) and the last arrival (host time, s); None without samples."""
+        with self._lock:
+            return None if self._newest == EMPTY else (self._newest, self._latest, self._arrival)
+
+    def append(self, frames: Frames, arrival: float) -> None:
+        """Adds frames that arrived at a host time, s; frames older than the ring are ignored."""
+        with self._lock:
+            if not len(frames.sequence):
+                return
+            newest = max(self._newest, int(frames.sequence.max()))
+            fresh = frames.sequence > newest - self._size
+            place = frames.sequence[fresh] % self._size
+            self._sequence[place] = frames.sequence[fresh]
+            self._time[place] = frames.time[fresh]
+            self._flags[place] = frames.flags[fresh]
+            self._values[place] = frames.values[fresh]
+            self._newest, self._arrival = newest, arrival
+            self._latest = int(self._time[newest % self._size])
+
+    def between(self, first: int, last: int) -> Frames:
+        """The present frames from `first` to `last`, both included, ordered by sequence number."""
+        with self._lock:
+            number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
+            return self._at(number[self._sequence[number % self._size] == number] % self._size)
+
+    def _at(self, place: np.ndarray) -> Frames:
+        return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])

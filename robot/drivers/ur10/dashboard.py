@@ -67,7 +67,9 @@ class Dashboard:
 
     def controller(self) -> ControllerStatus:
         """Asks for the status of the controller."""
-        version = _version(self.ask("PolyscopeVersion"))
+        # (5, 11) of `URSoftware 5.11.0.1234 (Jan 01 2022)`.
+        found = re.search(r"(\d+)\.(\d+)", self.ask("PolyscopeVersion"))
+        version = (int(found[1]), int(found[2])) if found else (0, 0)
         safety = self.ask("safetymode")
         remote = "true" in self.ask("is in remote control").lower() if version >= (5, 6) else None
         program = "true" in self.ask("running").lower()
@@ -96,12 +98,6 @@ def stop_program(host: str, timeout: float = 0.5, tries: int = 3) -> str:
         with suppress(DashboardSilent), Dashboard(host, timeout) as dashboard:
             return dashboard.stop()
     return ""
-
-
-def _version(line: str) -> tuple[int, ...]:
-    """(5, 11) of `URSoftware 5.11.0.1234 (Jan 01 2022)`."""
-    found = re.search(r"(\d+)\.(\d+)", line)
-    return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
 def _value(line: str) -> str:

@@ -22,8 +22,7 @@ from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head import usb_descriptors
 from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
-from robot.emulators.head.pose_source import AlongPath, CarriedByArm, PoseSource
-from robot.emulators.head.whiskers import maze_whiskers
+from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, maze_whiskers
 from robot.emulators.listening import listening
 from robot.world.head_trajectory import HeadPath
 from robot.world.scene import KidnapConfig, make_scene

@@ -1,24 +1,39 @@
-"""The whiskers of an emulated head, simulated in blocks of samples."""
+"""The whiskers of an emulated head, simulated in blocks of samples.
+
+Drives of an emulated head: they whisk, rest, and retract if no commands arrive.
+
+A whisk starts at the start of a block of samples or at the end of the previous whisk.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from pydantic import ValidationError
 
-from robot.drivers.head.protocol import Command
+from robot.drivers.head.protocol import (
+    ANGLE,
+    COMMAND_TIMEOUT,
+    NO_THRESHOLD,
+    Command,
+    CommandKind,
+    FeedbackMode,
+)
+from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.emulators.head.sensor_array import Block, block_samples
-from robot.emulators.head.servo_drives import ServoDrives
 from robot.simulation.head.baseline import Baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.quasistatic import advance_balance, whiskers_at_rest
+from robot.simulation.head.quasistatic import WhiskerBalance, advance_balance, whiskers_at_rest
 from robot.simulation.head.whisk_stream import WallSweep, draw_noise, sensor_readings, sweep_walls
+from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whiskers.head_geometry import Head, ur10_head
+from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
 
 STEP = 1e-4
 """Resolution of lifts, m; an arm at working height stays within it."""
@@ -146,3 +161,192 @@ def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -
         block_samples(rate),
         make_baseline(mechanics.baseline, mechanics.noise, rate, len(head.length), config.seed),
     )
+
+
+RETRACTION = 0.2
+"""Duration of the retraction, s."""
+
+
+class WhiskCommand(NamedTuple):
+    """A commanded whisk.
+
+    Attributes:
+        whisking: settings of the whisking law. samples: samples per cycle. offset: added to all angles, rad;
+            with the amplitude it is within the limit of the drives. threshold: [W] rad. feedback: whether the
+            law uses deflections; if not, the host sends amplitudes. amplitude: [W] rad, without feedback.
+    """
+
+    whisking: WhiskingConfig
+    samples: int
+    offset: float
+    threshold: np.ndarray
+    feedback: bool
+    amplitude: np.ndarray
+
+
+class ServoDrives:
+    """The drives of one head, sample by sample.
+
+    Attributes:
+        whisk: the whisk in progress; None at rest or during retraction. sample: next sample of the cycle.
+    """
+
+    def __init__(self, head: Head, rate: float) -> None:
+        self.head, self.rate = head, rate
+        self.whisk: WhiskCommand | None = None
+        self.sample = 0
+        self._next: WhiskCommand | None = None
+        self._command_time, self._stopped = -np.inf, False
+        self._centre = np.zeros(len(head.length))
+        self._from: np.ndarray | None = None  # angles at the start of the retraction
+
+    @property
+    def resting(self) -> bool:
+        """Whether the drives are at rest and no command is pending."""
+        return self.whisk is None and self._next is None and self._from is None
+
+    @property
+    def samples_left(self) -> int | None:
+        """Samples until the next change; None while unknown."""
+        if self.whisk is not None:
+            return self.whisk.samples - self.sample
+        return None if self._from is None else self._retraction - self.sample
+
+    @property
+    def _retraction(self) -> int:
+        return round(RETRACTION * self.rate)
+
+    def receive(self, command: Command, time: float) -> None:
+        """Stores a command received at a time, s (the clock of `begin`)."""
+        self._command_time = time
+        if command.kind == CommandKind.DRIVE:
+            self._next = self._make_whisk(command) or self._next
+        elif command.kind == CommandKind.CENTRE and len(command.numbers) == len(self._centre):
+            self._centre = command.numbers * ANGLE
+        elif (
+            command.kind == CommandKind.AMPLITUDES
+            and self.whisk is not None
+            and len(command.numbers) == len(self._centre)
+            and not self.whisk.feedback
+        ):
+            most = self.head.limit - self.whisk.offset
+            self.whisk = self.whisk._replace(amplitude=np.clip(command.numbers * ANGLE, 0.0, most))
+
+    def stop(self) -> None:
+        """Retracts and discards pending commands."""
+        self._stopped, self._next = True, None
+
+    def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
+        """Selects the next activity; called at the start of each block and after `samples_left` samples.
+
+        Args:
+            time: s. balance: state of the whiskers.
+
+        Returns:
+            state of the whiskers: at rest at the beginning of a cycle.
+        """
+        silent = time - self._command_time > COMMAND_TIMEOUT
+        self._next = None if silent else self._next
+        stop, self._stopped = silent or self._stopped, False
+        if self.whisk is not None and stop:
+            self.whisk, self._from, self.sample = None, balance.before[0].copy(), 0
+        if self._from is not None:
+            if self.sample < self._retraction:
+                return balance
+            self._from, self.sample = None, 0
+            balance = whiskers_at_rest(*balance.before.shape)
+        ended = self.whisk is not None and self.sample >= self.whisk.samples
+        if (self.whisk is None and self._next is not None) or ended:
+            if self._next is not None:
+                self.whisk, self._next = self._next, None
+            assert self.whisk is not None
+            common = np.full(len(self._centre), np.radians(self.whisk.whisking.amplitude_deg))
+            self.whisk, self.sample = self.whisk._replace(amplitude=common), 0
+            return whiskers_at_rest(*balance.before.shape)
+        return balance
+
+    def law(self, drive: WhiskDrive, time: float, deflection: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
+        """A `robot.simulation.head.quasistatic.WhiskingLaw`; `time` counts from the start of the whisk."""
+        if self.whisk is None:
+            share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
+            return np.zeros_like(deflection) + (0.0 if self._from is None else self._from * share), drive
+        whisk = self.whisk
+        if whisk.feedback:
+            bend = deflection - self._centre
+            aim, drive = whisk_command(whisk.whisking, drive, time, bend, whisk.threshold, self.head.shape)
+        else:
+            aim = np.zeros_like(deflection) + whisk.amplitude * whisk_phase(whisk.whisking, time)
+        return aim + whisk.offset if whisk.offset else aim, drive
+
+    def _make_whisk(self, command: Command) -> WhiskCommand | None:
+        """The whisk of a command; None (no change) if it exceeds the limits of the drives."""
+        threshold = np.full(len(self._centre), np.inf)
+        numbers = command.numbers[: len(threshold)]
+        threshold[: len(numbers)] = np.where(numbers == NO_THRESHOLD, np.inf, numbers * ANGLE)
+        feedback = command.mode == FeedbackMode.RCP
+        offset = min(max(command.offset, 0.0), self.head.limit)
+        amplitude = min(command.amplitude, self.head.limit - offset)
+        try:
+            whisking = WhiskingConfig(
+                mode="rcp" if feedback else "open",
+                rate=command.frequency,
+                amplitude_deg=float(np.degrees(amplitude)),
+                gain=command.gain,
+                window=command.window if feedback else WhiskingConfig().window,
+            )
+        except ValidationError:
+            return None
+        samples = round(self.rate / whisking.rate)
+        if samples < 2:
+            return None
+        return WhiskCommand(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))
+
+
+AHEAD = 0.1
+"""Longest extrapolation of a pose by the arm's speed, s; after that the head stands still."""
+
+
+class PoseSource(Protocol):
+    """Pose of the head over time."""
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        """Pose in the map [3] (m, m, rad) and lift above working height, m.
+
+        Args:
+            time: s, host's monotonic clock.
+        """
+        ...
+
+
+class CarriedByArm:
+    """The newest pose of an arm, extrapolated by its speed."""
+
+    def __init__(self, arm: PoseListener, placing: BaseTransformConfig) -> None:
+        self.arm, self.placing = arm, placing
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        newest = self.arm.latest()
+        if newest is None:
+            return np.zeros(3), np.inf
+        ahead = min(max(time - newest.time, -AHEAD), AHEAD)
+        tool = np.array(newest.tcp, float)
+        tool[:3] += ahead * newest.speed[:3]
+        pose, lift = pose_from_tcp(self.placing, tool)
+        # The rotation axes of the arm and of the map's headings are both vertical.
+        return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
+
+
+class AlongPath:
+    """A motion along a path that starts at the time given to `begin`; before, the path's first pose."""
+
+    def __init__(self, path: HeadPath) -> None:
+        self.path = path
+        self.began: float | None = None
+
+    def begin(self, time: float) -> None:
+        """Starts the motion at a time, s; later calls have no effect."""
+        self.began = time if self.began is None else self.began
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        since = 0.0 if self.began is None else time - self.began
+        return poses_at(self.path, np.array(since)), 0.0

@@ -2,6 +2,10 @@
 
 One thread, no locks. Late steps are made up for, up to `BACKLOG`, so that the mean rate holds on a busy
 machine; steps later than that are skipped, and the robot's clock jumps.
+
+The dashboard port: answers each line of text with one line.
+
+Source: Universal Robots, "Dashboard Server", CB3 and e-Series.
 """
 
 from __future__ import annotations
@@ -19,12 +23,10 @@ from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.listening import listening
 from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
-from robot.emulators.ur10.controller import EmulatedController
-from robot.emulators.ur10.dashboard_server import WELCOME, DashboardSession
+from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime
 from robot.emulators.ur10.fault_server import ControllerFaults, FaultSession
 from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.rtde_server import Claims, RtdeSession
-from robot.emulators.ur10.script_server import ScriptSession
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s
@@ -180,3 +182,95 @@ def serve(config: UrEmulatorConfig) -> None:
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         server.run()
+
+
+class ScriptSession:
+    """One client. A program runs from a line `def ...` to `end` at the margin; any other line is one, too."""
+
+    def __init__(self, controller: EmulatedController) -> None:
+        self._controller = controller
+        self._rest = b""
+        self._program: list[str] | None = None
+
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Uploads complete programs. Answers nothing (a real controller sends states)."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for raw in lines:
+            line = raw.decode("utf-8", "replace").rstrip("\r")
+            if self._program is not None:
+                self._program.append(line)
+                if line.startswith("end"):
+                    self._controller.upload("\n".join(self._program))
+                    self._program = None
+            elif line.startswith("def "):
+                self._program = [line]
+            elif line.strip():
+                self._controller.upload(line)
+        return b""
+
+    def close(self) -> None:
+        """Discards an incomplete program; a running program continues."""
+
+
+WELCOME = b"Connected: Universal Robots Dashboard Server\n"
+SINCE_5_6 = ("is in remote control", "get serial number")
+
+
+class DashboardSession:
+    """A client connection."""
+
+    def __init__(self, controller: EmulatedController) -> None:
+        self._controller = controller
+        self._rest = b""
+
+    def receive(self, data: bytes, host: float) -> bytes:
+        """Executes complete lines; returns one line of answer for each."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return b"".join(
+            f"{answer_command(self._controller, line.decode().strip())}\n".encode() for line in lines
+        )
+
+    def close(self) -> None:
+        """Has no effect."""
+
+
+def answer_command(controller: EmulatedController, command: str) -> str:
+    """Executes a command; returns the answer."""
+    do = _COMMANDS.get(command.lower())
+    if do is None or (command.lower() in SINCE_5_6 and controller.config.version < (5, 6)):
+        return f"could not understand: '{command}'"
+    return do(controller)
+
+
+def _stop(controller: EmulatedController) -> str:
+    controller.stop_program()
+    return "Stopped"
+
+
+def _unlock(controller: EmulatedController) -> str:
+    if controller.unlock():
+        return "Protective stop releasing"
+    return "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
+
+
+def _power(mode: RobotMode, answer: str) -> Callable[[EmulatedController], str]:
+    def do(controller: EmulatedController) -> str:
+        controller.power(mode)
+        return answer
+
+    return do
+
+
+_COMMANDS: dict[str, Callable[[EmulatedController], str]] = {
+    "stop": _stop,
+    "unlock protective stop": _unlock,
+    "power on": _power(RobotMode.IDLE, "Powering on"),
+    "brake release": _power(RobotMode.RUNNING, "Brake releasing"),
+    "power off": _power(RobotMode.POWER_OFF, "Powering off"),
+    "robotmode": lambda c: f"Robotmode: {c.robot_mode.name}",
+    "is in remote control": lambda c: str(c.remote).lower(),
+    "get serial number": lambda c: "20163000000",
+    "safetymode": lambda c: f"Safetymode: {c.safety.name}",
+    "running": lambda c: f"Program running: {str(c.runtime is Runtime.PLAYING).lower()}",
+    "polyscopeversion": lambda c: "URSoftware {}.{}.{}.0 (emulated)".format(*c.config.version),
+}

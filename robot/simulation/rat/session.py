@@ -1,20 +1,27 @@
-"""A simulated session of a rat in a box with cues as a source, bit-identical for the same settings."""
+"""A simulated session of a rat in a box with cues as a source, bit-identical for the same settings.
+
+A random walk of a rat in a box: Ornstein-Uhlenbeck speed and turning, drawn to the walls.
+
+After Raudies & Hasselmo 2012 and RatInABox (George et al. 2024), whose means and times the defaults are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import atan2, cos, exp, pi, sin
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
+from robot.recordings.csv_file import read_csv
+from robot.recordings.sanity_checks import RowName
 from robot.simulation.rat.box import BoxConfig, ViewConfig, panoramic_views
-from robot.simulation.rat.path_files import PathFileConfig, read_path
 from robot.simulation.rat.phases import PhaseConfig, boxes_of, lay_out_phases
-from robot.simulation.rat.random_walk import RandomWalkConfig, walk_randomly
 from robot.simulation.rat.rat_odometry import RatOdometryConfig, measure_motion
-from robot.simulation.rat.rat_path import RatPath, check_path, sample_path
-from robot.sources.input_files import digest_of
+from robot.simulation.rat.rat_path import MotionConfig, RatPath, check_path, sample_path
+from robot.sources.input_files import digest_of, raise_errors, require_file
 from robot.sources.simulated import (
     NO_ODOMETRY,
     SimulatedSource,
@@ -25,6 +32,7 @@ from robot.sources.simulated import (
 from robot.sources.source_info import SourceInfo
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.npz import read_npz
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Observation, observation
@@ -37,6 +45,170 @@ OUTSIDE = 0.1
 at the wall."""
 WALK_SECONDS = 600.0
 """Duration of a random walk of unspecified duration, s."""
+
+STEER = 8.0
+"""Rate at which the rat turns from a wall that it touches, 1/s, as a share of the angle left."""
+
+PACKAGED = {path.stem: path for path in sorted((Path(__file__).resolve().parent / "data").glob("*.npz"))}
+"""Files of the packaged paths by name: `sargolini` (600 s, 1 x 1 m), `tanni` (1200 s, 3.5 x 2.5 m)."""
+
+
+class PathFileConfig(MotionConfig):
+    """A recorded path."""
+
+    file: Path = Path("sargolini")
+    """`sargolini` (600 s in 1 x 1 m), `tanni` (1200 s in 3.5 x 2.5 m), or a file: `.csv` with columns t, x
+    and y, or `.npz` with t [N] and pos [N, 2]; s and m, with integers in ms and mm. The origin is a corner of
+    the box."""
+    unit: PositiveFloat = 1.0
+    """Length of the unit of positions, m: 0.01 for cm."""
+    shift: tuple[float, float] = (0.0, 0.0)
+    """Added to the positions, m."""
+    skip: NonNegativeFloat = 0.0
+    """Time to leave out at the beginning, s."""
+
+    def resolved(self, folder: Path) -> PathFileConfig:
+        """A copy whose file, unless packaged, is taken from the folder."""
+        if str(self.file) in PACKAGED:
+            return self
+        return self.model_copy(update={"file": folder / self.file})
+
+
+def read_path(config: PathFileConfig) -> RatPath:
+    """The path of a file, checked, with the settings for unit, shift and skipped time applied.
+
+    Raises:
+        InputError: the file cannot be read, or holds no path of a rat (`check_path`), with its row.
+    """
+    file = PACKAGED.get(str(config.file), config.file)
+    require_file(file)
+    path, place = _read_csv_path(file) if file.suffix == ".csv" else _read_npz_path(file)
+    path = path._replace(position=path.position * config.unit + np.asarray(config.shift))
+    check_path(path, config, place)
+    kept = path.time >= path.time[0] + config.skip
+    if kept.sum() < 2:
+        found = f"{config.skip:g} s to skip"
+        expected = f"less than the duration of {file.name}, {path.time[-1] - path.time[0]:.4g} s"
+        raise InputError("rat_simulation.path.skip", found, expected)
+    return RatPath(path.time[kept], path.position[kept])
+
+
+def _read_csv_path(file: Path) -> tuple[RatPath, RowName]:
+    table = read_csv(file)
+    raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
+    raise_errors(table.judge(["t", "x", "y"])[1])
+    position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
+    return RatPath(table.column("t", "time"), position), table.place
+
+
+def _read_npz_path(file: Path) -> tuple[RatPath, RowName]:
+    path = read_npz(file, ("t", "pos"), _parse_arrays, "a path: arrays t [N] and pos [N, 2]")
+    return path, lambda row: f"{file}:{row}"
+
+
+def _parse_arrays(time: np.ndarray, position: np.ndarray) -> RatPath:
+    if time.ndim != 1 or position.shape != (len(time), 2):
+        raise ValueError(f"t {list(time.shape)} and pos {list(position.shape)}")
+    return RatPath(_in_units(time), _in_units(position))
+
+
+def _in_units(values: np.ndarray) -> np.ndarray:
+    """Values in s or m; integers are thousandths."""
+    if np.issubdtype(values.dtype, np.integer):
+        return values / 1000.0
+    return values.astype(np.float64)
+
+
+class RandomWalkConfig(Settings):
+    """A random walk."""
+
+    speed: PositiveFloat = 0.16
+    """Mean speed, m/s."""
+    speed_sd: PositiveFloat = 0.084
+    """Standard deviation of the speed, m/s; 0.52 of the mean resembles a Rayleigh distribution."""
+    speed_time: PositiveFloat = 0.7
+    """Correlation time of the speed, s."""
+    turn_sd: NonNegativeFloat = 2.1
+    """Standard deviation of the turn rate, rad/s."""
+    turn_time: PositiveFloat = 0.08
+    """Correlation time of the turn rate, s."""
+    wall_distance: NonNegativeFloat = 0.1
+    """Distance from which a wall acts on the direction, m."""
+    thigmotaxis: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """How far the rat follows walls: 1: it turns along a wall, 0: straight away from it."""
+
+
+def walk_randomly(
+    config: RandomWalkConfig, size: tuple[float, float], seconds: float, rate_hz: float, seed: int
+) -> RatPath:
+    """A walk in a box of a size (m, m) with a corner at the origin, from its middle.
+
+    Speeds have a gamma distribution of the given mean and standard deviation: the quantiles of a normal
+    Ornstein-Uhlenbeck process. A longer walk of the same seed begins with the shorter one.
+    """
+    from scipy.stats import gamma, norm  # slow to import
+
+    count = int(np.ceil(seconds * rate_hz)) + 1
+    draws = stream(seed, "rat walk").standard_normal((count, 2))
+    z = ornstein_uhlenbeck(draws, np.array([config.speed_time, config.turn_time]), 1 / rate_hz)
+    spread = config.speed_sd**2 / config.speed
+    speed = gamma.ppf(norm.cdf(z[:, 0]), config.speed / spread, scale=spread)
+    turn = config.turn_sd * z[:, 1]
+    position = _walk(config, size, speed / rate_hz, turn / rate_hz, 1 / rate_hz)
+    return RatPath(np.arange(count) / rate_hz, position)
+
+
+def ornstein_uhlenbeck(draws: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
+    """[N, D] stationary processes of variance 1 from normal draws [N, D], for correlation times [D], s."""
+    keep = np.exp(-step / time)
+    fresh = np.sqrt(1 - keep**2)
+    values = np.empty_like(draws)
+    values[0] = draws[0]
+    for row in range(1, len(draws)):
+        values[row] = keep * values[row - 1] + fresh * draws[row]
+    return values
+
+
+def _walk(
+    config: RandomWalkConfig, size: tuple[float, float], steps: np.ndarray, turns: np.ndarray, dt: float
+) -> np.ndarray:
+    """[N, 2] positions after steps [N], m, and turns [N], rad; walls reflect."""
+    (width, height), steer = size, 1 - exp(-STEER * dt)
+    x, y, heading = width / 2, height / 2, 0.0
+    position = np.empty((len(steps), 2))
+    for row, (step, turn) in enumerate(zip(steps.tolist(), turns.tolist(), strict=True)):
+        position[row] = x, y
+        heading += turn
+        for distance, outward in ((x, pi), (width - x, 0.0), (y, -pi / 2), (height - y, pi / 2)):
+            heading += steer * _turn_at_wall(config, distance, heading - outward)
+        x, mirrored = _reflect(x + step * cos(heading), width)
+        if mirrored:
+            heading = pi - heading
+        y, mirrored = _reflect(y + step * sin(heading), height)
+        if mirrored:
+            heading = -heading
+    return position
+
+
+def _turn_at_wall(config: RandomWalkConfig, distance: float, heading: float) -> float:
+    """Turn that a wall asks for, rad: from a heading relative to its outward normal to one along it, or away
+    from it; 0 for a rat that is farther than `wall_distance` or already leaves."""
+    if distance >= config.wall_distance:
+        return 0.0
+    heading = atan2(sin(heading), cos(heading))
+    wanted = pi / 2 + (1 - config.thigmotaxis) * pi / 2
+    if abs(heading) >= wanted:
+        return 0.0
+    turn = wanted - abs(heading)
+    return (1 - distance / config.wall_distance) * (turn if heading >= 0 else -turn)
+
+
+def _reflect(value: float, size: float) -> tuple[float, bool]:
+    """A coordinate mirrored at the walls at 0 and `size`, and whether it was."""
+    if 0 <= value <= size:
+        return value, False
+    folded = value % (2 * size)
+    return min(folded, 2 * size - folded), True
 
 
 class RatSimulationConfig(Settings):

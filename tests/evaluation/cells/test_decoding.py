@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import gammaln, xlogy
 
-from evaluation.cells.decoding import DecodingSettings, decode_positions, log_occupancy, log_posterior
+from evaluation.cells.decoding import DecodingSettings, decode_positions, log_posterior
 from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -68,7 +68,7 @@ def test_posterior_is_that_of_poisson_cells() -> None:
     rates = stream(0, "rates").random((3, 2, 4)) + 0.1
     rates[:, 1, 3] = np.nan
     counts, seconds = np.array([[2, 0, 1], [0, 4, 0]]), np.array([0.5, 2.0])
-    prior = log_occupancy(np.arange(1.0, 9.0).reshape(2, 4))
+    prior = np.log(np.arange(1.0, 9.0).reshape(2, 4) / 36)
     found = log_posterior(counts, seconds, rates, prior)
     mean = rates[None] * seconds[:, None, None, None]
     each = xlogy(counts[:, :, None, None], mean) - mean - gammaln(counts + 1.0)[:, :, None, None]
@@ -77,11 +77,6 @@ def test_posterior_is_that_of_poisson_cells() -> None:
     assert np.isneginf(found[:, ~known]).all()
     difference = (found - expected)[:, known]
     assert_allclose(difference, difference[:, :1] * np.ones(7), atol=1e-12)
-
-
-def test_places_without_time_have_no_prior() -> None:
-    prior = log_occupancy(np.array([[1.0, 0.0], [1.0, 2.0]]))
-    assert_allclose(np.exp(prior), [[0.25, 0], [0.25, 0.5]])
 
 
 def test_short_recordings_are_refused() -> None:

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from evaluation.cells.coherence import coherence, correlate, neighbour_means
-from evaluation.cells.conjunctive import conjunctive_information, exceeds_both, joint_maps
 from evaluation.cells.information import (
+    conjunctive_information,
+    exceeds_both,
     information,
     information_above_mean,
     information_rate,
@@ -17,7 +18,7 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import rate_maps
+from evaluation.cells.rate_map import box_samples, rate_maps, sum_into
 from tactile.base.random_streams import stream
 from tests.evaluation.cells.box_walk import direction_cells, mixed_sums, place_cells, random_walk
 
@@ -123,8 +124,11 @@ def test_product_cells_are_conjunctive_and_others_are_not() -> None:
     place = place_cells(walk.truth[:, :2], np.array([[0.4, 0.6]]), width=0.2)
     turn = direction_cells(walk.truth[:, 2], np.array([1.0]))
     edges = np.linspace(0, 1, 11)
-    joint = joint_maps(*walk, np.concatenate([place * turn, place, turn], axis=1), edges, edges)
-    both, place_only, turn_only = conjunctive_information(*joint)
+    samples = box_samples(*walk, np.concatenate([place * turn, place, turn], axis=1), edges, edges, 8)
+    at = samples.heading * 100 + samples.place
+    seconds, sums = sum_into(at, samples.seconds, samples.activity, (8, 10, 10))
+    rates = sums / np.where(seconds > 0, seconds, np.nan)
+    both, place_only, turn_only = conjunctive_information(rates, seconds)
     assert both > 0.5
     assert place_only < 0.1
     assert turn_only < 0.15

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.alignment.interruptions import LONGEST, SHARE, continue_states, summed, uninterrupted
+from ratslam.alignment.hypotheses import LONGEST, SHARE, continue_states, summed, uninterrupted
 
 NOWHERE = np.zeros(1)
 

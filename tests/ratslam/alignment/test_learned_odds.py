@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.alignment.gain_odds import GainOdds, learn_gain_odds
-from ratslam.alignment.learned_odds import LearnedOdds
+from ratslam.alignment.gain_odds import GainOdds, LearnedOdds, learn_gain_odds
 
 
 def odds_of(seed: int) -> GainOdds:

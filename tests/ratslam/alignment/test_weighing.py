@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from ratslam.alignment.gain_odds import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
 from ratslam.alignment.self_comparison import compare_with_itself
-from ratslam.alignment.weighing import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
 from tests.ratslam.alignment.test_self_comparison import GUARD, gains_on, laps
 
 GAINS = arrays(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.alignment.ground import Ground
-from ratslam.atlas.contact_signs import ContactMap, contact_map, contact_points, contact_signs
+from ratslam.atlas.session_changes import ContactMap, contact_map, contact_points, contact_signs
 from ratslam.recall.whisker_likelihood import (
     PRIOR,
     estimate_background,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.alignment.following import Motion
-from ratslam.atlas.map_traverse import TOGETHER, MapTraverse
+from ratslam.atlas.joining import TOGETHER, MapTraverse
 from ratslam.atlas.placement import Traverse, find_placements
 from tactile.base.se2 import compose
 from tests.ratslam.atlas.test_placement import COUNT, MOVED, ODDS, compared, ground_of, ring

@@ -10,7 +10,7 @@ import pytest
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import dump_data
-from ratslam.fit.head import walls_of
+from ratslam.fit.record import walls_of
 from ratslam.fit.rig import Quantity, Rig, rig_file, rig_settings
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ratslam.config.completion import EXTENT_FACTOR, EXTENT_MARGIN, complete
-from ratslam.config.presets import PRESETS
+from ratslam.config.packaged import PRESETS
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
 from ratslam.pipeline.source import open_source

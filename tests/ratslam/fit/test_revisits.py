@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ratslam.config.run_config import load_config
-from ratslam.fit.record import fit_record, fit_wheels_of
-from ratslam.fit.revisits import RevisitFit, fit_revisits
+from ratslam.fit.record import RevisitFit, fit_record, fit_revisits, fit_wheels_of
 from ratslam.fit.rig import rig_settings
 from ratslam.fit.wheels import fit_wheels
 from ratslam.pipeline.source import open_source

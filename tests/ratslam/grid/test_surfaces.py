@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.grid.agreement import CONTACT, FREE, counted_agreement
 from ratslam.grid.config import GridConfig
 from ratslam.grid.expectation import CROSSINGS, TIPS, UNEXPLORED, expect
 from ratslam.grid.map_drawing import contact_log
+from ratslam.grid.search import CONTACT, FREE, counted_agreement
 from ratslam.grid.surfaces import Surfaces, draw_surfaces
 from tactile.base.se2 import compose
 from tactile.base.types import MotionKind

@@ -7,9 +7,13 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from ratslam.keyframes.calibration import starting_calibration, starting_noise, write_calibration
+from ratslam.keyframes.calibration import (
+    HeadingNoise,
+    starting_calibration,
+    starting_noise,
+    write_calibration,
+)
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.odometry_noise import HeadingNoise
 from ratslam.keyframes.optimizer import CalibrationPrior, MapCovariance
 from tactile.base.se2 import wrap
 from tests.ratslam.keyframes.map_cases import BIAS, CELL, LAP, TRUE, drive, new_map

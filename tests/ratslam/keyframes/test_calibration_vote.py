@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.keyframes.calibration_vote import LEAST_TURN_ERROR, SHRINK, vote
+from ratslam.keyframes.closure_odds import LEAST_TURN_ERROR, SHRINK, vote
 from ratslam.keyframes.optimizer import CalibrationPrior
 
 LEAST = 1e-3

@@ -9,9 +9,9 @@ import pytest
 
 from ratslam.experiments.atlas.scenarios import ten_circuits
 from ratslam.experiments.atlas.stored_maps import store_map
+from ratslam.keyframes.calibration import HeadingNoise
 from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT, STEPS, SelectionProblem, select_closures
-from ratslam.keyframes.fresh_selection import NOISY, reconsidered, seems_noisy
-from ratslam.keyframes.odometry_noise import HeadingNoise
+from ratslam.keyframes.map_solution import NOISY, reconsidered, seems_noisy
 from ratslam.keyframes.optimizer import solve
 from tests.ratslam.keyframes.selection_cases import off, world
 

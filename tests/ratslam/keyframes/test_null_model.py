@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.keyframes.null_model import (
+from ratslam.keyframes.closure_odds import (
     LEAST_SCORE,
     MIN_TRUE,
     PRIOR_COUNT,

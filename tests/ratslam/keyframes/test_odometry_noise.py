@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.keyframes.odometry_noise import (
+from ratslam.keyframes.calibration import (
     LARGEST_STEP,
     LEAST_FACTOR,
     SPREAD,

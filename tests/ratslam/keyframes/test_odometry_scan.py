@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.keyframes.appearance import ViewAppearance
-from ratslam.keyframes.config import FULL, KeyframeMapConfig
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.odometry_scan import (
+from ratslam.keyframes.closure_odds import (
     BIAS_SPAN,
     BIAS_STEPS,
     REACH,
@@ -20,6 +18,8 @@ from ratslam.keyframes.odometry_scan import (
     UNLIKELY,
     OdometryScan,
 )
+from ratslam.keyframes.config import FULL, KeyframeMapConfig
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.optimizer import CalibrationPrior
 from tactile.base.se2 import compose, correct_heading, wrap
 

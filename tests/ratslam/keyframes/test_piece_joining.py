@@ -9,10 +9,10 @@ from ratslam.core.backend import NO_CLOSURE
 from ratslam.keyframes.acceptance import AcceptByEvidence, believe
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.keyframe_graph import APART
 from ratslam.keyframes.loop_closures import Candidate
 from ratslam.keyframes.map_health import DOUBTED
 from ratslam.keyframes.optimizer import CalibrationPrior
-from ratslam.keyframes.piece_placement import APART
 from ratslam.keyframes.piece_ties import Tie, no_tie
 from tactile.base.se2 import between, compose
 from tests.ratslam.keyframes.map_cases import BIAS, CELL, LAP, STEP, drive, new_map, sequence

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.keyframes.piece_placement import APART, PiecePlacement, piece_start
-from ratslam.keyframes.pieces import number_pieces
+from ratslam.keyframes.keyframe_graph import APART, PiecePlacement, number_pieces, piece_start
 from tactile.base.se2 import between, compose, wrap
 
 CELL = 0.2

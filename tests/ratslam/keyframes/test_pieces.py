@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.keyframes.pieces import number_pieces
+from ratslam.keyframes.keyframe_graph import number_pieces
 
 law = settings(derandomize=True, deadline=None, max_examples=100)
 

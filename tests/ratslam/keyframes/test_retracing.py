@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.keyframes.carried_solution import JUMP, retrace
 from ratslam.keyframes.loop_closures import ClosureLog
-from ratslam.keyframes.retracing import JUMP, retrace
 from tests.ratslam.keyframes.selection_cases import LAP, lap_poses
 from tests.ratslam.keyframes.track_cases import COUNT, ODDS, laps, places
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.alignment.ground import Ground
+from ratslam.keyframes.carried_solution import LONGEST, add_closures_along
 from ratslam.keyframes.loop_closures import ClosureLog
 from ratslam.keyframes.pose_tracks import SelfTraverse
-from ratslam.keyframes.track_closures import LONGEST, add_closures_along
 
 LAP, COUNT, GUARD = 24, 60, 5
 """Keyframes of a lap and of all, and those before a keyframe that it is not compared with."""

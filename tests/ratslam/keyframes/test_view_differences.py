@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.keyframes.view_differences import mean_differences, near_facing, summed_log_odds
+from ratslam.keyframes.appearance import mean_differences, near_facing, summed_log_odds
 
 seeds = st.integers(0, 10_000)
 

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.metrics.metric import Quantity
 from ratslam.config.completion import complete
-from ratslam.config.presets import PRESETS
+from ratslam.config.packaged import PRESETS
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.examples import taxel_array
 from ratslam.pipeline.run import run

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ratslam.config.presets import PRESETS
+from ratslam.config.packaged import PRESETS
 from tactile.base.types import Observation
 from tests.ratslam.pipeline.touch_walks import (
     WIDE,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.config.completion import complete
-from ratslam.config.presets import PRESETS
+from ratslam.config.packaged import PRESETS
 from ratslam.config.run_config import RunConfig
 from ratslam.keyframes.loop_closures import Verdict
 from robot.simulation.head.session import HeadSimulation

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from ratslam.recall.filter import BASIN, FACING
-from ratslam.recall.transition import SUPPORT
+from ratslam.recall.filter import BASIN, FACING, SUPPORT
 from tactile.base.se2 import between, compose, wrap
 from tests.ratslam.recall.recall_cases import (
     ANGLE,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ratslam.recall.config import sector_shifts
+from ratslam.recall.filter import FOLLOWERS, SUPPORT, follow_keyframes
 from ratslam.recall.observation_model import STEPS
-from ratslam.recall.transition import FOLLOWERS, SUPPORT, follow_keyframes
 from tactile.base.se2 import between, compose
 from tests.ratslam.recall.whisker_cases import (
     AHEAD,

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.recall.config import RecallConfig
+from ratslam.recall.filter import follow_keyframes
 from ratslam.recall.memory import (
     MapFeedback,
     accumulate_motion,
@@ -19,7 +20,6 @@ from ratslam.recall.memory import (
     init_memory,
     store_keyframe,
 )
-from ratslam.recall.transition import follow_keyframes
 from ratslam.recall.whisker_likelihood import (
     DEAD,
     HEIGHTS,

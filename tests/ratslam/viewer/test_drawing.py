@@ -8,8 +8,7 @@ from rerun.chunk import RrdReader
 
 from ratslam.core.types import GridDrawing
 from ratslam.pipeline.progress import MapReport, RunDescription, StepReport
-from ratslam.viewer.drawing import Drawing, open_recording
-from ratslam.viewer.whisker_shapes import whisker_curves
+from ratslam.viewer.drawing import Drawing, open_recording, whisker_curves
 from tactile.base.types import Odometry, observation
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.pipeline.progress import MapSchedule
-from ratslam.viewer.judgements import VerdictLog
-from ratslam.viewer.whisker_shapes import POINTS, whisker_curves
+from ratslam.viewer.drawing import POINTS, VerdictLog, whisker_curves
 from tactile.whiskers.head_geometry import HeadConfig, tip_points, ur10_head
 
 HEAD = ur10_head(HeadConfig())

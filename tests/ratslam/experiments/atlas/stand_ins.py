@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.metrics.localisation import nearest_steps
-from ratslam.experiments.atlas.methods import Localised, Methods
+from ratslam.experiments.atlas.row import Localised, Methods
 from ratslam.experiments.atlas.sessions import Recorded
 from ratslam.experiments.atlas.stored_maps import MapArrays, StoredMap
 from robot.world.maze import CELL_SIDE

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.experiments.atlas.arena_sessions import REPORTS, ArenaDrive, shuffled_contacts
-from ratslam.experiments.atlas.arenas import SOON, ArenaFigures, arena_lines
+from ratslam.experiments.atlas.arenas import (
+    REPORTS,
+    SOON,
+    ArenaDrive,
+    ArenaFigures,
+    arena_lines,
+    shuffled_contacts,
+)
 from ratslam.experiments.atlas.localising import Judged
 from tests.helpers.grid_world import report
 

@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.experiments.atlas.goal_drives import (
+from ratslam.experiments.atlas.goals import (
     ClosedLoop,
     Drive,
+    GoalFigures,
     cells_between,
     clearance,
+    draw_goals,
     driven_map,
+    goal_lines,
     shortest_driven,
     walls_of,
 )
-from ratslam.experiments.atlas.goals import GoalFigures, draw_goals, goal_lines
 from ratslam.experiments.atlas.sessions import Recipe, touch_config
 from ratslam.experiments.atlas.stored_maps import store_map
 from ratslam.experiments.tables.touch import MAIN

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from ratslam.experiments.atlas import halves, merging
-from ratslam.experiments.atlas.methods import Methods
 from ratslam.experiments.atlas.reproduction import ROWS, reproduce_maps
-from ratslam.experiments.atlas.row import MapTask
+from ratslam.experiments.atlas.row import MapTask, Methods
 from ratslam.experiments.atlas.scenarios import (
     carried_sessions,
     kidnapped,

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ratslam.config.run_config import RunConfig
-from ratslam.experiments.atlas.cell_parts import cells_of, wall_middle
 from ratslam.experiments.atlas.scenarios import (
     FOREIGN,
     LOCALISED,
     REENTERED,
     Change,
     carried_sessions,
+    cells_of,
     closed_door,
     moved_wall,
     open_world,
@@ -23,6 +23,7 @@ from ratslam.experiments.atlas.scenarios import (
     same_maze,
     ten_circuits,
     unknown_start,
+    wall_middle,
 )
 from ratslam.experiments.atlas.sessions import Recipe, record
 from robot.world.maze import CELL_SIDE, Maze

@@ -7,16 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.experiments.cells.boxes import FIGURE, fit_maps, measure_boxes
-from ratslam.experiments.cells.figure import CellTask
-from ratslam.experiments.cells.place_columns import EVERY, choose_columns, one_of_each, sum_columns
-from ratslam.experiments.cells.rat_sessions import rat_config
-from ratslam.experiments.cells.torus_alignment import (
+from ratslam.experiments.cells.boxes import (
+    EVERY,
+    FIGURE,
     align_maps,
+    choose_columns,
     correlate_shifts,
+    fit_maps,
     lay_on_torus,
     mean_correlation,
+    measure_boxes,
+    one_of_each,
+    sum_columns,
 )
+from ratslam.experiments.cells.figure import CellTask
+from ratslam.experiments.cells.rat_sessions import rat_config
 
 BINS = 21
 CENTRES = np.random.default_rng(0).uniform(0, BINS, (40, 2))

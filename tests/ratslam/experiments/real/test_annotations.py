@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.experiments.real.annotations import (
+from ratslam.experiments.real.contact import (
     Label,
     merge_marks,
     read_annotation,

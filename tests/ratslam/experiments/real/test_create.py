@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ratslam.experiments.real.create import CreateResult, create_table, draw_create
-from ratslam.experiments.real.create_runs import Variant, true_revisits
+from ratslam.experiments.real.create import CreateResult, Variant, create_table, draw_create, true_revisits
 from ratslam.experiments.real.wall_distance import wall_distances
 from ratslam.keyframes.appearance import ViewAppearance
 from ratslam.keyframes.config import FULL, KeyframeMapConfig

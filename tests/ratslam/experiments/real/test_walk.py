@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from ratslam.config.completion import complete
-from ratslam.experiments.real.walk import compare_one_way, whisker_config
-from ratslam.experiments.real.walk_odometry import continue_path, draw_energies, last_before_reversal
+from ratslam.experiments.real.walk import (
+    compare_one_way,
+    continue_path,
+    draw_energies,
+    last_before_reversal,
+    whisker_config,
+)
 from ratslam.experiments.real.walk_source import (
     AWAY,
     ENTRY,

@@ -13,9 +13,15 @@ from hypothesis import strategies as st
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.cli import main
 from ratslam.cli.reproduce import SALMAN2016
-from ratslam.experiments.salman2016.claims import judge_claim, render_claims
 from ratslam.experiments.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
-from ratslam.experiments.salman2016.reproduction import PAPER, match_thresholds, plan_jobs, session_config
+from ratslam.experiments.salman2016.reproduction import (
+    PAPER,
+    judge_claim,
+    match_thresholds,
+    plan_jobs,
+    render_claims,
+    session_config,
+)
 from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.reproduction import ResultRow, column, reproduce
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds

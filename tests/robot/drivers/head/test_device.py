@@ -9,8 +9,7 @@ from array import array
 
 import pytest
 
-from robot.drivers.head.address import Address
-from robot.drivers.head.config import HeadLinkConfig
+from robot.drivers.head.config import Address, HeadLinkConfig
 from robot.drivers.head.device import (
     Disconnected,
     HeadIdentity,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.ring_buffer import RingBuffer
+from robot.drivers.head.reader import RingBuffer
 
 SIZE = 16
 

@@ -14,7 +14,7 @@ from robot.drivers.head.protocol import ANGLE, REQUEST_OUT, Request, to_radians
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 from robot.emulators.create.config import CreateWorldConfig
 from robot.emulators.create.serial_line import Terminal
-from robot.emulators.create.whiskers import CreateWhiskers
+from robot.emulators.create.server import CreateWhiskers
 from robot.emulators.head.device import EmulatedHead
 from robot.simulation.create.strain_sensors import (
     ShakeConfig,

@@ -21,9 +21,8 @@ from robot.drivers.head.protocol import (
 )
 from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
 from robot.emulators.head.device import EmulatedHead
-from robot.emulators.head.pose_source import AlongPath, PoseSource
 from robot.emulators.head.sensor_array import BLOCK
-from robot.emulators.head.whiskers import maze_whiskers
+from robot.emulators.head.whiskers import AlongPath, PoseSource, maze_whiskers
 from robot.world.scene import KidnapConfig, Scene, make_scene
 from robot.world.walls import Walls
 from tactile.whiskers.head_geometry import ur10_head

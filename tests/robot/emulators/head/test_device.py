@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from robot.drivers.head.protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, FrameFlag, Request
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.fifo import Fifo
+from robot.emulators.head.device import Fifo
 from robot.emulators.head.sensor_array import BLOCK
 from tests.robot.emulators.head.heads import EVER, HostedHead, drive
 

@@ -19,8 +19,8 @@ from robot.drivers.head.protocol import (
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.pose_listener import ToolPose
 from robot.emulators.head.config import HeadEmulatorConfig
-from robot.emulators.head.pose_source import AHEAD, AlongPath, CarriedByArm
 from robot.emulators.head.sensor_array import BLOCK
+from robot.emulators.head.whiskers import AHEAD, AlongPath, CarriedByArm
 from robot.simulation.head.baseline import HALL_BASELINE, BaselineConfig, make_baseline
 from robot.simulation.head.kinematic import HeadSetup
 from robot.simulation.head.quasistatic import simulate_quasistatic

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.dashboard_server import DashboardSession
-from robot.emulators.ur10.safety import Runtime
-from robot.emulators.ur10.script_server import ScriptSession
-from robot.emulators.ur10.server import emulated_controller
+from robot.emulators.ur10.controller import Runtime
+from robot.emulators.ur10.server import DashboardSession, ScriptSession, emulated_controller
 
 PROGRAM = b"def rtde_control():\n    global reg_offset_int = # int register offset\n0\nend\n"
 HERE = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)

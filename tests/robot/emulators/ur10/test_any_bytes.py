@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.dashboard_server import DashboardSession
 from robot.emulators.ur10.rtde_server import Claims, RtdeSession
-from robot.emulators.ur10.script_server import ScriptSession
-from robot.emulators.ur10.server import emulated_controller
+from robot.emulators.ur10.server import DashboardSession, ScriptSession, emulated_controller
 
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))

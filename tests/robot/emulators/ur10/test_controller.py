@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.emulators.ur10.safety import Runtime
+from robot.emulators.ur10.controller import Runtime
 from tests.robot.emulators.ur10.controller_bench import HERE, RUNNING, THERE, Bench
 
 

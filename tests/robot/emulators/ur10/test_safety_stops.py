@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from robot.emulators.ur10.safety import RobotMode, Runtime, SafetyMode
+from robot.emulators.ur10.controller import RobotMode, Runtime, SafetyMode
 from tests.robot.emulators.ur10.controller_bench import THERE, Bench
 
 

@@ -9,9 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.simulation.rat.path_files import PACKAGED, PathFileConfig, read_path
-from robot.simulation.rat.random_walk import RandomWalkConfig, ornstein_uhlenbeck, walk_randomly
 from robot.simulation.rat.rat_path import MotionConfig, RatPath, sample_path
+from robot.simulation.rat.session import (
+    PACKAGED,
+    PathFileConfig,
+    RandomWalkConfig,
+    ornstein_uhlenbeck,
+    read_path,
+    walk_randomly,
+)
 from tactile.base.errors import InputError
 
 MOTION = MotionConfig()
