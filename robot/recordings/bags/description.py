@@ -10,7 +10,7 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.images import IMAGES, RAW, grey_image
-from robot.recordings.bags.motions import POSES, TWISTS, twist_in_plane
+from robot.recordings.bags.motions import POSES, TWISTS, pose_in_plane, twist_in_plane
 from robot.recordings.bags.scans import (
     CLOUD,
     SCAN,
@@ -306,7 +306,7 @@ def _value_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ValueShape:
 
 def _motion_values(content: Any, kind: str, where: str) -> np.ndarray:
     """[6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none."""
-    pose = POSES[kind](content, where) if kind in POSES else (np.nan,) * 3
+    pose = pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
     return np.array([*pose, *(twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3)])
 
 
