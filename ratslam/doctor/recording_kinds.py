@@ -85,13 +85,13 @@ def _csv(path: Path) -> FileContents:
     rows = (("column", "from", "to"), *columns)
     notes, faults = list(found.parts.values()), []
     what = f"{path}: a CSV file, {found.rows} row{'s' * (found.rows != 1)}"
-    if found.clock is not None:
-        clock = found.clock
-        what += f" over {clock.last - clock.first:.6g} s"
-        if clock.step <= 0 or not clock.gap > 0:
+    if found.time is not None:
+        what += f" over {found.time[-1] - found.time[0]:.6g} s"
+        steps = np.diff(found.time) if len(found.time) > 1 else np.zeros(1)
+        if np.median(steps) <= 0 or not steps.max() > 0:
             faults.append("its times do not increase")
-        elif clock.gap > 10 * clock.step:
-            notes.append(f"longest gap: {clock.gap:.3g} s after t = {clock.gap_at:.6g} s")
+        elif steps.max() > 10 * np.median(steps):
+            notes.append(f"longest gap: {steps.max():.3g} s after t = {found.time[steps.argmax()]:.6g} s")
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
     table = {"table": found.table} if found.table else None
@@ -157,9 +157,9 @@ def _bag(path: Path) -> FileContents:
         recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
         notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
-    fov = shape.fov if isinstance(shape, ScanShape) else None
-    if isinstance(shape, ScanShape) and shape.ring:
-        fov = 2 * np.pi
+    fov = None
+    if isinstance(shape, ScanShape):
+        fov = 2 * np.pi if shape.extent.ring else shape.extent.width
     if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
         recording["image"] = size
@@ -186,7 +186,8 @@ def in_words(shape: Shape | None) -> str:
     """What the messages of a topic hold."""
     match shape:
         case ScanShape():
-            turn = "all around" if shape.ring else f"over {np.degrees(abs(shape.fov)):.0f} degrees"
+            width = np.degrees(abs(shape.extent.width))
+            turn = "all around" if shape.extent.ring else f"over {width:.0f} degrees"
             return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
         case CloudShape():
             return f"{shape.points} points, median {shape.reach:.2g} m away"

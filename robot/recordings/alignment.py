@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import prod
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,18 +16,6 @@ from tactile.base.bounded import MOST_PIXELS
 from tactile.base.errors import InputError
 
 RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
-
-
-class NearestRows(NamedTuple):
-    """Odometry rows of M values.
-
-    Attributes:
-        rows: [M] the row nearest in time. away: [M] s from it. reach: s, how far a value may be away.
-    """
-
-    rows: np.ndarray
-    away: np.ndarray
-    reach: float
 
 
 @dataclass(eq=False)
@@ -149,13 +136,16 @@ def range_errors(
     return errors
 
 
-def nearest_rows(moments: np.ndarray, time: np.ndarray, tolerance: float | None) -> NearestRows | None:
+def nearest_rows(
+    moments: np.ndarray, time: np.ndarray, tolerance: float | None
+) -> tuple[np.ndarray, np.ndarray, float] | None:
     """The odometry row nearest in time to each of the times [M] s.
 
     Args:
         time: [N] s of the odometry. tolerance: how far a value may be away, s; None: the median step.
 
     Returns:
+        The rows [M], how far they are away [M] s, and how far they may be, s;
         None if the odometry's times do not increase, which is an error of its own.
     """
     steps = np.diff(time)
@@ -163,7 +153,7 @@ def nearest_rows(moments: np.ndarray, time: np.ndarray, tolerance: float | None)
         return None
     rows = np.searchsorted(time[:-1] + steps / 2, moments)
     reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
-    return NearestRows(rows, np.abs(time[rows] - moments), reach)
+    return rows, np.abs(time[rows] - moments), reach
 
 
 def interpolated_poses(

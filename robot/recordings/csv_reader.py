@@ -193,18 +193,12 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvC
         own_time = file is base and hasattr(part, "time")  # then that of the odometry is used
         errors += file.absences(column_keys(part, f"table.{key}")[own_time:])
         if isinstance(part, columns.ViewColumns):
-            errors += _gap_errors(file, part.prefix)
+            there = file.numbered(part.prefix)
+            wanted = range(min(there), max(there)) if there else [0]
+            absent = [f"{part.prefix}{number}" for number in wanted if number not in there]
+            errors += [missing_error(file.top, "column", name, file.names, "table.views.prefix")
+                       for name in absent[:1]]  # fmt: skip
     return errors
-
-
-def _gap_errors(file: CsvFile, prefix: str) -> list[InputError]:
-    """The error for view columns whose numbers have a gap."""
-    there = file.numbered(prefix)
-    wanted = range(min(there), max(there)) if there else [0]
-    absent = next((number for number in wanted if number not in there), None)
-    if absent is None:
-        return []
-    return [missing_error(file.top, "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
 
 
 def _motion(

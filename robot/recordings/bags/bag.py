@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -316,19 +315,6 @@ def bag_files(path: Path) -> list[Path]:
     stored = [file for file in there if file.suffix in SUFFIXES]
     cure = f"`ros2 bag reindex`, or name the file: {stored[0].name}" if stored else ""
     raise InputError(str(path), f"is a folder without {METADATA}", "a file or the folder of a bag", cure)
-
-
-def bag_digest(path: Path) -> str:
-    """SHA-256 (hex) of the files of a bag, one after the other."""
-    total = hashlib.sha256()
-    for part in bag_files(path):
-        try:
-            with part.open("rb") as file:
-                while content := file.read(1 << 20):
-                    total.update(content)
-        except OSError as error:
-            raise unreadable_error(part, error) from error
-    return total.hexdigest()
 
 
 def _plain(raw: Any) -> bytes:

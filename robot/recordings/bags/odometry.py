@@ -10,7 +10,7 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
-from robot.recordings.bags.motions import PARTS, POSES, TWISTS, pose_in_plane, twist_in_plane
+from robot.recordings.bags.motions import POSES, TWISTS, pose_in_plane, twist_in_plane
 from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors, still_axis
@@ -126,7 +126,7 @@ def _read_series(
             if not np.isfinite(value).all():
                 raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
             return value
-        position, turn = PARTS[topic.kind](content)
+        position, turn = POSES[topic.kind](content)
         value = pose_in_plane(position, turn, place, config.plane)
         points.append((position.x, position.y, position.z))
         for doubt in _doubts(content, turn):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from itertools import compress
 from typing import NamedTuple
 
@@ -130,22 +129,16 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     bodies, sensor = (body.lstrip("/"),) if body else BODIES, sensor.lstrip("/")
     if sensor in bodies:
         return FORWARD
-    links = read_links(bag, STATIC, clock)
-    chain = _first_chain(links, bodies, sensor)
-    if chain is None:
-        links = read_links(bag, MOVING, clock) | links
-        chain = _first_chain(links, bodies, sensor)
-    if chain is None:
-        return None
-    whole = np.eye(4)
-    for frames, down in chain:
-        whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
-    return Mount(whole[:3, :3], whole[:3, 3])
-
-
-def _first_chain(links: Links, bodies: Sequence[str], sensor: str) -> Chain | None:
-    chains = (chain_between(links, body, sensor) for body in bodies)
-    return next((chain for chain in chains if chain is not None), None)
+    links: Links = {}
+    for name in (STATIC, MOVING):
+        links = read_links(bag, name, clock) | links
+        chains = (chain_between(links, each, sensor) for each in bodies)
+        if (chain := next(filter(None, chains), None)) is not None:
+            whole = np.eye(4)
+            for frames, down in chain:
+                whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
+            return Mount(whole[:3, :3], whole[:3, 3])
+    return None
 
 
 def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Report) -> Series:
@@ -172,7 +165,7 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
         use, faults = usable_stamps(links[pair].stamps, place, clock, report)
-        links[pair] = _chosen(links[pair], use)
+        links[pair] = Link(*(list(compress(part, use)) for part in links[pair]))
         times[pair] = in_seconds(links[pair].stamps)
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))
@@ -193,13 +186,6 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
         whole = whole @ _matrices(links[pair], times.get(pair, np.zeros(1)), moments, down)
     values = np.column_stack([whole[:, 0, 3], whole[:, 1, 3], np.arctan2(whole[:, 1, 0], whole[:, 0, 0])])
     return Series(where, moments, values, numbers[inside], [])
-
-
-def _chosen(link: Link, use: np.ndarray) -> Link:
-    """The transforms that are used: [N] bool."""
-    stamps, shifts, turns, numbers = link
-    shifts, turns = list(compress(shifts, use)), list(compress(turns, use))
-    return Link(list(compress(stamps, use)), shifts, turns, list(compress(numbers, use)))
 
 
 def _matrices(link: Link, time: np.ndarray, moments: np.ndarray, down: bool) -> np.ndarray:
