@@ -70,14 +70,12 @@ def map_chart(report: RunReport) -> Any:
 
 def _path_traces(report: RunReport) -> list[Any]:
     """The final trajectory, each piece of the map by itself, `run.main` as the trajectory of one piece."""
-    final, truth, piece, main = report.layers.final, report.layers.truth, report.run.piece, report.run.main
+    final, truth, traces = report.layers.final, report.layers.truth, []
     if not report.run.has_pieces and not len(report.run.state):
         path = final if truth is None else split_at_jumps(final, truth)
         return [_line(path, "trajectory", "final", width=1.6)]
-    traces, (numbers, sizes) = [], np.unique(piece, return_counts=True)
-    ranks = np.argsort(-sizes - len(final) * (numbers == main), kind="stable")
-    for rank, number in enumerate(numbers[ranks].tolist(), start=main < 0):
-        rows = np.flatnonzero(piece == number)
+    for rank, number in report.run.ranked_pieces():
+        rows = np.flatnonzero(report.run.piece == number)
         path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])
         name = report.run.name_piece(number)
         traces.append(_line(path, name, f"run{rank % RUN_ROLES}" if rank else "final", width=1.6))

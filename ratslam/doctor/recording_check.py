@@ -14,6 +14,7 @@ from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
+from ratslam.fit.record import shows_place
 from ratslam.pipeline.map_settings import differing_settings
 from ratslam.pipeline.saved_map import SavedMap
 from ratslam.pipeline.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
@@ -22,7 +23,6 @@ from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_mot
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source
 from tactile.base.errors import InputError
-from tactile.base.types import Observation
 
 CELLS_IN_RANGE = 13
 """Pose cells in the range of the sensor, as in the configurations of real buildings."""
@@ -145,10 +145,7 @@ def summarise(source: Source) -> Contents:
         motions.append(np.asarray(sample.reading.odometry, float))
         times.append(sample.time)
         truths += sample.truth is not None
-        seen = not isinstance(sample.reading, Observation) or (
-            bool(sample.reading.view_seen) or int(sample.reading.label) >= 0
-        )
-        views.append(seen)
+        views.append(shows_place(sample.reading))
     motion, time, viewed = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
     length = np.hypot(motion[:, 0], motion[:, 1])
     between = np.diff(np.cumsum(length)[viewed])

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evaluation.artifacts.run_directory import SESSION_REPORT
+from evaluation.artifacts.manifest import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.live.arm_session import prepare_arm_session
@@ -33,7 +33,6 @@ def run_live_session(
     config: RunConfig,
     directory: Path,
     log: Callable[[str], None],
-    mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
     view: str | None = None,
 ) -> tuple[Fault, Scorecard | None]:
@@ -43,7 +42,6 @@ def run_live_session(
 
     Args:
         directory: the new run directory. log: called with each line of progress.
-        mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
         armed: called with the directory when the session begins. view: target of a live view, or None.
 
     Returns:
@@ -57,7 +55,7 @@ def run_live_session(
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
+    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(view) as mapper:
         robot = open_robot(stopped)
         fault, standing, card = None, False, None
         try:
