@@ -43,8 +43,9 @@ def key_figures(report: RunReport) -> list[KeyFigure]:
     if report.closures.verdicts:
         count, accepted = len(report.closures.verdicts), int(report.closures.accepted().sum())
         figures.append(KeyFigure("Closures accepted", f"{accepted:,}", f"of {count:,} considered"))
-    time = report.run.time
-    figures.append(KeyFigure("Duration", _duration(float(time[-1] - time[0])), f"{len(time):,} steps"))
+    count, lasted = len(report.run.time), float(report.run.time[-1] - report.run.time[0])
+    duration = f"{lasted:.3g} s" if lasted < 120 else f"{lasted / 60:.3g} min"
+    figures.append(KeyFigure("Duration", duration, f"{count:,} steps"))
     if len(report.cost.value):
         cost = 1e3 * float(np.median(report.cost.value))
         figures.append(KeyFigure("Cost of a step", f"{cost:.3g} ms", "median"))
@@ -103,10 +104,6 @@ def _grid(report: RunReport) -> list[KeyFigure]:
     skill = score["map_brier_skill"].value
     note = "" if skill is None else f"skill {skill:.3g}"
     return [KeyFigure("Grid, Brier score", f"{score['map_brier'].value:.3g}", note)]
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.3g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
 
 
 def _number(value: float | None) -> str:
