@@ -86,16 +86,17 @@ class Mapper:
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Args:
-        view: target of a live view, or None.
+        process: its main function; None: `run_mapper`. view: target of a live view, or None.
 
     Attributes:
         mapped: results of all samples mapped so far, in order.
     """
 
-    def __init__(self, view: str | None = None) -> None:
+    def __init__(self, process: Any = None, view: str | None = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
-        self._process = context.Process(target=run_mapper, args=(theirs,), daemon=True, name="ratslam mapper")
+        target = process or run_mapper
+        self._process = context.Process(target=target, args=(theirs,), daemon=True, name="ratslam mapper")
         with withheld_signals():
             self._process.start()
         theirs.close()

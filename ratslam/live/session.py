@@ -33,6 +33,7 @@ def run_live_session(
     config: RunConfig,
     directory: Path,
     log: Callable[[str], None],
+    mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
     view: str | None = None,
 ) -> tuple[Fault, Scorecard | None]:
@@ -42,6 +43,7 @@ def run_live_session(
 
     Args:
         directory: the new run directory. log: called with each line of progress.
+        mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
         armed: called with the directory when the session begins. view: target of a live view, or None.
 
     Returns:
@@ -55,7 +57,7 @@ def run_live_session(
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(view) as mapper:
+    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
         robot = open_robot(stopped)
         fault, standing, card = None, False, None
         try:
