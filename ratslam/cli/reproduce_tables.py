@@ -23,12 +23,8 @@ def add_tables(tables: Commands) -> None:
 
     touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
     add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
-    touch.add_argument(
-        "--sessions",
-        type=positive_integer,
-        metavar="N",
-        help="sessions per row (default: of the row, 12 to 40)",
-    )
+    sessions = "sessions per row (default: of the row, 12 to 40)"
+    touch.add_argument("--sessions", type=positive_integer, metavar="N", help=sessions)
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
