@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.config.completion import complete
-from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
+from ratslam.config.other_files import FOLDER, RECORDING, kind_of, refuse_other_files
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
@@ -19,6 +19,7 @@ from ratslam.pipeline.map_settings import differing_settings
 from ratslam.pipeline.saved_map import SavedMap
 from ratslam.pipeline.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
 from ratslam.pipeline.source import open_source
+from robot.recordings.bags.bag import METADATA
 from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source
@@ -61,6 +62,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     Raises:
         InputError: it is missing, or of no known format.
     """
+    path = path.parent if path.name == METADATA and kind_of(path.parent) == RECORDING else path
     refuse_other_files(path, "a recording", (RECORDING, FOLDER))
     if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"

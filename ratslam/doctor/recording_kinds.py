@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import METADATA
 from robot.recordings.bags.description import (
     BagDescription,
     CloudShape,
@@ -67,11 +66,6 @@ def describe_file(path: Path) -> FileContents:
     """
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
-    if path.name == METADATA:
-        bag = _bag(path.parent)
-        if bag.recording is None:
-            return bag
-        return bag._replace(recording={"file": str(path.parent.resolve()), **bag.recording})
     if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
         return _bag(path)
     describe = KINDS.get(path.suffix.lower())
