@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -165,7 +165,8 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
         use, faults = usable_stamps(links[pair].stamps, place, clock, report)
-        links[pair] = Link(*(list(compress(part, use)) for part in links[pair]))
+        kept: list[Any] = [list(compress(part, use)) for part in links[pair]]
+        links[pair] = Link(*kept)
         times[pair] = in_seconds(links[pair].stamps)
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))

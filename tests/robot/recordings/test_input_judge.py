@@ -228,6 +228,7 @@ def _faulty(kind: str) -> MotionTrack:
         "two nodes": _two_nodes,
         "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
         "centimetres": lambda poses: poses * [100, 100, 1],
+        "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
     }
     poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
     if "gap" in kind:
@@ -245,6 +246,7 @@ JUDGED = {
         "over 40 m/s",
         "these are centimetres: --set recording.odometry.length_scale",
     ),
+    "slow degrees, poses": (True, "headings agree with the direction", "turn_scale=0.0174533"),
     "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
     "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
     "gap, velocities": (True, "row 220: nothing for 60.1 s", "recording.odometry.largest_step"),
