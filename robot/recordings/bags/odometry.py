@@ -175,7 +175,7 @@ def _frame_errors(
 ) -> list[InputError]:
     """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 
-    Several nodes that publish in turn make a path longer than that of each; a frame that changes jumps or turns.
+    Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
     """
     counts = Counter(frames)
     if len(counts) < 2:
