@@ -164,12 +164,7 @@ def _frames_of(message: Any) -> tuple[str, str]:
 
 
 def _frame_errors(
-    where: str,
-    numbers: list[int],
-    frames: list[tuple[str, str]],
-    role: str,
-    places: np.ndarray,
-    report: Report,
+    where: str, numbers: list[int], frames: list[Any], role: str, places: np.ndarray, report: Report
 ) -> list[InputError]:
     """The error for messages of several frames whose positions [M, 2] disagree; those that agree are told.
 
@@ -182,19 +177,16 @@ def _frame_errors(
     parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
     found = f"messages of several frames: {', '.join(parts)}"
     at = f"{where}, message {numbers[frames.index(other)]}"
+    length = lambda places: float(np.hypot(*np.diff(places, axis=0).T).sum())  # noqa: E731
     names = np.array([list(counts).index(pair) for pair in frames])
-    alone = [_length(places[names == k]) for k in range(len(counts))]
+    alone = [length(places[names == k]) for k in range(len(counts))]
     in_turn = (np.diff(names) != 0).sum() > len(counts)
-    if _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+    if length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
         report(f"{at}: {found}; their poses agree, look at the publisher")
         return []
     cure = f"--set recording.topics.{role}.frames='[{', '.join(filter(None, usual))}]'"
     found += "; several nodes publish here, or it changes"
     return [InputError(at, found, "one frame and child frame", cure)]
-
-
-def _length(places: np.ndarray) -> float:
-    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
 def _doubts(message: Any, turn: Any) -> Iterator[str]:

@@ -165,7 +165,7 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
         use, faults = usable_stamps(links[pair].stamps, place, clock, report)
-        links[pair] = Link(*(list(compress(part, use)) for part in links[pair]))
+        links[pair] = Link(*(list(compress(part, use)) for part in links[pair]))  # type: ignore[arg-type]
         times[pair] = in_seconds(links[pair].stamps)
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))
