@@ -8,7 +8,7 @@ from math import prod
 import numpy as np
 
 from robot.recordings.input_judge import Cures, InputJudge, MotionTrack, unit_cure
-from robot.recordings.sanity_checks import RowName
+from robot.recordings.sanity_checks import RowName, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
@@ -124,11 +124,7 @@ def range_errors(
     Args:
         lowest: [M] smallest range of each view, m. typical: median of all. key: setting of `max_range`.
     """
-    errors = []
-    negative = lowest < 0
-    if negative.any():
-        row = int(negative.argmax())
-        errors.append(InputError(place(row), f"{what} is {lowest[row]}", "ranges of 0 m or more"))
+    errors = first_error(lowest < 0, place, lambda row: f"{what} is {lowest[row]}", "ranges of 0 m or more")
     if typical > RANGE_UNIT_FACTOR * max_range:
         unit = "--set recording.table.views.unit=mm" if key.startswith("table") else "divide by 1000"
         cure = f"{unit} if they are millimetres, else raise {key}"

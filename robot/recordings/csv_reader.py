@@ -19,7 +19,15 @@ from robot.recordings.alignment import (
 from robot.recordings.csv_file import EMPTY, CsvFile, read_csv
 from robot.recordings.csv_units import split_unit
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
-from robot.recordings.sanity_checks import SPOILT, RowName, clock_errors, leave_out, still_axis, view_errors
+from robot.recordings.sanity_checks import (
+    SPOILT,
+    RowName,
+    clock_errors,
+    first_error,
+    leave_out,
+    still_axis,
+    view_errors,
+)
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
@@ -90,7 +98,7 @@ def read_csv_recording(
         there = config.time in (*base.names, *base.full)
         start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
         time = np.nan_to_num(start) + kept / config.rate
-    motion, poses, faults = _motion(base, time, part, config.units, kept, limits)
+    motion, poses, faults = _motion(base, time, kept, config, limits)
     shape, place, held = (
         (config.rows, config.columns, 1),
         base.place,
@@ -202,14 +210,11 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvC
 
 
 def _motion(
-    base: CsvFile,
-    time: np.ndarray,
-    part: columns.PoseColumns | columns.VelocityColumns | columns.MotionColumns,
-    units: columns.TableUnits,
-    kept: np.ndarray,
-    limits: UnitLimits,
+    base: CsvFile, time: np.ndarray, kept: np.ndarray, config: columns.CsvConfig, limits: UnitLimits
 ) -> tuple[np.ndarray, np.ndarray | None, list[InputError]]:
     """Motions [N, 4] of the rows at positions [N], poses [N, 3] where these are given, and errors."""
+    units, part = config.units, config.pose or config.velocity or config.motion
+    assert part is not None
     with np.errstate(all="ignore"):  # faulty values are already reported
         if isinstance(part, columns.PoseColumns):
             poses, errors = read_poses(base, part, units, time, limits, "table.pose")
@@ -324,11 +329,9 @@ def _labels(files: Files, labels: columns.LabelColumns) -> AlignedRows:
     ids = ids[there]
     rows, errors = _match_rows(files, file, there, labels)
     bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
-    if bad.any():
-        row = int(bad.argmax())
-        found, expected = f"{labels.column} is {ids[row]}", "an integer from 0; -1 or an empty cell for none"
-        return rows, ids, [InputError(file.place(int(there[row])), found, expected), *errors]
-    return rows, ids.astype(np.int32), errors
+    found, place = (lambda row: f"{labels.column} is {ids[row]}"), file.rows(there).place
+    errors = first_error(bad, place, found, "an integer from 0; -1 or an empty cell for none") + errors
+    return rows, ids if errors else ids.astype(np.int32), errors
 
 
 def _pairs(files: Files, part: columns.PairColumns) -> AlignedRows:
@@ -338,11 +341,9 @@ def _pairs(files: Files, part: columns.PairColumns) -> AlignedRows:
     score = file.column(part.score)
     errors = file.judge([part.later, part.earlier, part.score])[1]
     crossed = later <= earlier
-    if crossed.any():
-        row = int(crossed.argmax())
-        found = f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"
-        cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
-        errors.append(InputError(file.place(row), found, "the later time of a pair first", cure))
+    found = lambda row: f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"  # noqa: E731
+    cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
+    errors += first_error(crossed, file.place, found, "the later time of a pair first", cure)
     if errors:
         return later, later, errors
     moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
@@ -503,16 +504,11 @@ def each_nearest(
     if found is None:
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
     rows, away, reach = found
-    errors = []
-    far = away > reach
-    if far.any():
-        i = int(far.argmax())
-        text = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
-        cure = "raise tolerance, or bring both to one clock"
-        errors.append(InputError(place(i), text, f"at most {reach:.4g} s", cure))
-    twice = np.flatnonzero(np.diff(rows) == 0)
-    if len(twice) and not errors:
-        i = int(twice[0]) + 1
-        text = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
-        errors.append(InputError(place(i), text, "one for each odometry row", "thin them out"))
+    far, cure = away > reach, "raise tolerance, or bring both to one clock"
+    one = f"(one of {int(far.sum())} such rows)"
+    found_far = lambda i: f"the nearest odometry row is {away[i]:.4g} s away {one}"  # noqa: E731
+    errors = first_error(far, place, found_far, f"at most {reach:.4g} s", cure)
+    twice = np.append(False, np.diff(rows) == 0)
+    text = f"belongs to the same odometry row as the previous one (one of {int(twice.sum())} such rows)"
+    errors = errors or first_error(twice, place, lambda _: text, "one for each odometry row", "thin them out")
     return rows, errors

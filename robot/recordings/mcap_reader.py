@@ -17,7 +17,7 @@ from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner, is_foreign
 from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.recorder import Recorder
-from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
+from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
 from robot.sources.input_files import digest_of_files, raise_errors, require_file
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
@@ -103,10 +103,8 @@ class Recording(ClosedSource):
         )
         errors += nonfinite_errors(odd, "a number in the reading", place)
         errors += nonfinite_errors(truth, "truth", place, has_truth > 0)
-        back = motion[:, 3] < 0
-        if back.any():
-            row = int(back.argmax())
-            errors.append(InputError(place(row), f"odometry has dt {motion[row, 3]} s", "at least 0 s"))
+        dt = motion[:, 3]
+        errors += first_error(dt < 0, place, lambda row: f"odometry has dt {dt[row]} s", "at least 0 s")
         track = MotionTrack(time, moved, motion, truth if has_truth.any() else None)
         raise_errors(errors + judge.errors(track, place, str(self.path), in_order=not errors))
         return time[moved]

@@ -37,6 +37,14 @@ def leave_out(
     return []
 
 
+def first_error(
+    bad: np.ndarray, place: RowName, found: Callable[[int], str], expected: str, cure: str = ""
+) -> list[InputError]:
+    """The error for the first of the rows that are bad, [N] bool; none without any."""
+    row = int(bad.argmax()) if bad.any() else None
+    return [] if row is None else [InputError(place(row), found(row), expected, cure)]
+
+
 def still_axis(points: np.ndarray) -> str:
     """The axis, x or y, along which a path [N, 3] m hardly moves although it does along z; '' for none."""
     points = points[np.isfinite(points).all(axis=1)]
@@ -89,11 +97,11 @@ def view_errors(low: np.ndarray, high: np.ndarray, what: str, place: RowName) ->
     hit = (low < 0) | (high > 1)
     if not hit.any():
         return []
-    row = int(hit.argmax())
-    worst = float(high[row] if high[row] > 1 else low[row])
     most = 255 if np.nanmax(high) <= 255 else f"their largest possible value, at least {np.nanmax(high):g}"
     cure = "shift and scale them" if np.nanmin(low) < 0 else f"divide them by {most}"
-    return [InputError(place(row), f"{what} holds {worst!r}{count_others(hit)}", "view values in 0..1", cure)]
+    worst = np.where(high > 1, high, low)
+    found = lambda row: f"{what} holds {float(worst[row])!r}{count_others(hit)}"  # noqa: E731
+    return first_error(hit, place, found, "view values in 0..1", cure)
 
 
 def count_others(hit: np.ndarray) -> str:

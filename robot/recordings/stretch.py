@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, Field, create_model
@@ -30,11 +30,14 @@ def _check_time(value: float | str) -> float | str:
 Moment = Annotated[float | str, AfterValidator(_check_time)]
 """s from the start of the recording, or an ISO time such as 2024-05-01T10:00:00+02:00; UTC without offset."""
 _WORDS = {"from": "the recording is read from here on, as if it began here", "to": "it is read to here"}
-_FIELDS: dict[str, Any] = {
-    name: (Moment | None, Field(default=None, description=f"{words}: s from its start, or an ISO time."))
-    for name, words in _WORDS.items()
-}
-StretchConfig = create_model("StretchConfig", __base__=Settings, **_FIELDS)
+StretchConfig = create_model(
+    "StretchConfig",
+    __base__=Settings,
+    **{
+        name: (Moment | None, Field(default=None, description=f"{words}: s from its start, or an ISO time."))
+        for name, words in _WORDS.items()
+    },
+)  # type: ignore[call-overload]
 """The settings `from` and `to`; the first is a keyword of Python, which no class can name."""
 
 

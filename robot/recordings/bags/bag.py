@@ -223,15 +223,15 @@ class Bag:
         where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
             raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
-        coded = {getattr(each.ext, "serialization_format", "cdr") for reader in self._readers
-                 for each in reader.connections if each.topic == topic.name}  # fmt: skip
-        if coded - {"cdr"}:
+        connections = [
+            each for reader in self._readers for each in reader.connections if each.topic == topic.name
+        ]
+        coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
+        if coded:
             raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
-        if self._first:
-            digest = self._store.generate_msgdef(topic.kind)[1]
-            connections = (each for reader in self._readers for each in reader.connections)
-            if any(each.topic == topic.name and each.digest not in (digest, "*") for each in connections):
-                raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
+        known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
+        if self._first and any(each.digest not in known for each in connections):
+            raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
 
     def __enter__(self) -> Self:
         return self

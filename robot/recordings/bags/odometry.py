@@ -166,12 +166,7 @@ def _frames_of(message: Any) -> tuple[str, str]:
 
 
 def _frame_errors(
-    where: str,
-    numbers: list[int],
-    frames: list[tuple[str, str]],
-    role: str,
-    poses: np.ndarray,
-    report: Report,
+    where: str, numbers: list[int], frames: list[Any], role: str, poses: np.ndarray, report: Report
 ) -> list[InputError]:
     """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 

@@ -125,7 +125,9 @@ class _RangeReader:
 
     def view(self, content: Any, place: str) -> RangeView | None:
         """As `scan_view` and `cloud_view`."""
-        config, sensor, reach = self._config, content.header.frame_id, self.reach or _reach(content)
+        config, sensor = self._config, content.header.frame_id
+        longest = scan_limits(content)[1] if self._topic.kind == SCAN else LONGEST
+        reach = self.reach or min(longest, LONGEST)
         pixels = config.rows * config.columns
         if self._topic.kind == CLOUD:
             view = cloud_view(content, self._mount(sensor), config.heights, pixels, reach, place)
@@ -164,8 +166,3 @@ class _RangeReader:
                 self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
             self._mounts[sensor] = mount or FORWARD
         return self._mounts[sensor]
-
-
-def _reach(content: Any) -> float:
-    """The range that becomes 1 where none is given, m."""
-    return min(scan_limits(content)[1], LONGEST) if hasattr(content, "ranges") else LONGEST
