@@ -186,7 +186,7 @@ def describe_bag(path: Path) -> BagDescription:
                 found = read_links(bag, name, "header")
             except InputError:
                 continue  # the fault of the topic says why
-            links += [FrameLink(*pair, name == STATIC, len(link.stamps)) for pair, link in found.items()]
+            links += [FrameLink(*pair, name == STATIC, len(link)) for pair, link in found.items()]
     return BagDescription(path, topics, tuple(links), tuple(told))
 
 
