@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.manifest import SESSION_REPORT as SESSION_REPORT
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
@@ -76,6 +75,12 @@ def read_run(path: Path) -> RunArrays:
         state=_states(path / "localisation.csv", steps),
     )
     return run._replace(node_piece=_localised_nodes(run)) if len(run.state) else run
+
+
+def has_steps(path: Path) -> bool:
+    """Whether a run directory has a step."""
+    online = path / "online.tum"
+    return online.exists() and online.stat().st_size > 0
 
 
 def first_visits(place: np.ndarray, nodes: int) -> np.ndarray:

@@ -63,11 +63,8 @@ def _lines(path: str | Path) -> Iterator[tuple[int, list[str], bool]]:
     lines = read_text(path, "a text file of numbers").split("\n")
     for number, line in enumerate(lines, start=1):
         if line.strip() and not line.lstrip().startswith("#"):
-            yield number, _cells(line), number < len(lines)
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+            cells = [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+            yield number, cells, number < len(lines)
 
 
 def _places(where: str, names: list[str], columns: Columns) -> list[int]:

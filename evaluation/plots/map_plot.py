@@ -205,15 +205,14 @@ def _paint_path(
     def drawn(rows: np.ndarray) -> np.ndarray:
         return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
 
-    numbers, sizes = np.unique(run.piece, return_counts=True)
-    if len(numbers) < 2 and not len(run.state):
+    if not run.has_pieces and not len(run.state):
         axes.plot(*drawn(np.arange(len(path))).T, color=BLUE, label="mapped path", **line)
         return
-    ranks = np.argsort(-sizes - len(path) * (numbers == run.main), kind="stable")
-    for rank, number in enumerate(numbers[ranks].tolist(), start=run.main < 0):
+    pieces = run.ranked_pieces()
+    for rank, number in pieces:
         rows, name = np.flatnonzero(run.piece == number), run.name_piece(number)
         if rank >= NAMED:
-            name = "_" if rank > NAMED else f"{len(numbers) - NAMED} smaller pieces"
+            name = "_" if rank > NAMED else f"{len(pieces) - NAMED} smaller pieces"
         axes.plot(*drawn(rows).T, color=PIECES[min(rank, NAMED)], label=name, **line)
 
 

@@ -68,25 +68,12 @@ def add_commands(commands: Commands) -> None:
         "-o", "--output", type=Path, metavar="DIR", check=own_folder("runs.jsonl", "growth.jsonl", "sets"),
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
-    study.add_argument(
-        "--error",
-        metavar="NAME",
-        help="error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity",
-    )
-    study.add_argument(
-        "--by",
-        type=float,
-        default=0.2,
-        metavar="SHARE",
-        help="share by which --preset vary changes a number (default 0.2)",
-    )
-    study.add_argument(
-        "--seconds",
-        type=float,
-        default=600.0,
-        metavar="S",
-        help="length of a session of --preset tiers, s (default 600)",
-    )
+    error = "error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity"
+    study.add_argument("--error", metavar="NAME", help=error)
+    share = "share by which --preset vary changes a number (default 0.2)"
+    study.add_argument("--by", type=float, default=0.2, metavar="SHARE", help=share)
+    length = "length of a session of --preset tiers, s (default 600)"
+    study.add_argument("--seconds", type=float, default=600.0, metavar="S", help=length)
 
     size = commands.add("size", _size, "recommend settings for a scene", "size whisker_maze", "study")
     add_config(size)
@@ -168,13 +155,8 @@ def _study(arguments: argparse.Namespace) -> int:
 
     remarks: list[str] = []
     if arguments.preset:
-        study, remarks = preset_study(
-            arguments.preset,
-            find_config(arguments.config),
-            arguments.set,
-            by=arguments.by,
-            seconds=arguments.seconds,
-        )
+        config, changes = find_config(arguments.config), {"by": arguments.by, "seconds": arguments.seconds}
+        study, remarks = preset_study(arguments.preset, config, arguments.set, **changes)
     else:
         study = read_study(find_config(arguments.config), arguments.set)
     error = find_error(arguments.error) if arguments.error else None

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evaluation.artifacts.run_directory import SESSION_REPORT
+from evaluation.artifacts.manifest import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.live.arm_session import prepare_arm_session

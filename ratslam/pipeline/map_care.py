@@ -48,6 +48,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
     made = saved.open_session().map
     path = made.trajectory() if saved.steps else np.zeros((0, 3))
     doubt = made.final_doubt() if saved.steps else np.nan
+    box = np.array([path[:, :2].min(axis=0), path[:, :2].max(axis=0)]) if len(path) else path
     info: dict[str, Any] = {
         "path": str(saved.path),
         "format": saved.format,
@@ -61,7 +62,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
         "experiences": len(made.graph()) if saved.steps else 0,
         "pieces": len(np.unique(made.pieces())) if saved.steps else 0,
         "closures": len(made.closures()) if saved.steps else 0,
-        "box_m": _box(path),
+        "box_m": box.ravel().tolist(),
         "doubt": float(doubt) if np.isfinite(doubt) else None,
         "unjudged": made.unjudged() if saved.steps else "",
     }
@@ -243,8 +244,3 @@ def _content(saved: SavedMap) -> MapContent:
     names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
     path = made.trajectory() if saved.steps else np.zeros((0, 3))
     return MapContent(path, names, made.closures())
-
-
-def _box(path: np.ndarray) -> list[float]:
-    """Least x and y and largest x and y of poses [T, 3], m."""
-    return [*path[:, :2].min(axis=0).tolist(), *path[:, :2].max(axis=0).tolist()] if len(path) else []

@@ -14,7 +14,7 @@ from evaluation.artifacts.merged_map import NAME as MERGED
 from evaluation.artifacts.merged_map import is_merged, read_session_steps
 from evaluation.artifacts.pieces_table import NAME as PIECES
 from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_directory import has_steps, read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -73,8 +73,7 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
 
 def holds_results(folder: Path) -> bool:
     """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
-    online = folder / "online.tum"
-    return is_merged(folder) or (online.exists() and online.stat().st_size > 0)
+    return is_merged(folder) or has_steps(folder)
 
 
 def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:

@@ -164,7 +164,7 @@ class Slam:
         slam.estimate = saved.estimate
         if slam._frontend is not None and saved.frontend:
             found = "the front end's arrays do not fit it ({})"
-            with malformed(Path(path), "a map of this front end", found=found):
+            with malformed(saved.path, "a map of this front end", found=found):
                 slam._frontend.restore(dict(saved.frontend))
         return slam
 

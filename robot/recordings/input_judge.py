@@ -56,6 +56,8 @@ SHORTEST, HELD = 4e-4, 5.0
 """Shortest median interval of any odometry, s, and longest over which a velocity holds."""
 RETURNS, RETURNING = 0.25, 0.1
 """Share of a step within which the next one leads back, and share of the steps of two publishers that do."""
+ENOUGH, ALIKE = 20, (0.5, 0.9)
+"""Steps that tell the unit of headings; mean agreement with the motion in a wrong and a right unit."""
 COARSE = 0.1
 """Share of the typical step above which the spacing of numbers spoils it."""
 
@@ -159,6 +161,9 @@ class InputJudge:
                 return [InputError(place(finding.row or 0), *finding[2:])]
             if (found := unit_errors(track, where, self.limits, cures or unit_cure)) or not in_order:
                 return found
+            if track.poses is not None and _are_degrees(track.poses):
+                said = "headings agree with the direction of motion in degrees, and not in radians"
+                return [InputError(where, said, "headings in radians", (cures or unit_cure)("angle", "deg"))]
             errors = []
             for finding in judge_steps(track, self.limits, clock):
                 at = where if finding.row is None else place(finding.row)
@@ -307,11 +312,22 @@ def _two_publishers(poses: np.ndarray) -> Finding | None:
     return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
 
 
+def _are_degrees(poses: np.ndarray) -> bool:
+    """Whether headings point along the motion, forwards or backwards, in degrees and not in radians."""
+    step = np.diff(poses[:, :2], axis=0)
+    length, heading = np.hypot(*step.T), poses[:-1, 2]
+    moved = length > np.median(length[length > 0]) / 2 if (length > 0).any() else length > 0
+    along = 2j * np.arctan2(step[moved, 1], step[moved, 0])
+    agree = [abs(np.exp(2j * angle[moved] - along).mean()) for angle in (heading, np.radians(heading))]
+    wide = np.ptp(heading) > 2 * np.pi
+    return bool(wide and moved.sum() > ENOUGH and agree[0] < ALIKE[0] and agree[1] > ALIKE[1])
+
+
 def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
     """Coordinates so far from the origin that numbers lie apart by much of a step."""
     places = poses[:, :2]
     single = places.astype(np.float32)
-    far = float(np.abs(places).max())
+    far = float(np.median(np.abs(places).max(axis=1)))
     spacing = float(np.spacing(np.float32(far)) if (single == places).all() else np.spacing(far))
     if not spacing > COARSE * steps.typical_length > 0:
         return None
@@ -319,7 +335,7 @@ def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
     cure = "write them in double precision or from a near origin; of a bag, take velocities: "
     cure += "--set recording.topics.odometry.use=twist"
-    return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
+    return Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
 
 
 def typical_motion(track: MotionTrack) -> TypicalMotion:

@@ -16,10 +16,12 @@ from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors, still_axis
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
-from tactile.base.se2 import integrate
+from tactile.base.se2 import integrate, wrap
 
 AGREED = 1.2
 """Length of the path of all frames over that of each of them, up to which their poses agree."""
+TURNED = 0.5
+"""Typical turn between poses of different frames, rad, from which they disagree."""
 
 
 class BagOdometry(NamedTuple):
@@ -142,8 +144,8 @@ def _read_series(
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
     numbers, times, others, pairs = ([row[k] for row in rows] for k in range(4))
     values = np.array(kept).reshape(-1, 3)
-    places = values[:, :2] * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict
-    errors = _frame_errors(where, numbers, pairs, role, places, report)
+    poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
+    errors = _frame_errors(where, numbers, pairs, role, poses, report)
     for doubt, at in doubts.items() if not errors else ():
         report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
     if config.plane == "xy" and not (twist or errors) and still_axis(np.array(points)) == "y":
@@ -164,29 +166,34 @@ def _frames_of(message: Any) -> tuple[str, str]:
 
 
 def _frame_errors(
-    where: str, numbers: list[int], frames: list[Any], role: str, places: np.ndarray, report: Report
+    where: str, numbers: list[int], frames: list[Any], role: str, poses: np.ndarray, report: Report
 ) -> list[InputError]:
-    """The error for messages of several frames whose positions [M, 2] disagree; those that agree are told.
+    """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 
-    Several nodes that publish in turn make a path longer than that of each; a frame that changes once jumps.
+    Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
     """
     counts = Counter(frames)
     if len(counts) < 2:
         return []
-    (usual, _), (other, _), *_ = counts.most_common()
+    usual = counts.most_common(1)[0][0]
     parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
     found = f"messages of several frames: {', '.join(parts)}"
-    at = f"{where}, message {numbers[frames.index(other)]}"
-    length = lambda places: float(np.hypot(*np.diff(places, axis=0).T).sum())  # noqa: E731
     names = np.array([list(counts).index(pair) for pair in frames])
-    alone = [length(places[names == k]) for k in range(len(counts))]
-    in_turn = (np.diff(names) != 0).sum() > len(counts)
-    if length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+    changes, places = np.flatnonzero(np.diff(names)), poses[:, :2]
+    at = f"{where}, message {numbers[changes[0] + 1]}"
+    alone = [_length(places[names == k]) for k in range(len(counts))]
+    in_turn = len(changes) > len(counts)
+    turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
+    if turned < TURNED and _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
         report(f"{at}: {found}; their poses agree, look at the publisher")
         return []
-    cure = f"--set recording.topics.{role}.frames='[{', '.join(filter(None, usual))}]'"
+    cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
     found += "; several nodes publish here, or it changes"
     return [InputError(at, found, "one frame and child frame", cure)]
+
+
+def _length(places: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
 def _doubts(message: Any, turn: Any) -> Iterator[str]:

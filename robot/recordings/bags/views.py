@@ -59,7 +59,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         if count:
             report(f"{where}: {count} of {topic.total} messages {fault} and are no views")
     if wider := reader.wider_span():
-        cure = f"--set {KEY}.span='[{wider[0]:.4f}, {wider[1]:.4f}]'"
+        cure = f"--set {KEY}.span=[{wider[0]:.4f},{wider[1]:.4f}]"
         report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
     numbers, stamps, found = ([row[k] for row in rows] for k in range(3))
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)

@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.artifacts.manifest import RUNNING
-from evaluation.artifacts.run_directory import SESSION_REPORT, read_run, read_walls
+from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
+from evaluation.artifacts.run_directory import read_run, read_walls
 from evaluation.monitor.progress import RunMonitor, RunProgress
 from evaluation.monitor.watch import draw_watch, path_length, status_line, watch_run
 from ratslam.cli import main

@@ -228,8 +228,10 @@ def _faulty(kind: str) -> MotionTrack:
         "two nodes": _two_nodes,
         "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
         "centimetres": lambda poses: poses * [100, 100, 1],
+        "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
     }
     poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
+    time = time * (10 if "slow" in kind else 1)
     if "gap" in kind:
         time = time + np.where(np.arange(len(time)) >= 120, 60.0, 0.0)
     return MotionTrack(time, everywhere, from_poses(time, poses), poses=poses)
@@ -245,6 +247,7 @@ JUDGED = {
         "over 40 m/s",
         "these are centimetres: --set recording.odometry.length_scale",
     ),
+    "slow degrees, poses": (True, "headings agree with the direction", "turn_scale=0.0174533"),
     "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
     "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
     "gap, velocities": (True, "row 220: nothing for 60.1 s", "recording.odometry.largest_step"),
@@ -265,7 +268,7 @@ def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
     for piece in pieces:
         assert piece in said
     alone = judge_motion(*_faulty(kind)[:3:2], "session")
-    assert bool(alone) == (not kind.startswith("two"))
+    assert bool(alone) == (not kind.startswith(("two", "slow")))
 
 
 def test_a_clean_drive_has_no_finding() -> None:

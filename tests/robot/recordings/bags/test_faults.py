@@ -192,7 +192,7 @@ def test_several_publishers_are_named_and_chosen(
         assert opened(path, told, views=None).length == 24
         assert all(piece in told[0] for piece in (*pieces, "their poses agree"))
     else:
-        cure = "--set recording.topics.odometry.frames='[odom, base_link]'"
+        cure = "--set recording.topics.odometry.frames=[odom,base_link]"
         refused(lambda: opened(path, views=None), *pieces, cure)
     one = opened(path, views=None, odometry={"topic": "/odom", "frames": ["odom", "base_link"]})
     assert one.length == 12
