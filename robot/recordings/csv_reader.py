@@ -99,12 +99,10 @@ def read_csv_recording(
         start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
         time = np.nan_to_num(start) + kept / config.rate
     motion, poses, faults = _motion(base, time, kept, config, limits)
-    shape, place, held = (
-        (config.rows, config.columns, 1),
-        base.place,
-        isinstance(part, columns.VelocityColumns),
+    recording = RecordingRows(
+        str(path), time, motion, (config.rows, config.columns, 1), 0, errors + faults, poses=poses
     )
-    recording = RecordingRows(str(path), time, motion, shape, 0, errors + faults, held, poses, place)
+    recording.place, recording.held = base.place, isinstance(part, columns.VelocityColumns)
     recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
     # What belongs to a row that is left out, is left out too.
     files = Files(base, found, _whole_clock(time, kept, len(whole.lines)), warn)
@@ -203,9 +201,10 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvC
         if isinstance(part, columns.ViewColumns):
             there = file.numbered(part.prefix)
             wanted = range(min(there), max(there)) if there else [0]
-            absent = [f"{part.prefix}{number}" for number in wanted if number not in there]
-            errors += [missing_error(file.top, "column", name, file.names, "table.views.prefix")
-                       for name in absent[:1]]  # fmt: skip
+            absent = next((number for number in wanted if number not in there), None)
+            if absent is not None:
+                name = f"{part.prefix}{absent}"
+                errors.append(missing_error(file.top, "column", name, file.names, "table.views.prefix"))
     return errors
 
 

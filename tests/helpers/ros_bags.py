@@ -141,6 +141,16 @@ def scan(time: int, ranges: Sequence[float] | np.ndarray, first: float, step: fl
     return Entry("/scan", "sensor_msgs/msg/LaserScan", time, given | fields)
 
 
+def image(
+    time: int, pixels: np.ndarray, encoding: str = "mono8", topic: str = "/image", **fields: Any
+) -> Entry:
+    """A raw image of pixels [H, W] or [H, W, C]."""
+    data = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8)
+    size = {"height": len(pixels), "width": pixels.shape[1], "step": len(data) // len(pixels)}
+    given = {"header": header(time), "encoding": encoding, "data": data} | size
+    return Entry(topic, "sensor_msgs/msg/Image", time, given | fields)
+
+
 def transform(
     time: int, parent: str, child: str, x: float, y: float, turn: Mapping[str, float]
 ) -> dict[str, Any]:

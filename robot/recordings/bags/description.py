@@ -10,7 +10,7 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.bags.images import IMAGES, RAW, grey_image
-from robot.recordings.bags.motions import POSES, TWISTS, pose_in_plane, twist_in_plane
+from robot.recordings.bags.motions import POSES, TWISTS, frames_of, pose_in_plane, twist_in_plane
 from robot.recordings.bags.scans import (
     CLOUD,
     SCAN,
@@ -186,7 +186,7 @@ def describe_bag(path: Path) -> BagDescription:
                 found = read_links(bag, name, "header")
             except InputError:
                 continue  # the fault of the topic says why
-            links += [FrameLink(*pair, name == STATIC, len(link.stamps)) for pair, link in found.items()]
+            links += [FrameLink(*pair, name == STATIC, len(link)) for pair, link in found.items()]
     return BagDescription(path, topics, tuple(links), tuple(told))
 
 
@@ -218,7 +218,7 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
                 received.append(time)
                 if hasattr(content, "header"):
                     stamps.append(nanoseconds(content.header.stamp))
-                    frames = frames if any(frames) else _frames_of(content)
+                    frames = frames if any(frames) else frames_of(content)
             if summary is not None:
                 shape = summary[1](bag, contents, stamps or received)
     except InputError as error:
@@ -226,10 +226,6 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
         received = received or list(bag.receipts(topic))
     stamped = times_of(stamps, received) if len(stamps) == len(received) > 0 else None
     return TopicDescription(*topic, times_of(received), stamped, *frames, shape, roles, fault)
-
-
-def _frames_of(content: Any) -> tuple[str, str]:
-    return str(content.header.frame_id), str(getattr(content, "child_frame_id", ""))
 
 
 def times_of(stamps: list[int], other: list[int] | None = None) -> Times:

@@ -13,6 +13,12 @@ from tactile.base.errors import InputError
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
+def frames_of(message: Any) -> tuple[str, str]:
+    """Frame and child frame of a message, without leading slashes; '' where it names none."""
+    frame, child = str(message.header.frame_id), str(getattr(message, "child_frame_id", ""))
+    return frame.lstrip("/"), child.lstrip("/")
+
+
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
     """Heading of a quaternion, rad in [-pi, pi]: the direction of its x axis in the plane."""
     return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))

@@ -10,7 +10,14 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
-from robot.recordings.bags.motions import POSES, TWISTS, plane_errors, pose_in_plane, twist_in_plane
+from robot.recordings.bags.motions import (
+    POSES,
+    TWISTS,
+    frames_of,
+    plane_errors,
+    pose_in_plane,
+    twist_in_plane,
+)
 from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors
@@ -121,7 +128,7 @@ def _read_series(
     wanted = tuple(frame.lstrip("/") for frame in config.frames)
 
     def read(content: Any, place: str) -> Any:
-        if wanted != _frames_of(content)[: len(wanted)]:
+        if wanted != frames_of(content)[: len(wanted)]:
             return None
         if twist:
             value = twist_in_plane(TWISTS[topic.kind](content))
@@ -138,7 +145,7 @@ def _read_series(
     for number, received, content, value in bag.usable(topic, read):
         if value is not None:
             stamps = (stamp_of(content, received, each) for each in (clock, OTHER_CLOCK[clock]))
-            rows.append((number, *stamps, _frames_of(content)))
+            rows.append((number, *stamps, frames_of(content)))
             kept.append(value)
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
@@ -153,12 +160,6 @@ def _read_series(
     series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body
-
-
-def _frames_of(message: Any) -> tuple[str, str]:
-    """Frame and child frame of a message, without leading slashes; '' where it names none."""
-    frame, child = str(message.header.frame_id), str(getattr(message, "child_frame_id", ""))
-    return frame.lstrip("/"), child.lstrip("/")
 
 
 def _frame_errors(

@@ -82,7 +82,7 @@ def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
         if named and link.child in [named[1] + body for body in (*BODIES, "base")]:
             found.append((named[1], (link.parent, link.child)))
     views = _views(bag)
-    frame = "" if views is None else views[0].frame.lstrip("/")
+    frame = "" if views is None else views[0].frame
     return [pair for prefix, pair in sorted(found, key=lambda each: not frame.startswith(each[0]))]
 
 

@@ -27,7 +27,6 @@ def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Se
     if topic.kind not in (JOINTS, *ARRAYS):
         expected = f"one of {JOINTS}, {', '.join(ARRAYS)}"
         raise InputError(where, f"messages of type {topic.kind}", expected)
-    numbers, stamps, values = list[int](), list[int](), list[np.ndarray]()
     names, shape, known = config.joints, None, list[str]()
 
     def read(content: Any, place: str) -> np.ndarray | None:
@@ -49,11 +48,8 @@ def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Se
             names = names or tuple(content.name)
         return value
 
-    for number, stamp, value in read_usable(bag, topic, clock, read):
-        if value is not None:
-            values.append(value)
-            numbers.append(number)
-            stamps.append(stamp)
+    rows = [row for row in read_usable(bag, topic, clock, read) if row[2] is not None]
+    numbers, stamps, values = ([row[k] for row in rows] for k in range(3))
     if not values:
         absent = next((name for name in names if name not in known), None)
         if absent is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,19 +28,9 @@ BODIES = ("base_link", "base_footprint")
 """Usual names of the robot's frame."""
 
 
-class Link(NamedTuple):
-    """The transforms from a frame to a child frame, N of them; one is enough for a fixed link.
-
-    Attributes:
-        stamps: ns. shifts: (x, y, z) m. turns: quaternions (x, y, z, w). numbers: message of each.
-    """
-
-    stamps: list[int]
-    shifts: list[tuple[float, float, float]]
-    turns: list[tuple[float, float, float, float]]
-    numbers: list[int]
-
-
+Link = list[tuple[int, tuple[float, ...], tuple[float, ...], int]]
+"""The transforms from a frame to a child frame: stamp in ns, (x, y, z) in m, quaternion (x, y, z, w), number
+of the message; one is enough for a fixed link."""
 Links = dict[tuple[str, str], Link]
 Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
 
@@ -83,14 +73,10 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
                     first = first or InputError(place, found, "numbers, and a unit quaternion")
                     spoilt += 1
                     continue
-                link = links.setdefault(frames, Link([], [], [], []))
+                stamp = nanoseconds(each.header.stamp) if clock == "header" else received
                 if name == STATIC:
-                    for part in link:
-                        part.clear()
-                link.stamps.append(nanoseconds(each.header.stamp) if clock == "header" else received)
-                link.shifts.append(shift)
-                link.turns.append(quaternion)
-                link.numbers.append(number)
+                    links[frames] = []
+                links.setdefault(frames, []).append((stamp, shift, quaternion, number))
         if first is not None:
             raise_errors(leave_out(spoilt, total, "transforms", first, bag.warn))
     return links
@@ -167,25 +153,24 @@ def poses_between(
     chain = chain_between(links, parent, child)
     if chain is None:
         raise InputError(where, "frames that are not connected", f"a chain of links in {MOVING} or {STATIC}")
-    moving = [pair for pair, _ in chain if len(links[pair].stamps) > 1]
+    moving = [pair for pair, _ in chain if len(links[pair]) > 1]
     if not moving:
         raise InputError(where, "frames that never move", "a link with several transforms")
     times, errors = dict[tuple[str, str], np.ndarray](), list[InputError]()
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
-        use, faults = usable_stamps(links[pair].stamps, place, clock, report)
-        kept: list[Any] = [list(compress(part, use)) for part in links[pair]]
-        links[pair] = Link(*kept)
-        times[pair] = in_seconds(links[pair].stamps)
+        use, faults = usable_stamps([stamp for stamp, *_ in links[pair]], place, clock, report)
+        links[pair] = list(compress(links[pair], use))
+        times[pair] = in_seconds([stamp for stamp, *_ in links[pair]])
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))
-    moments, numbers = times[lead], np.array(links[lead].numbers)
+    moments, numbers = times[lead], np.array([number for *_, number in links[lead]])
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        points, turns = ([_Axes(*each) for each in part] for part in (links[lead].shifts, links[lead].turns))
-        poses = [pose_in_plane(*pose, where, plane) for pose in zip(points, turns, strict=True)]
-        errors = plane_errors(np.array(links[lead].shifts), where, role, plane)
+        given = [(_Axes(*shift), _Axes(*turn)) for _, shift, turn, _ in links[lead]]
+        poses = [pose_in_plane(*pose, where, plane) for pose in given]
+        errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
         return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)
     start, end = max(times[pair][0] for pair in moving), min(times[pair][-1] for pair in moving)
     inside = (start <= moments) & (moments <= end)
@@ -205,8 +190,9 @@ def _matrices(link: Link, time: np.ndarray, moments: np.ndarray, down: bool) -> 
 
     found = np.zeros((len(moments), 4, 4))
     found[:, 3, 3] = 1.0
-    turns, shifts = Rotation.from_quat(link.turns), np.array(link.shifts)
-    if len(link.stamps) == 1:
+    turns = Rotation.from_quat([turn for _, _, turn, _ in link])
+    shifts = np.array([shift for _, shift, _, _ in link])
+    if len(link) == 1:
         found[:, :3, :3], found[:, :3, 3] = turns[0].as_matrix(), shifts[0]
     else:
         found[:, :3, :3] = Slerp(time, turns)(moments).as_matrix()

@@ -20,6 +20,7 @@ from robot.recordings.formats import RecordingConfig, open_recording
 from tests.helpers.ros_bags import (
     Entry,
     header,
+    image,
     odometry,
     pose,
     quaternion,
@@ -44,22 +45,7 @@ TRUE = [
     for time in TIMES
 ]
 FRAMES = [tf(time, transform(time, "odom", "base_link", 0.1, 0, quaternion(0.0))) for time in TIMES]
-IMAGES = [
-    Entry(
-        "/image",
-        "sensor_msgs/msg/Image",
-        time,
-        {
-            "header": header(time),
-            "height": 12,
-            "width": 60,
-            "step": 60,
-            "encoding": "mono8",
-            "data": [7] * 720,
-        },
-    )
-    for time in range(START, TIMES[-1], STEP // 3)
-]
+IMAGES = [image(time, np.full((12, 60), 7, np.uint8)) for time in range(START, TIMES[-1], STEP // 3)]
 
 
 def write(folder: Path, *parts: list[Entry]) -> Path:

@@ -17,7 +17,7 @@ from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, stored_frames, write_video
-from tests.helpers.ros_bags import ROS2, Entry, built, header, odometry, write_bag
+from tests.helpers.ros_bags import ROS2, Entry, built, header, image, odometry, write_bag
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
 GREY = np.asarray(Image.fromarray(COLOUR).convert("L"))
@@ -28,14 +28,8 @@ def raw(pixels: np.ndarray, encoding: str, padding: int = 0, **fields: Any) -> A
     """A raw image whose rows end with some bytes of padding."""
     rows = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, padding)), constant_values=7)
-    given = {
-        "height": pixels.shape[0],
-        "width": pixels.shape[1],
-        "encoding": encoding,
-        "step": data.shape[1],
-        "data": data.reshape(-1),
-    }
-    return built(ROS2, RAW, given | fields)
+    given = {"step": data.shape[1], "data": data.reshape(-1)} | fields
+    return built(ROS2, RAW, image(0, pixels, encoding, **given).fields)
 
 
 def with_alpha(pixels: np.ndarray) -> np.ndarray:

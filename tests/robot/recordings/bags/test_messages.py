@@ -23,6 +23,7 @@ from tests.helpers.ros_bags import (
     KINDS,
     Entry,
     header,
+    image,
     odometry,
     pose,
     quaternion,
@@ -216,17 +217,8 @@ def test_the_topics_of_openratslam_are_a_preset(read: Read) -> None:
     wheels = [entry._replace(topic="/irat_red/odom") for entry in WHEELS]
     for entry in wheels:
         entry.fields["twist"]["twist"]["linear"]["x"] = 0.5
-    image = {
-        "height": 24,
-        "width": 80,
-        "encoding": "mono8",
-        "step": 80,
-        "data": np.full(24 * 80, 51, np.uint8),
-    }
-    images = [
-        Entry("/irat_red/camera/image", "sensor_msgs/msg/Image", time, {"header": header(time)} | image)
-        for time in TIMES
-    ]
+    grey = np.full((24, 80), 51, np.uint8)
+    images = [image(time, grey, topic="/irat_red/camera/image") for time in TIMES]
     entries = sorted([*wheels, *images], key=lambda entry: entry.time)
     source = read(entries, odometry=None, openratslam="irat_red")
     assert source.motion[5, 0] == pytest.approx(0.05)
