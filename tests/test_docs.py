@@ -62,7 +62,7 @@ MARKED = {
 }  # fmt: skip
 """The only commands that no test types, by their beginnings: they need a robot (or a screen), data of one's
 own, or minutes to hours. They are parsed, and their configurations validated; most have tests elsewhere."""
-REFUSED = {"python -m ratslam run square --continue runs/square/map.npz": "already holds all 349 samples"}
+REFUSED = {"python -m ratslam run square --continue runs/square -o runs/rest": "already holds all 349"}
 """What is refused, as its README says: that run was not interrupted."""
 SLOW = (
     "run create_arena", "run rat_box", "run whisker_maze", "simulate ", "export runs/rat", "timeit ",

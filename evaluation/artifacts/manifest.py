@@ -46,9 +46,13 @@ def read_manifest(directory: Path) -> Manifest:
     """
     file = directory / "manifest.json"
     found = read_json(file, "the manifest of a run", _parse) if file.exists() else Manifest()
-    if found.status == RUNNING:
-        found = found._replace(killed=file.exists() and _is_left(directory / "steps.csv"))
-    return found._replace(status=_session_outcome(directory)) if found.status == RUNNING else found
+    if found.status != RUNNING:
+        return found
+    killed, report = file.exists() and _is_left(directory / "steps.csv"), directory / SESSION_REPORT
+    if not report.exists():
+        return found._replace(killed=killed)
+    outcome = read_json(report, "the report of a live session", lambda content: str(content["outcome"]))
+    return found._replace(killed=killed, status=outcome)
 
 
 def _parse(content: Any) -> Manifest:
@@ -76,11 +80,3 @@ def _is_left(file: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def _session_outcome(directory: Path) -> str:
-    """The outcome in the report of a live session; `running` without a report."""
-    file = directory / SESSION_REPORT
-    if not file.exists():
-        return RUNNING
-    return read_json(file, "the report of a live session", lambda content: str(content["outcome"]))

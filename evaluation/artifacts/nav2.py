@@ -18,7 +18,7 @@ import yaml
 from evaluation.metrics.occupancy_grid import OccupancyGrid, check_grid
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.bounded import read_plain_yaml
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 
 FREE_THRESH, OCCUPIED_THRESH = 0.19, 0.65
 """Thresholds of free and occupied cells; 205 stays unknown even for a reader that divides by 256."""
@@ -105,11 +105,8 @@ def _value(path: Path, given: dict[str, Any], key: str) -> float:
 
 def _image(path: Path) -> np.ndarray:
     """Pixels [H, W], top row first."""
-    try:
+    with os_errors_of(path, "cannot be read", "an image beside its map.yaml"):
         content = path.read_bytes()
-    except OSError as error:
-        found = f"cannot be read ({error.strerror})"
-        raise InputError(str(path), found, "an image beside its map.yaml") from None
     head = _HEAD.match(content)
     if head is None or int(head[3]) != 255:
         raise InputError(str(path), "another kind of image", "a binary 8-bit PGM (P5)")

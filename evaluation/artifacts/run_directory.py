@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.manifest import SESSION_REPORT as SESSION_REPORT
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.merged_map import refuse_merged
 from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.metrics.text_table import read_text_table
+from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
 from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
@@ -78,6 +77,12 @@ def read_run(path: Path) -> RunArrays:
     return run._replace(node_piece=_localised_nodes(run)) if len(run.state) else run
 
 
+def has_steps(path: Path) -> bool:
+    """Whether a run directory has a step."""
+    online = path / "online.tum"
+    return online.exists() and online.stat().st_size > 0
+
+
 def first_visits(place: np.ndarray, nodes: int) -> np.ndarray:
     """[nodes] the first step at each node by the node of each step [T]; -1 without one."""
     first = np.full(nodes, -1)
@@ -102,7 +107,7 @@ def read_scorecard(path: Path) -> Scorecard:
         InputError: it is missing or malformed.
     """
     file = path / "scorecard.json"
-    return read_json(file, "the scorecard.json of a scored run", Scorecard.model_validate)
+    return read_json(file, "the directory of a scored run", Scorecard.model_validate)
 
 
 WALL_COLUMNS = ("west", "south", "east", "north", "height")
@@ -160,7 +165,10 @@ def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray
     try:
         column = header.split(",").index(name)
         cells = [line.split(",")[column] for line in lines]
-        return np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        found = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+        if ((np.abs(found) > LARGEST) & np.isfinite(found)).any():
+            raise ValueError
+        return found
     except (ValueError, IndexError):
         raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
 

@@ -26,13 +26,7 @@ from evaluation.cells.head_direction import (
     rayleigh_z,
 )
 from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
-from evaluation.cells.rate_map import (
-    MapSettings,
-    arena_edges,
-    bin_activity,
-    rate_maps,
-    tuning_curves,
-)
+from evaluation.cells.rate_map import MapSettings, arena_edges, bin_activity, rate_maps, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
 from tactile.base.atomic_write import write_atomically
 from tactile.base.config import Settings

@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from evaluation.cells.rate_map import (
-    BoxSamples,
-    arena_edges,
-    box_samples,
-    rate_maps,
-    sum_samples,
-)
+from evaluation.cells.rate_map import BoxSamples, arena_edges, box_samples, rate_maps, sum_samples
 from evaluation.cells.recording import CellRecording
 from tactile.base.config import Settings
 from tactile.base.errors import InputError

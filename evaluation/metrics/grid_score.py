@@ -22,12 +22,7 @@ from evaluation.metrics.grid_error import (
 )
 from evaluation.metrics.grid_metrics import GRID_METRICS, grid_findings
 from evaluation.metrics.metric import Quantity
-from evaluation.metrics.occupancy_grid import (
-    GridTruth,
-    OccupancyGrid,
-    check_grid,
-    touchable_surface,
-)
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid, touchable_surface
 from tactile.base.config import Settings
 
 PAPER_ERRORS = {"blob": 0.40, "geometric": 0.39, "template": 0.37}

@@ -72,6 +72,12 @@ class RunArrays(NamedTuple):
         numbers, steps = np.unique(self.piece[self.found], return_counts=True)
         return int(numbers[steps.argmax()]) if len(numbers) else -1
 
+    def ranked_pieces(self) -> list[tuple[int, int]]:
+        """Rank and number of each piece: `main` first, with rank 0, then by the number of their steps."""
+        numbers, sizes = np.unique(self.piece, return_counts=True)
+        ranks = np.argsort(-sizes - len(self.piece) * (numbers == self.main), kind="stable")
+        return list(enumerate(numbers[ranks].tolist(), start=self.main < 0))
+
     def name_piece(self, number: int) -> str:
         """A piece in words."""
         rows = np.flatnonzero(self.piece == number)

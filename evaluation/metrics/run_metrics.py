@@ -98,12 +98,13 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
             `energy_gap`, steps.
     """
     rows, truth = truth_rows(run), run.truth
+    note = "map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else ""
     findings = {
         "steps": Finding(len(run.time)),
         "duration": Finding(float(run.time[-1] - run.time[0])),
         "experiences": Finding(len(run.nodes)),
         "links": Finding(len(run.links)),
-        "map_doubt": _doubt(run),
+        "map_doubt": Finding(run.doubt, note=note if np.isfinite(run.doubt) else run.unjudged),
     }
     if run.has_pieces:
         findings |= piece_findings(run, rows)
@@ -177,12 +178,6 @@ def _undefined_across_pieces(findings: dict[str, Finding]) -> dict[str, Finding]
         name: found if name.startswith("energy_links") else Finding(np.nan, found.odometry, reason)
         for name, found in findings.items()
     }
-
-
-def _doubt(run: RunArrays) -> Finding:
-    if not np.isfinite(run.doubt):
-        return Finding(np.nan, note=run.unjudged)
-    return Finding(run.doubt, note="map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else "")
 
 
 def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:

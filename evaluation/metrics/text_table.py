@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import chain
-from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +14,8 @@ from tactile.base.errors import InputError
 
 LONGEST = 80
 """Characters of a bad row that an error shows."""
+LARGEST = 1e20
+"""Magnitude above which a number is damage: squares of others do not overflow."""
 Columns = Mapping[str, tuple[str, ...]]
 """Columns to read, in order: name -> alternative names in a header (compared in lower case)."""
 
@@ -46,7 +47,7 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     rows, at = [], []
     for number, cells, whole in lines if header else chain([(first, fields, ended)], lines):
         row = _numbers(cells)
-        if row is not None and len(row) == len(names) and all(map(isfinite, row)):
+        if row is not None and len(row) == len(names) and all(abs(number) <= LARGEST for number in row):
             rows.append([row[place] for place in where])
             at.append(number)
         elif whole:
@@ -62,11 +63,8 @@ def _lines(path: str | Path) -> Iterator[tuple[int, list[str], bool]]:
     lines = read_text(path, "a text file of numbers").split("\n")
     for number, line in enumerate(lines, start=1):
         if line.strip() and not line.lstrip().startswith("#"):
-            yield number, _cells(line), number < len(lines)
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+            cells = [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+            yield number, cells, number < len(lines)
 
 
 def _places(where: str, names: list[str], columns: Columns) -> list[int]:

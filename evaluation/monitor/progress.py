@@ -14,7 +14,7 @@ import numpy as np
 
 from evaluation.artifacts.manifest import RUNNING, read_manifest
 from evaluation.artifacts.run_directory import check_run_directory, checkpoint_steps
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 
 KILLED = "killed"
 """Status of a run that has not ended and that no process writes."""
@@ -149,11 +149,8 @@ class RunMonitor:
 
     def _files(self) -> list[str]:
         """All files except the monitor's own."""
-        try:
+        with os_errors_of(self.directory, "cannot be read", "the directory of a run"):
             return [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
-        except OSError as error:
-            found = f"cannot be read ({error.strerror})"
-            raise InputError(str(self.directory), found, "the directory of a run") from None
 
     def _date(self, *names: str) -> float:
         """Time of the last write to these files, s; 0 without any."""

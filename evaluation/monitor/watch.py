@@ -21,7 +21,7 @@ from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
 from evaluation.plots.style import BLUE, GREY, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
 from tactile.base.atomic_write import write_atomically
-from tactile.base.errors import InputError
+from tactile.base.errors import os_errors_of
 from tactile.base.se2 import between, compose
 
 SILENCE_LIMIT = 300.0
@@ -61,11 +61,8 @@ def watch_run(
             pace = (len(seen.path) - len(before.path)) / (began - last)
         if before is None or (len(seen.path), seen.status) != (len(before.path), before.status):
             figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
-            try:
+            with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
                 write_atomically(file, figure.savefig)
-            except OSError as error:
-                found = f"cannot be written ({error.strerror or error})"
-                raise InputError(str(file), found, "a run directory that can be written to") from None
         report(status_line(seen, pace))
         if once or seen.status != RUNNING or seen.silence > patience:
             return seen

@@ -13,7 +13,6 @@ from evaluation.plots import style
 from evaluation.plots.map_plot import IN_PLACE, NO_WALLS, bounds, draw_walls, wall_corners
 from evaluation.plots.style import BLUE, GREEN, GREY, PURPLE, VERMILLION
 
-_BOTTOM = 1.0  # inches below the axes
 _MARGIN = 0.06  # m around all
 _KINDS = {
     "new": (VERMILLION, "something new"),
@@ -41,25 +40,21 @@ def draw_changes(
     shown = walls if known else NO_WALLS
     seen = path if run.found.any() or len(ground) else np.zeros((1, 2))
     low, high = bounds(seen, ground[:, :2], places, wall_corners(shown, to_map))
-    low, high = low - _MARGIN, high + _MARGIN
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    tall = inner * (high - low)[1] / (high - low)[0]
-    figure = style.new_figure(tall + style.TOP + _BOTTOM, name, _headline(run, changes))
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    style.metre_grid(axes, style.MAP)
+    box = np.stack([low - _MARGIN, high + _MARGIN])
+    figure, axes = style.map_figure(box, name, _headline(run, changes), style.MAP)
     if len(shown):
         draw_walls(axes, shown, to_map)
     if len(ground):
         axes.plot(*ground[:, :2].T, ".", color=GREY, ms=4, mew=0, zorder=2, label="experience of the map")
     name = "path where found" if run.found.any() else "_"
     axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label=name)
-    _mark(axes, changes, places, (high - low).max())
+    _mark(axes, changes, places, np.ptp(box, axis=0).max())
     style.add_legend(figure, axes)
     return figure
 
 
 def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, size: float) -> None:
+    from matplotlib.colors import to_rgb
     from matplotlib.patches import Circle
 
     labelled = set()
@@ -68,16 +63,10 @@ def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, si
         label = None if what in labelled else what
         labelled.add(what)
         radius = max(change.extent / 2, 0.02 * size)
-        ring = {"facecolor": (*_rgb(color), 0.18), "edgecolor": color, "lw": 2.0, "zorder": 6, "label": label}
-        axes.add_patch(Circle((place[0], place[1]), radius, **ring))
+        ring = {"facecolor": (*to_rgb(color), 0.18), "edgecolor": color, "lw": 2.0, "zorder": 6}
+        axes.add_patch(Circle((place[0], place[1]), radius, label=label, **ring))
         at = (place[0] + 1.1 * radius, place[1] + 1.1 * radius)
         axes.text(*at, str(number), color=color, fontsize=11, fontweight="bold", zorder=7)
-
-
-def _rgb(color: str) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
-
-    return to_rgb(color)
 
 
 def _headline(run: RunArrays, changes: Sequence[ChangeRow]) -> str:

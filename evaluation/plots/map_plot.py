@@ -11,20 +11,9 @@ from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
-from evaluation.plots.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    YELLOW,
-)
+from evaluation.plots.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from tactile.base.se2 import between, compose
 
-_BOTTOM = 1.0  # inches below the axes
 _ROOM = 0.2  # share of the map's size for drifting odometry
 _JUMP = 5.0  # a step longer than this multiple of the usual one: the robot was moved by hand
 _PALE, _DARK = 0.86, 0.62  # greys of a wall of height 0 and of the tallest wall
@@ -72,13 +61,7 @@ def draw_map(
     run = arrange_pieces(run)
     layers = align_layers(run)
     shown = walls if layers.truth is not None else NO_WALLS
-    box = _frame(layers, shown)
-    width, height = box[1] - box[0]
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, card.name, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
-    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes, of)
+    figure, axes = style.map_figure(_frame(layers, shown), card.name, line, of)
     if len(shown):
         draw_walls(axes, shown, layers.to_map)
         _paint_laps(axes, run, layers, card.exm.position, closures)
@@ -222,15 +205,14 @@ def _paint_path(
     def drawn(rows: np.ndarray) -> np.ndarray:
         return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
 
-    numbers, sizes = np.unique(run.piece, return_counts=True)
-    if len(numbers) < 2 and not len(run.state):
+    if not run.has_pieces and not len(run.state):
         axes.plot(*drawn(np.arange(len(path))).T, color=BLUE, label="mapped path", **line)
         return
-    ranks = np.argsort(-sizes - len(path) * (numbers == run.main), kind="stable")
-    for rank, number in enumerate(numbers[ranks].tolist(), start=run.main < 0):
+    pieces = run.ranked_pieces()
+    for rank, number in pieces:
         rows, name = np.flatnonzero(run.piece == number), run.name_piece(number)
         if rank >= NAMED:
-            name = "_" if rank > NAMED else f"{len(numbers) - NAMED} smaller pieces"
+            name = "_" if rank > NAMED else f"{len(pieces) - NAMED} smaller pieces"
         axes.plot(*drawn(rows).T, color=PIECES[min(rank, NAMED)], label=name, **line)
 
 

@@ -12,8 +12,6 @@ from evaluation.plots import style
 from evaluation.plots.map_plot import NAMED, PIECES
 from evaluation.plots.style import GREEN
 
-_BOTTOM = 1.0  # inches below the axes
-
 
 def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequence[int]) -> style.Figure:
     """Draws the paths of the sessions of a merged map, each in a colour of its own; pieces that nothing joins
@@ -24,18 +22,11 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
             steps of each session, in the order of `path`.
     """
     shown = _beside_each_other(path, piece)
-    box = style.frame(shown)
-    width, height = box[1] - box[0]
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    pieces = len(np.unique(piece))
-    line = f"{len(steps)} sessions, {len(path)} steps  ·  " + (
-        "joined" if pieces == 1 else f"{pieces} pieces"
-    )
-    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
-    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    largest = int(np.bincount(piece).argmax())
-    style.metre_grid(axes, style.MAP if pieces == 1 else f"piece {largest + 1}, the largest")
+    pieces, largest = len(np.unique(piece)), int(np.bincount(piece).argmax())
+    joined = "joined" if pieces == 1 else f"{pieces} pieces"
+    line = f"{len(steps)} sessions, {len(path)} steps  ·  {joined}"
+    of = style.MAP if pieces == 1 else f"piece {largest + 1}, the largest"
+    figure, axes = style.map_figure(style.frame(shown), title, line, of)
     ends = np.cumsum(steps).tolist()
     for number, (count, end) in enumerate(zip(steps, ends, strict=True)):
         own = slice(end - count, end)

@@ -28,6 +28,8 @@ SKY = "#56b4e9"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
 """Width and margins of every plot, inches."""
+BOTTOM = 1.0
+"""Room below the axes of a map, inches."""
 MARGIN, FLATTEST, TALLEST = 0.08, 0.4, 1.15
 """Share of a map's size kept free around it; least and largest height / width of its axes."""
 MAP, TRUTH = "the map", "the truth"
@@ -96,6 +98,17 @@ def frame(points: np.ndarray) -> np.ndarray:
     middle, size = (low + high) / 2, np.maximum(high - low + MARGIN * (high - low).max(), 1e-3)
     size = np.maximum(size, size[::-1] * [1 / TALLEST, FLATTEST])
     return np.stack([middle - size / 2, middle + size / 2])
+
+
+def map_figure(box: np.ndarray, title: str, line: str, of: str) -> tuple[Figure, Axes]:
+    """A figure with equal axes (m) that show a box [[left, bottom], [right, top]] in the frame `of` a map."""
+    width, height = box[1] - box[0]
+    inner = WIDTH - LEFT - RIGHT
+    figure = new_figure(inner * height / width + TOP + BOTTOM, title, line)
+    axes = add_axes(figure, LEFT, BOTTOM, inner, inner * height / width)
+    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
+    metre_grid(axes, of)
+    return figure, axes
 
 
 def metre_grid(axes: Axes, of: str = "") -> None:

@@ -7,8 +7,6 @@ import numpy as np
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, VERMILLION
 
-_BOTTOM = 1.0  # inches below the axes
-
 
 def draw_way(
     title: str, line: str, nodes: np.ndarray, links: np.ndarray, way: np.ndarray, felt: np.ndarray
@@ -22,12 +20,7 @@ def draw_way(
     from matplotlib.collections import LineCollection
 
     box = style.frame(np.concatenate([nodes, felt, way[:, :2]]))
-    width, height = box[1] - box[0]
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    figure = style.new_figure(inner * height / width + style.TOP + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, inner * height / width)
-    axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
-    style.metre_grid(axes, style.MAP)
+    figure, axes = style.map_figure(box, title, line, style.MAP)
     if len(felt):
         axes.plot(*felt.T, ".", color=GREY, ms=2.2, mew=0, zorder=1, label="contact felt")
     if len(links):

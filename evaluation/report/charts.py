@@ -56,12 +56,11 @@ def map_chart(report: RunReport) -> Any:
     if report.map_path is not None:
         traces.append(_line(report.map_path, "map, not believed", "doubted", dash="dot", width=1.2))
     traces += _path_traces(report)
-    main = (
-        f"piece {report.run.main + 1}," if report.run.has_pieces and not len(report.run.state) else "the map,"
-    )
+    run = report.run
+    main = f"piece {run.main + 1}," if run.has_pieces and not len(run.state) else "the map,"
     traces = [*traces, *_place_traces(report), *_closure_traces(report)]
     figure = _map_figure(traces, _frame(report), main)
-    figure.update_layout(shapes=[*_link_shapes(report), *_closure_shapes(report)])
+    figure.update_layout(shapes=_shapes(report))
     if report.grid is not None:  # no empty space beside the grid
         figure.update_xaxes(constrain="domain").update_yaxes(constrain="domain")
     return figure
@@ -69,14 +68,12 @@ def map_chart(report: RunReport) -> Any:
 
 def _path_traces(report: RunReport) -> list[Any]:
     """The final trajectory, each piece of the map by itself, `run.main` as the trajectory of one piece."""
-    final, truth, piece, main = report.layers.final, report.layers.truth, report.run.piece, report.run.main
+    final, truth, traces = report.layers.final, report.layers.truth, []
     if not report.run.has_pieces and not len(report.run.state):
         path = final if truth is None else split_at_jumps(final, truth)
         return [_line(path, "trajectory", "final", width=1.6)]
-    traces, (numbers, sizes) = [], np.unique(piece, return_counts=True)
-    ranks = np.argsort(-sizes - len(final) * (numbers == main), kind="stable")
-    for rank, number in enumerate(numbers[ranks].tolist(), start=main < 0):
-        rows = np.flatnonzero(piece == number)
+    for rank, number in report.run.ranked_pieces():
+        rows = np.flatnonzero(report.run.piece == number)
         path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])
         name = report.run.name_piece(number)
         traces.append(_line(path, name, f"run{rank % RUN_ROLES}" if rank else "final", width=1.6))
@@ -160,11 +157,6 @@ def _place_traces(report: RunReport) -> list[Any]:
     return [places.update(hovertemplate=hover, legendgroup="experience")]
 
 
-def _link_shapes(report: RunReport) -> list[Any]:
-    lines = report.layers.nodes[report.run.links]
-    return [_line_shape(lines, "link", "solid", "experience")] if len(lines) else []
-
-
 def _closure_traces(report: RunReport) -> list[Any]:
     """Of each verdict the marks halfway between the two places; a mark carries the closure's number."""
     from plotly import graph_objects
@@ -184,12 +176,13 @@ def _closure_traces(report: RunReport) -> list[Any]:
     return traces
 
 
-def _closure_shapes(report: RunReport) -> list[Any]:
-    """Of each verdict the lines between the two places, in the order of its marks."""
-    return [
-        _line_shape(ends, *_CLOSURES.get(verdict, _OTHER)[::2], _text(verdict))
-        for verdict, _, ends in _drawn_closures(report)
-    ]
+def _shapes(report: RunReport) -> list[Any]:
+    """The links, and of each verdict the lines between the two places, in the order of its marks."""
+    lines = report.layers.nodes[report.run.links]
+    shapes = [_line_shape(lines, "link", "solid", "experience")] if len(lines) else []
+    for verdict, _, ends in _drawn_closures(report):
+        shapes.append(_line_shape(ends, *_CLOSURES.get(verdict, _OTHER)[::2], _text(verdict)))
+    return shapes
 
 
 def _drawn_closures(report: RunReport) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -207,15 +200,8 @@ def _line_shape(lines: np.ndarray, role: str, dash: str, group: str) -> dict[str
     """Lines [n, 2, 2] as one shape, which is drawn faster than a trace with n gaps."""
     path = "".join(f"M{a:.5g},{b:.5g}L{c:.5g},{d:.5g}" for a, b, c, d in lines.reshape(-1, 4).tolist())
     line = {"width": 1, "dash": dash}
-    return {
-        "type": "path",
-        "path": path,
-        "name": role,
-        "line": line,
-        "layer": "below",
-        "legendgroup": group,
-        "opacity": 0.15 if role == "refused" else 0.6,
-    }
+    shape = {"type": "path", "path": path, "name": role, "line": line, "layer": "below"}
+    return shape | {"legendgroup": group, "opacity": 0.15 if role == "refused" else 0.6}
 
 
 def _grid_trace(report: RunReport) -> Any:

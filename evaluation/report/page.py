@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from evaluation.artifacts.manifest import RUNNING
-from evaluation.metrics.scorecard import scorecard_lines
+from evaluation.metrics.scorecard import position_error, scorecard_lines
 from evaluation.report.charts import GRID_SCALES, PALETTE, error_chart, overlay_chart, run_charts
 from evaluation.report.closure_records import closure_records, view_records
 from evaluation.report.run_report import RunReport, describe_status
@@ -251,8 +251,7 @@ def _row(report: RunReport) -> list[str]:
 
 
 def _error(report: RunReport) -> KeyFigure:
-    quantities = report.card.quantities
-    error = quantities.get("ate_within_pieces", quantities["ate_final"])
+    error = position_error(report.card)
     if error.value is None:
         return KeyFigure("Position error", "unknown", "no truth to compare with")
     note = "" if error.odometry is None else f"odometry {error.odometry:.3g} {error.unit}"

@@ -98,16 +98,19 @@ def read_run_report(directory: Path) -> RunReport:
     run = arrange_pieces(measured)
     count = len(run.time)
     doubt = read_column(steps, "doubt", np.nan)[:count]
-    verdict = judge_map(run.doubt, run.unjudged)
-    if run.unjudged == UNFINISHED and np.isfinite(doubt).any():
-        run = run._replace(doubt=float(doubt[np.isfinite(doubt)][-1]))
+    verdict, known = judge_map(run.doubt, run.unjudged), doubt[np.isfinite(doubt)]
+    if run.unjudged == UNFINISHED and len(known):
+        run = run._replace(doubt=float(known[-1]))
         verdict = judge_map(run.doubt)
-        verdict = verdict._replace(
-            reason=f"{verdict.reason} This is the judgement at the last step in its files."
-        )
+        reason = f"{verdict.reason} This is the judgement at the last step in its files."
+        verdict = verdict._replace(reason=reason)
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
+    file, score = directory / "gridscore.json", None
+    if file.exists():
+        score = read_json(file, "the scores of a grid", GridScore.model_validate)
+    step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
     return RunReport(
         name=name,
         manifest=read_manifest(directory),
@@ -117,14 +120,14 @@ def read_run_report(directory: Path) -> RunReport:
         verdict=verdict,
         doubt=doubt,
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
-        online_error=_online_error(directory),
-        cost=_cost(directory),
+        online_error=Series(*_columns(directory / "online_error.csv", "t", "error")),
+        cost=Series(step, seconds / np.maximum(steps_of, 1)),
         layers=layers,
         map_path=_map_path(directory, run),
         walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
         truth_lines=lines,
         grid=grid,
-        grid_score=_grid_score(directory / "gridscore.json"),
+        grid_score=score,
         closures=read_closure_table(directory),
         views=read_closure_views(directory),
         files=list_run_files(directory),
@@ -183,20 +186,6 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     return arrange_pieces(run._replace(final=path)).final[:, :2]
 
 
-def _online_error(directory: Path) -> Series:
-    file = directory / "online_error.csv"
-    if not file.exists():
-        return Series(np.zeros(0), np.zeros(0))
-    return Series(read_column(file, "t"), read_column(file, "error"))
-
-
-def _cost(directory: Path) -> Series:
-    file = directory / "timing.csv"
-    if not file.exists():
-        return Series(np.zeros(0), np.zeros(0))
-    step, steps, seconds = (read_column(file, name) for name in ("step", "steps", "seconds"))
-    return Series(step, seconds / np.maximum(steps, 1))
-
-
-def _grid_score(file: Path) -> GridScore | None:
-    return read_json(file, "the scores of a grid", GridScore.model_validate) if file.exists() else None
+def _columns(file: Path, *names: str) -> list[np.ndarray]:
+    """Columns of a file; empty ones without it."""
+    return [read_column(file, name) if file.exists() else np.zeros(0) for name in names]

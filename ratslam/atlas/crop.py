@@ -54,7 +54,8 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     if not len(taken):
         raise ValueError("no keyframe remains")
     number = np.where(inside, np.cumsum(inside) - 1, -1)
-    before, row = map.kept_keyframes().taken.rows.copy(), _rows(map)
+    before, kept = map.kept_keyframes().taken.rows.copy(), map.kept_keyframes().count
+    row = map.archive.row.rows.copy() if map.archive.begun else np.arange(kept)
     graph, log = _unmerged(map)
     elsewhere = bool(graph.begins.rows[taken[-1] + 1 :].any())
     since = HALT if elsewhere else _since(graph, int(taken[-1]))
@@ -86,11 +87,6 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     map.restore(arrays)
     merged = MergedRows(row[taken], *views, np.maximum(number[before], 0), np.zeros((len(before), 3)))
     return CroppedRows(merged, inside[before], *since, elsewhere)
-
-
-def _rows(map: KeyframeMap) -> np.ndarray:
-    """[E] the keyframe of the map that each one ever taken is or is merged with."""
-    return map.archive.row.rows.copy() if map.archive.begun else np.arange(map.kept_keyframes().count)
 
 
 def _unmerged(map: KeyframeMap) -> tuple[KeyframeGraph, ClosureLog]:

@@ -138,10 +138,7 @@ def join_all(
 
 
 def _join_some(
-    map: KeyframeMap,
-    views: Views,
-    tried: set[tuple[Stretches, Stretches]],
-    report: Callable[[str], None],
+    map: KeyframeMap, views: Views, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
 ) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
@@ -215,7 +212,8 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     best, *others = paths
     on = (best.odds != 0) & np.array([ground.is_near(pose) for pose in best.poses])
     common = float(on.sum() / max(session.views.shows.sum(), 1))
-    rivals = [float(path.odds.sum()) for path in others if not _is_like(ground, best, path, on)]
+    apart = [(path, between(best.poses[on], path.poses[on])) for path in others]
+    rivals = [float(path.odds.sum()) for path, moved in apart if not _is_small(ground, moved)]
     if best.odds.sum() - max(rivals, default=-np.inf) < needed:
         return None
     moved = fit_rigid_motion(own[on], best.poses[on])
@@ -243,11 +241,6 @@ def _weighed(ground: Ground, path: Path) -> Path:
     odds = counted_beside(ground, path)
     undriven = at_undriven_headings(ground, path)
     return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))
-
-
-def _is_like(ground: Ground, path: Path, other: Path, on: np.ndarray) -> bool:
-    """Whether two paths place the keyframes `on` the ground [n] alike."""
-    return _is_small(ground, between(path.poses[on], other.poses[on]))
 
 
 def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:

@@ -191,11 +191,7 @@ def _cost(a: dict, b: dict, traversals: int, travel: Travel) -> dict[str, float]
     length = float(np.hypot(a["x"] - b["x"], a["y"] - b["y"]))
     turn = abs(float(wrap(a["heading"] - b["heading"])))
     seconds = max(length / travel.speed, turn / travel.turn_rate, LEAST_SECONDS)
-    return {
-        "length": length,
-        "seconds": seconds,
-        "expected": seconds * (traversals + 2) / (traversals + 1),
-    }
+    return {"length": length, "seconds": seconds, "expected": seconds * (traversals + 2) / (traversals + 1)}
 
 
 def _descend(graph: networkx.Graph, start: int, left: Mapping[int, float]) -> list[int]:

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from ratslam.backends.config import LocaliseConfig
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import with_prefix
-from tactile.base.bounded import reason
+from ratslam.core.checkpoint import fill_odometry, with_prefix
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT, read_arrays
 
@@ -40,17 +40,14 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
         found = "neither a file nor a folder" if path.exists() else "no such file"
         cure = "put it back, or set localise.map to where it is"
         raise InputError(str(path), found, "the map in which the session is localised", cure)
-    try:
+    expected = f"a map made by `backend: {method}` with the same settings"
+    with malformed(path, expected, found="{}", spoilt=SPOILT):
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.startswith("map/")]
             arrays = read_arrays(archive, names, str(path))
         known = dict(zip([name.removesuffix(".npy") for name in names], arrays, strict=True))
+        fill_odometry(known)
         made.restore(with_prefix(known, "map/"))
-    except InputError:
-        raise
-    except SPOILT as error:
-        expected = f"a map made by `backend: {method}` with the same settings"
-        raise InputError(str(path), reason(error), expected) from None
     if not len(made.trajectory()):
         raise InputError(str(path), "a map without steps", "a map in which a session can be found")
     return made

@@ -179,9 +179,7 @@ class MapViews:
                 motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
             )
             return lax.cond(
-                real,
-                lambda: self.look(moved, view, label),
-                lambda: (memory, self.no_look(memory)),
+                real, lambda: self.look(moved, view, label), lambda: (memory, self.no_look(memory))
             )
 
         return lax.scan(look, memory, (views, labels, motions, real))

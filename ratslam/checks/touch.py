@@ -23,7 +23,6 @@ from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source
 from robot.touch_source import TOUCH, ReadingProcessor, TouchEntry
-from tactile.base.config import Settings
 from tactile.base.plugins import NoSettings
 from tactile.base.se2 import compose
 from tactile.base.types import Observation
@@ -50,17 +49,15 @@ def check_touch(name: str, assignments: Sequence[str] = (), source: str | None =
     if source is not None:
         models["source"] = SOURCES.get(source, "--source").config_class
     settings = read_assignments(models, assignments)
-    readings = simulated_head() if source is None else _open(source, settings["source"])
+    readings = simulated_head()
+    if source is not None:
+        readings = SOURCES.get(source, "--source").open(settings["source"] or NoSettings(), None)
     return run_checks(GROUPS, TouchTrial(entry, settings["settings"], readings))
 
 
 def simulated_head() -> Source:
     """A simulated session of the whisker head, whose readings are `Whisk`s."""
     return HeadSimulation(SimulationConfig(), HeadConfig())
-
-
-def _open(name: str, settings: Settings | None) -> Source:
-    return SOURCES.get(name, "--source").open(settings or NoSettings(), None)
 
 
 class TouchTrial:

@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, positive_integer, prepare_jax, tell
+from ratslam.cli.common import Commands, positive_integer, prepare_jax
+from tactile.base.errors import tell
 
 if TYPE_CHECKING:
     from ratslam.checks.common import Result

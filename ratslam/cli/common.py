@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,6 @@ import shtab
 
 from ratslam.config.packaged import packaged_configs
 from ratslam.core.xla_flags import add_xla_flags
-from tactile.base.errors import printable
 from tactile.base.new_file import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
@@ -167,11 +165,6 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     from ratslam.config.run_config import load_config
 
     return load_config(arguments.config, arguments.set)
-
-
-def tell(sentence: str) -> None:
-    """Prints one sentence beside the results."""
-    print(f"ratslam: {printable(sentence)}", file=sys.stderr, flush=True)
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:

@@ -35,9 +35,7 @@ def add_commands(commands: Commands) -> None:
         "that the recording can be localised in it or continue it",
     )  # fmt: skip
     doctor.add_argument(
-        "--live",
-        action="store_true",
-        help="check the robot of a live session; moves nothing",
+        "--live", action="store_true", help="check the robot of a live session; moves nothing"
     )
     add_set(doctor)
 

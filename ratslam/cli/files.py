@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ratslam.cli.common import Commands, tell
+from ratslam.cli.common import Commands
+from tactile.base.errors import tell
 
 
 def add_commands(commands: Commands) -> None:

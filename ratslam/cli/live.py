@@ -10,10 +10,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config, tell
+from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
 from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
 from robot.drivers.process_priority import put_last
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax
 from ratslam.cli.run import add_rerun, open_target
+from tactile.base.errors import tell
 
 if TYPE_CHECKING:
     from ratslam.config.run_config import RunConfig
@@ -40,11 +41,10 @@ def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.summary import summarise
     from ratslam.pipeline.localise import localise
-    from ratslam.pipeline.run import print_status
     from ratslam.pipeline.saved_map import read_map
     from ratslam.viewer.observer import open_viewer
 
-    target, saved = open_target(arguments), read_map(arguments.map, print_status)
+    target, saved = open_target(arguments), read_map(arguments.map, tell)
     config = _read_recording(arguments, saved)
     place = arguments.map.name.removesuffix(".npz") or "map"
     directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"

@@ -115,13 +115,13 @@ def _score(arguments: argparse.Namespace) -> int:
 
 def render_scores(path: Path, card: Scorecard) -> str:
     """All figures as text: the table, that of the grid in a run directory with one, warnings and health."""
-    from evaluation.metrics import grid_score
+    from evaluation.metrics.grid_score import GridScore, render_grid_scores
     from evaluation.metrics.scorecard import render_health, render_scorecard, render_warnings
+    from tactile.base.bounded import read_json
 
     parts, grid = [render_scorecard(card)], path / "gridscore.json"
     if grid.exists():
-        score = grid_score.GridScore.model_validate_json(grid.read_text(encoding="utf-8"))
-        parts.append(grid_score.render_grid_scores([score]))
+        parts.append(render_grid_scores([read_json(grid, "the scores of a grid", GridScore.model_validate)]))
     parts.append("\n".join([*render_warnings(card), render_health(card)]))
     return "\n\n".join(part for part in parts if part)
 

@@ -10,8 +10,8 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax, tell
-from tactile.base.errors import InputError
+from ratslam.cli.common import Commands, prepare_jax
+from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
     from ratslam.pipeline.saved_map import SavedMap

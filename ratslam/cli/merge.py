@@ -6,7 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from ratslam.cli.common import Commands, prepare_jax, tell
+from ratslam.cli.common import Commands, prepare_jax
+from tactile.base.errors import tell
 
 
 def add_commands(commands: Commands) -> None:

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax, tell
-from tactile.base.errors import InputError
+from ratslam.cli.common import Commands, prepare_jax
+from tactile.base.errors import InputError, tell
 from tactile.base.new_file import require_new_file
 
 if TYPE_CHECKING:

@@ -18,10 +18,9 @@ from ratslam.cli.common import (
     positive_integer,
     prepare_jax,
     read_config,
-    tell,
 )
 from ratslam.config.packaged import find_config
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, tell
 from tactile.base.new_file import require_new_file, require_own_folder
 
 REPLACED = {
@@ -69,25 +68,12 @@ def add_commands(commands: Commands) -> None:
         "-o", "--output", type=Path, metavar="DIR", check=own_folder("runs.jsonl", "growth.jsonl", "sets"),
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
-    study.add_argument(
-        "--error",
-        metavar="NAME",
-        help="error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity",
-    )
-    study.add_argument(
-        "--by",
-        type=float,
-        default=0.2,
-        metavar="SHARE",
-        help="share by which --preset vary changes a number (default 0.2)",
-    )
-    study.add_argument(
-        "--seconds",
-        type=float,
-        default=600.0,
-        metavar="S",
-        help="length of a session of --preset tiers, s (default 600)",
-    )
+    error = "error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity"
+    study.add_argument("--error", metavar="NAME", help=error)
+    share = "share by which --preset vary changes a number (default 0.2)"
+    study.add_argument("--by", type=float, default=0.2, metavar="SHARE", help=share)
+    length = "length of a session of --preset tiers, s (default 600)"
+    study.add_argument("--seconds", type=float, default=600.0, metavar="S", help=length)
 
     size = commands.add("size", _size, "recommend settings for a scene", "size whisker_maze", "study")
     add_config(size)
@@ -129,8 +115,7 @@ class Progress:
     ) -> None:
         self._bar.close()
         if kind is KeyboardInterrupt:
-            kept = f"{self._bar.n} {self._bar.unit}s are kept in {self._path}"
-            print(f"ratslam: {kept}; the same command continues", file=sys.stderr)
+            tell(f"{self._bar.n} {self._bar.unit}s are kept in {self._path}; the same command continues")
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
@@ -142,10 +127,7 @@ class Progress:
             for line in record.error.splitlines():
                 print(f"ratslam: error: {where}: {line}", file=sys.stderr)
         if self.failed:
-            print(
-                f"ratslam: {len(self.failed)} runs failed; delete their lines in {self._path} to repeat them",
-                file=sys.stderr,
-            )
+            tell(f"{len(self.failed)} runs failed; delete their lines in {self._path} to repeat them")
         return INPUT_ERROR if self.failed else 0
 
 
@@ -173,13 +155,8 @@ def _study(arguments: argparse.Namespace) -> int:
 
     remarks: list[str] = []
     if arguments.preset:
-        study, remarks = preset_study(
-            arguments.preset,
-            find_config(arguments.config),
-            arguments.set,
-            by=arguments.by,
-            seconds=arguments.seconds,
-        )
+        config, changes = find_config(arguments.config), {"by": arguments.by, "seconds": arguments.seconds}
+        study, remarks = preset_study(arguments.preset, config, arguments.set, **changes)
     else:
         study = read_study(find_config(arguments.config), arguments.set)
     error = find_error(arguments.error) if arguments.error else None
@@ -305,10 +282,10 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.pipeline.source import open_source
 
     path, config = arguments.config, read_config(arguments)
-    tell("trial runs take a minute or two, and several on a busy machine")
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)
+    tell("trial runs take a minute or two, and several on a busy machine")
     print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
     runs = try_settings(config, found, arguments.cycles)
     print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")

@@ -76,3 +76,10 @@ def _convert(value: np.ndarray, like: Any) -> Any:
         found = f"{value.dtype} with {value.ndim} dimensions"
         raise ValueError(f"an array of {found} instead of {like.dtype} with {like.ndim}")
     return np.array(value)
+
+
+def fill_odometry(arrays: dict[str, np.ndarray]) -> None:
+    """Adds the odometry of the steps, NaN: unknown, to the arrays of a map file written without it."""
+    for name, like in (("map/steps/odometry", "map/steps/frame"), ("map/odometry", "map/step_node")):
+        if like in arrays:
+            arrays.setdefault(name, np.full((len(arrays[like]), 3), np.nan))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from ratslam.fit.rig import aligned
 from tactile.base.errors import printable
 
 
@@ -26,13 +27,7 @@ class Diagnosis(NamedTuple):
 
 def render(diagnosis: Diagnosis) -> str:
     """The diagnosis as lines of text."""
-    lines = [diagnosis.what]
-    if diagnosis.table:
-        widths = [max(map(len, column)) for column in zip(*diagnosis.table, strict=True)]
-        for row in diagnosis.table:
-            lines.append(
-                "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            )
+    lines = [diagnosis.what, *(f"  {line}".rstrip() for line in aligned(diagnosis.table))]
     for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
         lines += [f"{mark}{text}" for text in texts]
     return "\n".join(map(printable, lines))

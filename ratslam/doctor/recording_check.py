@@ -9,20 +9,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.config.completion import complete
-from ratslam.config.other_files import FOLDER, RECORDING, refuse_other_files
+from ratslam.config.other_files import FOLDER, RECORDING, kind_of, refuse_other_files
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import dump_data, override, parse, validate
 from ratslam.doctor.diagnosis import Diagnosis
 from ratslam.doctor.recording_kinds import describe_file
+from ratslam.fit.record import shows_place
 from ratslam.pipeline.map_settings import differing_settings
 from ratslam.pipeline.saved_map import SavedMap
 from ratslam.pipeline.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
 from ratslam.pipeline.source import open_source
+from robot.recordings.bags.bag import METADATA
 from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source
 from tactile.base.errors import InputError
-from tactile.base.types import Observation
 
 CELLS_IN_RANGE = 13
 """Pose cells in the range of the sensor, as in the configurations of real buildings."""
@@ -61,6 +62,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
     Raises:
         InputError: it is missing, or of no known format.
     """
+    path = path.parent if path.name == METADATA and kind_of(path.parent) == RECORDING else path
     refuse_other_files(path, "a recording", (RECORDING, FOLDER))
     if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
@@ -145,10 +147,7 @@ def summarise(source: Source) -> Contents:
         motions.append(np.asarray(sample.reading.odometry, float))
         times.append(sample.time)
         truths += sample.truth is not None
-        seen = not isinstance(sample.reading, Observation) or (
-            bool(sample.reading.view_seen) or int(sample.reading.label) >= 0
-        )
-        views.append(seen)
+        views.append(shows_place(sample.reading))
     motion, time, viewed = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
     length = np.hypot(motion[:, 0], motion[:, 1])
     between = np.diff(np.cumsum(length)[viewed])

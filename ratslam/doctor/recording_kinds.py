@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import METADATA
 from robot.recordings.bags.description import (
     BagDescription,
     CloudShape,
@@ -67,11 +66,6 @@ def describe_file(path: Path) -> FileContents:
     """
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
-    if path.name == METADATA:
-        bag = _bag(path.parent)
-        if bag.recording is None:
-            return bag
-        return bag._replace(recording={"file": str(path.parent.resolve()), **bag.recording})
     if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
         return _bag(path)
     describe = KINDS.get(path.suffix.lower())
@@ -87,19 +81,17 @@ def _csv(path: Path) -> FileContents:
     from robot.recordings.csv_description import describe_csv
 
     found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
-    rows = (
-        ("column", "from", "to"),
-        *((name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns),
-    )
+    columns = [(name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns]
+    rows = (("column", "from", "to"), *columns)
     notes, faults = list(found.parts.values()), []
-    what = f"{path}: a CSV file, {counted(found.rows, 'row')}"
-    if found.clock is not None:
-        clock = found.clock
-        what += f" over {clock.last - clock.first:.6g} s"
-        if clock.step <= 0 or not clock.gap > 0:
+    what = f"{path}: a CSV file, {found.rows} row{'s' * (found.rows != 1)}"
+    if found.time is not None:
+        what += f" over {found.time[-1] - found.time[0]:.6g} s"
+        steps = np.diff(found.time) if len(found.time) > 1 else np.zeros(1)
+        if np.median(steps) <= 0 or not steps.max() > 0:
             faults.append("its times do not increase")
-        elif clock.gap > 10 * clock.step:
-            notes.append(f"longest gap: {clock.gap:.3g} s after t = {clock.gap_at:.6g} s")
+        elif steps.max() > 10 * np.median(steps):
+            notes.append(f"longest gap: {steps.max():.3g} s after t = {found.time[steps.argmax()]:.6g} s")
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
     table = {"table": found.table} if found.table else None
@@ -139,7 +131,7 @@ def _bag(path: Path) -> FileContents:
     moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
     if found.links:
         fixed = len(found.links) - len(moving)
-        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {counted(fixed, 'fixed link')}")
+        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {fixed} fixed link{'s' * (fixed != 1)}")
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
@@ -165,18 +157,13 @@ def _bag(path: Path) -> FileContents:
         recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
         notes.append(NO_WHEELS)
     shape = _shape_of_views(found, topics)
-    fov = shape.fov if isinstance(shape, ScanShape) else None
-    if isinstance(shape, ScanShape) and shape.ring:
-        fov = 2 * np.pi
+    fov = None
+    if isinstance(shape, ScanShape):
+        fov = 2 * np.pi if shape.extent.ring else shape.extent.width
     if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
         recording["image"] = size
     return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
-
-
-def counted(number: int, noun: str) -> str:
-    """A number of things."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def clock_notes(name: str, clock: Times) -> list[str]:
@@ -188,7 +175,7 @@ def clock_notes(name: str, clock: Times) -> list[str]:
     }
     notes = [f"{name}: {count} messages have {words}" for words, count in counts.items() if count]
     if 0.5 < clock.ahead < 1e6:
-        cure = "if those of others are not, set recording.topics.clock to bag"
+        cure = "if those of others are not, --set recording.topics.clock=bag"
         notes.append(f"{name}: stamps are {clock.ahead:.3g} s ahead of their receipt; {cure}")
     if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
         notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")
@@ -199,7 +186,8 @@ def in_words(shape: Shape | None) -> str:
     """What the messages of a topic hold."""
     match shape:
         case ScanShape():
-            turn = "all around" if shape.ring else f"over {np.degrees(abs(shape.fov)):.0f} degrees"
+            width = np.degrees(abs(shape.extent.width))
+            turn = "all around" if shape.extent.ring else f"over {width:.0f} degrees"
             return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
         case CloudShape():
             return f"{shape.points} points, median {shape.reach:.2g} m away"

@@ -9,7 +9,7 @@ import numpy as np
 
 from evaluation.artifacts.closure_table import Closures, count_closures
 from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_directory import check_run_directory, read_run
+from evaluation.artifacts.run_directory import check_run_directory, has_steps, read_run
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import ate
 from evaluation.report.verdict import CAUTION, judge_map
@@ -21,6 +21,14 @@ from tactile.base.se2 import between
 
 SAME = 0.99
 """Share of the odometry's error above which the map's is no better."""
+NONE_ACCEPTED = (
+    "no loop closure was accepted: the odometry contradicts those proposed, or places look alike; the report "
+    "shows them; is the sensor mounted the other way round?"
+)
+NONE_PROPOSED = (
+    "no place was recognised: did the robot come back to any? Do the views vary? Try another number of rows "
+    "and columns, or another max_range"
+)
 FAST = 2.0
 """Median motion of a step, cells, above which the views of successive steps differ too much."""
 
@@ -63,12 +71,6 @@ def diagnose_run(path: Path) -> Diagnosis:
     if manifest.killed or (status != "complete" and (path / "map.npz").exists()):
         advice.insert(0, proceed)
     return Diagnosis(what, (), tuple(notes), tuple(faults), tuple(advice))
-
-
-def has_steps(path: Path) -> bool:
-    """Whether a run directory has a step."""
-    online = path / "online.tum"
-    return online.exists() and online.stat().st_size > 0
 
 
 def error_notes(run: RunArrays) -> list[str]:
@@ -129,27 +131,12 @@ def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None
         size = float(f"{2 * float(np.median(moved)):.2g}")
         advice.append(f"--set pose_cells.cell_size={size}: a step moves {cells:.2g} cells")
     if closures is not None and not closures.accepted:
-        advice += _without_closures(closures)
+        advice.append(NONE_ACCEPTED if closures.proposed else NONE_PROPOSED)
     elif run.doubt > CAUTION:
-        advice += _for_a_doubtful_map(config)
+        advice.append(
+            "python -m ratslam report RUN_DIR -o report.html: shows each closure with its two views"
+        )
+        if config.recall.sector_fov == "auto":
+            advice.append("recall.sector_fov: the sensor's field of view, rad, instead of an estimate")
+        advice.append("keyframes.noise: the noise of this robot's odometry, instead of the preset's")
     return advice
-
-
-def _for_a_doubtful_map(config: RunConfig) -> list[str]:
-    advice = ["python -m ratslam report RUN_DIR -o report.html: shows each closure with its two views"]
-    if config.recall.sector_fov == "auto":
-        advice.append("recall.sector_fov: the sensor's field of view, rad, instead of an estimate")
-    advice.append("keyframes.noise: the noise of this robot's odometry, instead of the preset's")
-    return advice
-
-
-def _without_closures(closures: Closures) -> list[str]:
-    if closures.proposed:
-        return [
-            "no loop closure was accepted: the odometry contradicts those proposed, or places look alike; "
-            "the report shows them; is the sensor mounted the other way round?"
-        ]
-    return [
-        "no place was recognised: did the robot come back to any? Do the views vary? Try another number of "
-        "rows and columns, or another max_range"
-    ]

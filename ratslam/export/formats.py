@@ -40,10 +40,7 @@ FORMATS = (
 
 
 def export_run(
-    directory: Path,
-    output: Path,
-    warn: Warn = lambda sentence: None,
-    spikes: SpikeConfig | None = None,
+    directory: Path, output: Path, warn: Warn = lambda sentence: None, spikes: SpikeConfig | None = None
 ) -> None:
     """Writes the results of a run to a new file, whole or not at all.
 

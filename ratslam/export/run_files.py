@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.artifacts.closure_table import read_closure_table
+from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.nav2 import Nav2Map, read_nav2
 from evaluation.artifacts.run_directory import read_column, read_run
 from evaluation.artifacts.whisker_views import read_whisker_views
@@ -17,7 +18,6 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import align
 from ratslam.config.run_config import load_config
 from ratslam.pipeline.source import open_observations, read_observations
-from tactile.base.bounded import read_json
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, inverse
 
@@ -116,11 +116,7 @@ def _recorded_views(directory: Path, time: np.ndarray) -> Iterator[tuple[int, np
     config = load_config(directory / "config.yaml")
     if config.recording is None:
         return
-    digest = read_json(
-        directory / "manifest.json",
-        "the manifest of a run",
-        lambda content: str(content["recording"]["sha256"]),
-    )
+    digest = read_manifest(directory).digest
     with open_observations(config) as (_, source):
         if source.digest != digest:
             cure = "the views are those of another recording"

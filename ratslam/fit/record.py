@@ -116,7 +116,7 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
     if config.recording is None:
         return Rig(unknown=("wheels: the record has no true poses",))
     scale = "length scale: no true poses, and a map closes its loops at any scale"
-    if not any(_shows_place(sample.reading) for sample in samples):
+    if not any(shows_place(sample.reading) for sample in samples):
         return Rig(
             unknown=(scale, "turn scale, heading bias: no true poses, and no views that tell revisits")
         )
@@ -134,7 +134,7 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
     return Rig(tuple(quantities), notes=(note,), unknown=(scale,))
 
 
-def _shows_place(reading: Any) -> bool:
+def shows_place(reading: Any) -> bool:
     """Whether a place may be recognised by a reading."""
     return not isinstance(reading, Observation) or bool(reading.view_seen) or int(reading.label) >= 0
 

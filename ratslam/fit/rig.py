@@ -79,12 +79,8 @@ def rig_settings(rig: Rig) -> dict[str, Any]:
 
 def render_rig(rig: Rig) -> str:
     """The quantities as a table, with notes and what the record does not tell."""
-    rows = [HEADING, *(_row(quantity) for quantity in rig.quantities)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [_aligned(row, widths) for row in rows] if rig.quantities else []
-    lines += rig.notes
-    lines += [f"not determined: {reason}" for reason in rig.unknown]
-    return "\n".join(lines)
+    lines = aligned([HEADING, *map(_row, rig.quantities)]) if rig.quantities else []
+    return "\n".join([*lines, *rig.notes, *(f"not determined: {reason}" for reason in rig.unknown)])
 
 
 def rig_file(rig: Rig, record: str) -> str:
@@ -107,5 +103,7 @@ def _row(quantity: Quantity) -> Sequence[str]:
     return quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting
 
 
-def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
-    return "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of cells as lines, in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]

@@ -119,7 +119,8 @@ def signal_lines(record: SignalRecord, fit: SignalFit) -> tuple[str, ...]:
     reasons |= {int(k): "dead: no signal" for k in np.flatnonzero(fit.dead)}
     lines = [f"each channel: baseline; noise; correlation; drift ({record.unit}, {record.unit}/sqrt(s))"]
     for k, name in enumerate(record.names):
-        parts = (" ".join(map(_shown, column[k])) for column in _columns(fit))
+        columns = (fit.baseline, fit.noise, fit.correlation, fit.drift)
+        parts = (" ".join(map(_shown, column[k])) for column in columns)
         lines.append(f"  {name}: " + (reasons[k] if fit.dead[k] else "; ".join(parts)))
         if k in reasons and not fit.dead[k]:
             lines.append(f"    {reasons[k]}")
@@ -129,7 +130,3 @@ def signal_lines(record: SignalRecord, fit: SignalFit) -> tuple[str, ...]:
 def _shown(value: float) -> str:
     """A number, or '-' where the record does not tell it."""
     return f"{value:.3g}" if np.isfinite(value) else "-"
-
-
-def _columns(fit: SignalFit) -> tuple[np.ndarray, ...]:
-    return fit.baseline, fit.noise, fit.correlation, fit.drift

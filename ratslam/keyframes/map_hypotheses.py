@@ -11,12 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.keyframes.closure_selection import (
-    FINE,
-    STEPS,
-    SelectionProblem,
-    choose_sequences,
-)
+from ratslam.keyframes.closure_selection import FINE, STEPS, SelectionProblem, choose_sequences
 from ratslam.keyframes.merging import Merge
 from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import integrate, wrap

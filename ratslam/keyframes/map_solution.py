@@ -158,11 +158,7 @@ def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
 
 
 def selection_case(
-    graph: KeyframeGraph,
-    log: ClosureLog,
-    cut: GrowableArray,
-    sequences: np.ndarray,
-    place: Place,
+    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, place: Place
 ) -> SelectionProblem:
     """The problem of a selection among sequences [R], which the log then holds for accepted, with the
     odometry broken at `cut`."""

@@ -97,14 +97,11 @@ class GoalSteering:
         if len(mapped) > self._mapped and mapped[-1].number < count:
             result, self._mapped, self._told = mapped[-1], len(mapped), count
             pose = None if result.lost else np.asarray(result.pose, np.float64)
-            self._see(pose, result.points, self._whisks[result.number].pose)
+            now, arm = self._rig.odometer.pose(time.monotonic()), self._whisks[result.number].pose
+            self._note(self.route.see(pose, result.points, arm, now))
         elif count > self._told and count - len(mapped) > STALE:
             self._told = count
             self._note(self.route.rest())
-
-    def _see(self, pose: np.ndarray | None, points: np.ndarray, arm_pose: np.ndarray) -> None:
-        now = self._rig.odometer.pose(time.monotonic())
-        self._note(self.route.see(pose, points, arm_pose, now))
 
     def _note(self, state: DriveState) -> None:
         """Notes the end of a goal."""
@@ -112,6 +109,5 @@ class GoalSteering:
         if state.ended:
             end = {"goal": drive.goal + 1, "state": drive.state.name.lower(), "reason": drive.reason}
             self.ends.append(end | {"replans": drive.replans, "whisk": len(self._whisks)})
-            self._rig.record_event(
-                "goal", f"{drive.goal + 1}: {drive.state.name.lower()} {drive.reason}".strip()
-            )
+            text = f"{drive.goal + 1}: {end['state']} {drive.reason}".strip()
+            self._rig.record_event("goal", text)

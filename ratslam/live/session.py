@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evaluation.artifacts.run_directory import SESSION_REPORT
+from evaluation.artifacts.manifest import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.config.run_config import RunConfig
 from ratslam.live.arm_session import prepare_arm_session
@@ -81,15 +81,16 @@ def run_live_session(
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:
-                _write_report(directory, _report(fault, robot, mapper, standing))
+                report = json.dumps(_report(fault, robot, mapper, standing), indent=2) + "\n"
+                with suppress(OSError):  # a full disk has been reported
+                    (directory / SESSION_REPORT).write_text(report, encoding="utf-8")
     return fault, card
 
 
 def _interruption(robot: LiveRobot) -> Fault:
     done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
-    return Fault(
-        SessionOutcome.INTERRUPTED, done if robot.count else "nothing was recorded", time.monotonic()
-    )
+    detail = done if robot.count else "nothing was recorded"
+    return Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
 
 
 def open_recorder(job: MappingJob, calibration: Calibration | None) -> LiveRecorder:
@@ -116,11 +117,6 @@ def _run(robot: LiveRobot, mapper: Mapper) -> None:
         except SessionFault as error:
             robot.rig.record_event("fault", str(error.fault))
             raise
-
-
-def _write_report(directory: Path, report: dict[str, Any]) -> None:
-    with suppress(OSError):  # a full disk has been reported
-        (directory / SESSION_REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
 
 
 def _report(fault: Fault, robot: LiveRobot, mapper: Mapper, standing: bool) -> dict[str, Any]:

@@ -32,16 +32,12 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
     prepare_precision(config.session.precision)
     sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))
     backend = build(config.backend, config, sensors, config.session.precision, ablation)
-    plan = plan_recording(config, source, backend)
+    plan, length = plan_recording(config, source, backend), source.length
+    rows = length if length is not None and length <= RESERVED else 0  # a step adds at most one
     return Session(
         backend,
         seed=config.session.seed,
-        reserve=config.session.reserve or _known_rows(source.length),
+        reserve=config.session.reserve or rows,
         precision=config.session.precision,
         probe=None if plan is None else probe_of(backend, plan),
     )
-
-
-def _known_rows(length: int | None) -> int:
-    """Rows to reserve for a source of this length, 0 if they are not worth it: a step adds at most one."""
-    return length if length is not None and length <= RESERVED else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from evaluation.artifacts.manifest import read_manifest
@@ -15,7 +14,7 @@ from ratslam.pipeline.map_settings import check_same_method
 from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, read_map
 from ratslam.pipeline.sensor import check_same_sensor, sensor_of
 from robot.sources.source import Source
-from tactile.base.errors import InputError, printable
+from tactile.base.errors import InputError, tell
 
 
 def checkpoint_of(path: Path) -> Path | None:
@@ -38,7 +37,7 @@ def checkpoint_of(path: Path) -> Path | None:
     found = "killed before its first checkpoint"
     if manifest.continued:
         raise InputError(str(folder), found, "a run with a map", "continue the map that it went on from")
-    _say(f"{folder}: {found}; the recording is mapped from its beginning")
+    tell(f"{folder}: {found}; the recording is mapped from its beginning")
     return None
 
 
@@ -61,7 +60,7 @@ def resume_session(
         InputError: there is no map, or it holds the whole recording; it was made with another sensor, method
             or settings; or another recording cannot go on from it, because it is one piece.
     """
-    saved = read_map(path, _say)
+    saved = read_map(path, tell)
     check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)
@@ -75,14 +74,10 @@ def resume_session(
         if session.earlier or not read_manifest(saved.path.parent).killed:
             found = f"already holds all {samples} samples of {source.name}"
             raise InputError(str(path), found, "that of an unfinished run")
-        _say(f"{path}: killed after its last sample; the recording is mapped from its beginning")
+        tell(f"{path}: killed after its last sample; the recording is mapped from its beginning")
         session.restart(config.session.seed)
         return 0, START
     return samples or 0, saved.estimate
-
-
-def _say(sentence: str) -> None:
-    print(f"ratslam: {printable(sentence)}", file=sys.stderr)
 
 
 def _require_pieces(empty: Map, saved: SavedMap, source: Source) -> None:

@@ -19,13 +19,13 @@ from ratslam.config.strict_yaml import dump, override, parse, validate
 from ratslam.core.localisation import Localisation
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.progress import Observer
-from ratslam.pipeline.run import LAST_TASK, catch_interrupt, print_status, process_source
+from ratslam.pipeline.run import LAST_TASK, catch_interrupt, process_source
 from ratslam.pipeline.runner import open_runner
 from ratslam.pipeline.saved_map import SavedMap, is_map
 from ratslam.pipeline.sensor import check_same_fov
 from ratslam.pipeline.source import open_observations
 from robot.recordings.formats import RecordingConfig
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, tell
 
 NOT_LOCALISED = {
     "classic": "whose view templates say which view is nearest, and not how likely it is of another place",
@@ -168,7 +168,7 @@ def localise(
     """
     warnings: list[str] = []
     with (
-        open_observations(localising(config, saved), print_status, warnings) as (completed, source),
+        open_observations(localising(config, saved), tell, warnings) as (completed, source),
         open_runner(completed, source, directory, observers=observers, warnings=warnings) as runner,
         catch_interrupt(LAST_TASK),
     ):

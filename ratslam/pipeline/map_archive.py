@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile.base import npz
 from tactile.base.atomic_write import flush_to_disk
-from tactile.base.bounded import reason
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT
 
@@ -33,21 +33,16 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
         InputError: it is no such file, damaged, of an unknown format, or cannot be read.
     """
     begin = _begin(file)
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = [name.removesuffix(".npy") for name in archive.namelist()]
-            if "steps" not in members:
-                raise InputError(str(file), "an archive of other arrays", EXPECTED)
-            if "format" in members:
-                _check_format(file, *npz.read_arrays(archive, ["format.npy"], str(file)))
-            arrays = npz.read_arrays(archive, archive.namelist(), str(file))
-            return dict(zip(members, arrays, strict=True))
-    except InputError:
-        raise
-    except SPOILT as error:
-        spoilt = f"damaged, or not a map ({reason(error)})" if begin == ARCHIVE else "not a map"
-        spoilt = spoilt if begin else "empty, so not a map"
-        raise InputError(str(file), spoilt, EXPECTED, "restore it from a copy if it was one") from None
+    found = "damaged, or not a map ({})" if begin == ARCHIVE else "not a map"
+    found, cure = found if begin else "empty, so not a map", "restore it from a copy if it was one"
+    with malformed(file, EXPECTED, cure, found, SPOILT), zipfile.ZipFile(file) as archive:
+        members = [name.removesuffix(".npy") for name in archive.namelist()]
+        if "steps" not in members:
+            raise InputError(str(file), "an archive of other arrays", EXPECTED)
+        if "format" in members:
+            _check_format(file, *npz.read_arrays(archive, ["format.npy"], str(file)))
+        arrays = npz.read_arrays(archive, archive.namelist(), str(file))
+        return dict(zip(members, arrays, strict=True))
 
 
 def _begin(file: Path) -> bytes:
@@ -56,16 +51,11 @@ def _begin(file: Path) -> bytes:
     Raises:
         InputError: there is none, it is not a plain file, or it cannot be read.
     """
-    try:
+    with malformed(file, EXPECTED, "check the path and its permissions"):
         if not stat.S_ISREG(file.stat().st_mode):
             raise InputError(str(file), "neither a file nor a folder", EXPECTED)
         with file.open("rb") as opened:
             return opened.read(len(ARCHIVE))
-    except FileNotFoundError:
-        raise InputError(str(file), "no such file", EXPECTED) from None
-    except OSError as error:
-        found = f"cannot be read ({error.strerror})"
-        raise InputError(str(file), found, EXPECTED, "check the path and its permissions") from None
 
 
 def _check_format(file: Path, array: np.ndarray) -> None:

@@ -24,6 +24,7 @@ from ratslam.pipeline.folder_change import change_folder, finish_change, unfinis
 from ratslam.pipeline.map_results import holds_results, rewrite_results
 from ratslam.pipeline.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.pipeline.sensor import disagreement
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file, require_writable
 
@@ -47,6 +48,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
     made = saved.open_session().map
     path = made.trajectory() if saved.steps else np.zeros((0, 3))
     doubt = made.final_doubt() if saved.steps else np.nan
+    box = np.array([path[:, :2].min(axis=0), path[:, :2].max(axis=0)]) if len(path) else path
     info: dict[str, Any] = {
         "path": str(saved.path),
         "format": saved.format,
@@ -60,7 +62,7 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
         "experiences": len(made.graph()) if saved.steps else 0,
         "pieces": len(np.unique(made.pieces())) if saved.steps else 0,
         "closures": len(made.closures()) if saved.steps else 0,
-        "box_m": _box(path),
+        "box_m": box.ravel().tolist(),
         "doubt": float(doubt) if np.isfinite(doubt) else None,
         "unjudged": made.unjudged() if saved.steps else "",
     }
@@ -211,12 +213,9 @@ def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:
     session, made = _keyframe_session(saved, "crop")
     backend = session.backend
     assert isinstance(backend, RecallBackend)
-    try:
-        inside = choose(made)
-        cropped = crop_map(made, backend.new_map(), inside)
-    except ValueError as error:
-        cure = "`ratslam map info` says where the map lies and how many steps and pieces it has"
-        raise InputError(str(saved.path), str(error), "a part of the map", cure) from None
+    cure = "`ratslam map info` says where the map lies and how many steps and pieces it has"
+    with malformed(saved.path, "a part of the map", cure, "{}", (ValueError,)):
+        cropped = crop_map(made, backend.new_map(), choose(made))
     steps = len(made.pieces())
     session.change_rows(cropped.rows.rows, steps, lambda state: backend.crop_rows(state, cropped))
     if cropped.elsewhere:
@@ -245,8 +244,3 @@ def _content(saved: SavedMap) -> MapContent:
     names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
     path = made.trajectory() if saved.steps else np.zeros((0, 3))
     return MapContent(path, names, made.closures())
-
-
-def _box(path: np.ndarray) -> list[float]:
-    """Least x and y and largest x and y of poses [T, 3], m."""
-    return [*path[:, :2].min(axis=0).tolist(), *path[:, :2].max(axis=0).tolist()] if len(path) else []

@@ -23,7 +23,8 @@ def save_changes(map: Map, config: TouchConfig, directory: RunDirectory) -> None
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
     """The places at which a localised session does not agree with its map, the surest first."""
-    return session_changes(localiser.place, localiser.visits(), _touch(config))
+    touch = Touch(ur10_head(config.head), config.image.tallest)
+    return session_changes(localiser.place, localiser.visits(), touch)
 
 
 def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:
@@ -43,7 +44,3 @@ def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeR
         )
         for change in changes
     ]
-
-
-def _touch(config: TouchConfig) -> Touch:
-    return Touch(ur10_head(config.head), config.image.tallest)

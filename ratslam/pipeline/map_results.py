@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from evaluation.artifacts.merged_map import NAME as MERGED
 from evaluation.artifacts.merged_map import is_merged, read_session_steps
 from evaluation.artifacts.pieces_table import NAME as PIECES
 from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_directory import has_steps, read_run
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -41,12 +42,14 @@ def write_map_results(folder: Path, made: Map, time: np.ndarray) -> None:
     final, own, piece = (path[first:] for path in (made.trajectory(), made.map_trajectory(), made.pieces()))
     write_atomically(folder / "trajectory.tum", lambda path: write_tum(path, time, final))
     write_atomically(folder / "map.tum", lambda path: write_tum(path, time, own))
-    files = dict(made.files())
+    files: dict[str, Callable[[Path], Any]] = dict(made.files())
     if made.pieces().any():
         files[PIECES] = lambda path: write_pieces(path, time, piece)
     doubt, reason, pairs = made.final_doubt(), made.unjudged(), made.closures()
     if np.isfinite(doubt) or reason:
-        files["health.json"] = lambda path: _write_health(path, doubt, reason)
+        health = {"worse_than_odometry": doubt if np.isfinite(doubt) else None}
+        text = json.dumps(health | ({"reason": reason} if reason else {})) + "\n"
+        files["health.json"] = lambda path: path.write_text(text, encoding="utf-8")
     if len(pairs):
         files.setdefault("closures.csv", lambda path: write_closure_pairs(path, pairs))
     for name, write in files.items():
@@ -70,8 +73,7 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
 
 def holds_results(folder: Path) -> bool:
     """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
-    online = folder / "online.tum"
-    return is_merged(folder) or (online.exists() and online.stat().st_size > 0)
+    return is_merged(folder) or has_steps(folder)
 
 
 def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:
@@ -104,19 +106,10 @@ def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:
     Raises:
         InputError: a file is missing or malformed.
     """
-    card = score_run(
-        read_run(folder),
-        folder.name,
-        exm=config.experience_metric,
-        relations=read_relations(config.relations) if config.relations else None,
-        metrics=build_metrics(config.metrics),
-    )
+    relations = read_relations(config.relations) if config.relations else None
+    metrics, exm = build_metrics(config.metrics), config.experience_metric
+    card = score_run(read_run(folder), folder.name, exm=exm, relations=relations, metrics=metrics)
     write_text_atomically(folder / "scorecard.json", card.model_dump_json(indent=2) + "\n")
     for name, save in plot_writers(folder).items():
         write_atomically(folder / name, save)
     return card
-
-
-def _write_health(path: Path, doubt: float, reason: str) -> None:
-    known = {"worse_than_odometry": doubt} if np.isfinite(doubt) else {"worse_than_odometry": None}
-    path.write_text(json.dumps(known | ({"reason": reason} if reason else {})) + "\n", encoding="utf-8")

@@ -20,7 +20,10 @@ def check_same_method(where: str, of_map: RunConfig, other: RunConfig) -> None:
         where: the map, for the error.
     """
     if of_map.backend != other.backend:
-        raise _error(where, {"backend": [of_map.backend, other.backend]}, _method_cure(of_map))
+        cure = f"`--set backend={of_map.backend}` takes that of the map"
+        if of_map.backend in LOCALISING.values():
+            cure = f"continue the map in which that session was localised, {of_map.localise.map}"
+        raise _error(where, {"backend": [of_map.backend, other.backend]}, cure)
 
 
 def check_same_settings(where: str, of_map: RunConfig, other: RunConfig) -> None:
@@ -45,12 +48,6 @@ def differing_settings(configs: Sequence[RunConfig]) -> dict[str, list[Any]]:
     names = dict.fromkeys(name for settings in each for name in settings)
     values = {name: [settings.get(name) for settings in each] for name in names}
     return {name: found for name, found in values.items() if any(value != found[0] for value in found)}
-
-
-def _method_cure(of_map: RunConfig) -> str:
-    if of_map.backend in LOCALISING.values():
-        return f"continue the map in which that session was localised, {of_map.localise.map}"
-    return f"`--set backend={of_map.backend}` takes that of the map"
 
 
 def _error(where: str, different: dict[str, list[Any]], cure: str) -> InputError:

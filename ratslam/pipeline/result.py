@@ -168,7 +168,12 @@ class Result:
         return page
 
     def __repr__(self) -> str:
-        return f"<Result of {len(self.time)} steps in {self.directory}: {self._summary()}>"
+        error, parts = self.scorecard.quantities["ate_final"], [render_health(self.scorecard)]
+        if error.value is not None:
+            raw = "" if error.odometry is None else f" (odometry {error.odometry:.3g})"
+            parts = [f"position error {error.value:.3g} {error.unit}{raw}", *parts]
+        summary = ", ".join(part for part in parts if part)
+        return f"<Result of {len(self.time)} steps in {self.directory}: {summary}>"
 
     def _repr_html_(self) -> str:
         picture = BytesIO()
@@ -179,12 +184,3 @@ class Result:
         words = [f"{verdict.headline}. {verdict.reason} {describe_score(self.scorecard)}"]
         text = "".join(f"<p>{escape(line)}</p>" for line in words + render_warnings(self.scorecard))
         return f"<div>{image}{text}{scorecard_html(self.scorecard)}</div>"
-
-    def _summary(self) -> str:
-        """Position error and health in one line, as far as they are known."""
-        error = self.scorecard.quantities["ate_final"]
-        parts = [render_health(self.scorecard)]
-        if error.value is not None:
-            raw = "" if error.odometry is None else f" (odometry {error.odometry:.3g})"
-            parts = [f"position error {error.value:.3g} {error.unit}{raw}", *parts]
-        return ", ".join(part for part in parts if part)

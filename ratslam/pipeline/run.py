@@ -23,7 +23,7 @@ from ratslam.pipeline.runner import Runner, open_runner
 from ratslam.pipeline.source import open_observations, open_source
 from robot.recordings.recorder import Recorder
 from robot.sources.source import Source
-from tactile.base.errors import InputError, printable
+from tactile.base.errors import InputError, printable, tell
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
@@ -50,7 +50,7 @@ def run(
     """
     warnings: list[str] = []
     with (
-        open_observations(config, print_status, warnings) as (completed, source),
+        open_observations(config, tell, warnings) as (completed, source),
         open_runner(completed, source, directory, resume, observers=observers, warnings=warnings) as runner,
         catch_interrupt(LAST_TASK),
     ):
@@ -69,8 +69,7 @@ def process_source(runner: Runner, source: Source) -> bool:
     """
     samples = islice(iter(source), runner.skipped, None)
     total = None if source.length is None else source.length - runner.skipped
-    bar = tqdm(total=total, unit="step", desc=printable(source.name), file=sys.stderr, mininterval=0.5)
-    with bar, catch_interrupt(LAST_TASK) as interrupted:
+    with _bar(source, "step", total) as bar, catch_interrupt(LAST_TASK) as interrupted:
         begun = False
         while not interrupted() and (chunk := list(islice(samples, CHUNK - runner.session.steps % CHUNK))):
             begun, steps = True, runner.process(chunk)
@@ -95,26 +94,24 @@ def simulate(config: RunConfig, path: Path) -> tuple[int, bool]:
     """
     if config.simulation is config.create_simulation is config.rat_simulation is None:
         raise InputError("simulation", "missing", "a simulation", "`simulation: {}` is a complete session")
-    source = open_source(config, print_status)
+    source = open_source(config, tell)
     raw = config.simulation is None or config.simulation.raw
     frontend = None if raw else Frontend(config.touch, source.info.calibration)
     recorder = open_recorder(path, source)
-    bar = tqdm(
-        source,
-        unit="whisk",
-        desc=printable(source.name),
-        file=sys.stderr,
-        mininterval=0.5,
-        total=source.length,
-    )
+    bar = _bar(source, "whisk", source.length)
     with recorder, bar, catch_interrupt("closing the file") as interrupted:
-        for sample in bar:
+        for sample in source:
             if frontend is not None and isinstance(sample.reading, Cycle | Whisk):
                 sample = sample._replace(reading=frontend.features(sample.reading))
             recorder.write(sample)
+            bar.update()
             if interrupted():
                 break
         return recorder.count, interrupted()
+
+
+def _bar(source: Source, unit: str, total: int | None) -> tqdm:
+    return tqdm(total=total, unit=unit, desc=printable(source.name), file=sys.stderr, mininterval=0.5)
 
 
 def open_recorder(path: Path, source: Source) -> Recorder:
@@ -188,8 +185,3 @@ def _is_collecting(frame: FrameType | None) -> bool:
     while frame is not None and frame.f_code not in codes:
         frame = frame.f_back
     return frame is not None
-
-
-def print_status(sentence: str) -> None:
-    """Prints one sentence about the progress."""
-    print(f"ratslam: {printable(sentence)}", file=sys.stderr)

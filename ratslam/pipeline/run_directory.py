@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from tactile.base.atomic_write import write_atomically, write_text_atomically
-from tactile.base.errors import InputError
+from tactile.base.errors import os_errors_of
 from tactile.base.new_file import require_new_file
 
 COLUMNS = (
@@ -42,12 +42,8 @@ class RunDirectory:
     def __init__(self, path: Path, columns: Iterable[str] = (), manifest: str = "") -> None:
         self.path = path
         require_new_file(path, parents=True)
-        try:
+        with os_errors_of(path, "cannot be created", "a writable folder"):
             path.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(
-                str(path), f"cannot be created ({error.strerror})", "a writable folder"
-            ) from None
         if manifest:
             self.text("manifest.json", manifest)
         self._streams = {name: (path / name).open("x", encoding="utf-8", newline="") for name in STREAMS}

@@ -114,9 +114,7 @@ class Runner:
             self._truth.append(np.nan if sample.truth is None else sample.truth)
         entry = BACKENDS.get(self._config.backend, "backend")
         self._directory.append(_lines(samples, steps, odometry, entry))
-        self._estimate = pose_estimate(
-            steps[-1], entry.outcomes(int(steps[-1].evidence.outcome)).name.lower()
-        )
+        self._estimate = pose_estimate(steps[-1], entry.outcome(steps[-1].evidence))
         self._directory.append({"timing.csv": f"{self.session.steps},{len(steps)},{took:.6f}\n"})
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
@@ -140,18 +138,16 @@ class Runner:
         status = "interrupted" if interrupted else "complete"
         file = self._directory.path / NAME
         # Of a complete run it appears last: after a kill before, there are samples to go on with.
-        made = file if interrupted else temporary_path(file)
-        self._write_map(made, compressed=True)  # before a solution moves poses
+        written = file if interrupted else temporary_path(file)
+        self._write_map(written, compressed=True)  # before a solution moves poses
         try:
             card = self._write_results()
         finally:
-            made.replace(file)
-        manifest = self._manifest | {"status": status, "steps": self.session.steps}
-        self._directory.text("manifest.json", _manifest_text(manifest))
+            written.replace(file)
+        self._write_manifest(status=status, steps=self.session.steps)
+        made = self.session.map
         for observer in self._observers:
-            observer.finish(
-                self._map_report()._replace(path=self.session.map.trajectory(), grid=self.session.map.grid())
-            )
+            observer.finish(self._map_report()._replace(path=made.trajectory(), grid=made.grid()))
         return card
 
     def checkpoint(self) -> None:
@@ -186,8 +182,11 @@ class Runner:
             moved = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
             motion = np.column_stack([moved, np.diff(time, prepend=time[:1])])
             found += judge_motion(time, motion, self._source.name)
-        self._manifest |= {"input": _input(found)}
-        self._directory.text("manifest.json", _manifest_text(self._manifest | {"status": "running"}))
+        self._write_manifest(input=_input(found))
+
+    def _write_manifest(self, **changed: Any) -> None:
+        self._manifest |= changed
+        self._directory.text("manifest.json", _manifest_text(self._manifest))
 
     def _report(
         self,
@@ -244,12 +243,13 @@ def open_runner(
     begun = None if resume is None else checkpoint_of(resume)
     skip, estimate = (0, START) if begun is None else resume_session(session, begun, config, source)
     text = dump(config)
-    manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
     warnings = [] if warnings is None else warnings  # a reader goes on to add to it
     if begun is not None and map_file(begun).name == NAME:  # of a run
         warnings[:0] = read_manifest(map_file(begun).parent).warnings
-    running = _manifest_text(manifest | {"status": "running", "input": _input(warnings)})
-    with RunDirectory(directory, BACKENDS.get(config.backend, "backend").columns(), running) as files:
+    manifest = _manifest(config, text, source) | {"continued": begun is not None, "first_step": session.steps}
+    manifest |= {"input": _input(warnings), "status": "running"}
+    columns = BACKENDS.get(config.backend, "backend").columns()
+    with RunDirectory(directory, columns, _manifest_text(manifest)) as files:
         files.text("config.yaml", text)
         save_world(source.info, files)
         runner = Runner(config, source, files, manifest, session, skip, observers, estimate, warnings)
@@ -273,16 +273,8 @@ def _step_report(
     estimate = step.estimate
     places = int(estimate.place), int(estimate.previous)
     pose = np.asarray(step.pose, float)
-    return StepReport(
-        number,
-        float(sample.time),
-        observation,
-        odometry,
-        pose,
-        *places,
-        bool(estimate.lost),
-        float(step.doubt),
-    )
+    lost, doubt = bool(estimate.lost), float(step.doubt)
+    return StepReport(number, float(sample.time), observation, odometry, pose, *places, lost, doubt)
 
 
 def _lines(

@@ -6,7 +6,6 @@ configuration, the description of the readings, and a sha256 over all of it.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,21 +14,15 @@ from typing import Any
 import numpy as np
 
 from ratslam.backends.registry import BACKENDS, LOCALISING
+from ratslam.config.other_files import MAP, kind_of
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
-from ratslam.core.checkpoint import with_prefix
+from ratslam.core.checkpoint import fill_odometry, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
 from ratslam.pipeline.folder_change import unfinished_change
-from ratslam.pipeline.map_archive import (
-    EXPECTED,
-    FORMAT,
-    digest_of,
-    read_arrays,
-    text_of,
-    write_arrays,
-)
+from ratslam.pipeline.map_archive import EXPECTED, FORMAT, digest_of, read_arrays, text_of, write_arrays
 from ratslam.pipeline.map_settings import check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
@@ -37,7 +30,7 @@ from robot.sources.description import SourceDescription, describe
 from robot.sources.source import Source
 from robot.touch_source import TouchSource, open_touch_source
 from tactile.base.atomic_write import write_atomically
-from tactile.base.bounded import reason
+from tactile.base.bounded import malformed, reason
 from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT
 
@@ -47,8 +40,6 @@ TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND = "estimate/", "frontend/"
-ODOMETRY = {"map/steps/odometry": "map/steps/frame", "map/odometry": "map/step_node"}
-"""Odometry of the steps, which files did not always hold, and an array with as many rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +133,7 @@ def map_file(path: Path) -> Path:
 
 def is_map(path: Path) -> bool:
     """Whether a path is a map by the names in its file."""
-    file = map_file(path)
-    try:
-        if not file.is_file():
-            return False
-        with zipfile.ZipFile(file) as archive:
-            return {"steps.npy", "config.npy"} <= set(archive.namelist())
-    except (OSError, zipfile.BadZipFile):
-        return False
+    return kind_of(map_file(path)) == MAP
 
 
 def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMap:
@@ -224,21 +208,17 @@ def describe_readings(source: Source) -> SourceDescription:
 def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
     config = validate(parse(texts["config"], f"{file}: config"), LoopConfig)
     BACKENDS.get(config.backend, f"{file}: backend")
-    try:
+    with malformed(file, EXPECTED, found="{}", spoilt=SPOILT):
         source = SourceDescription.from_json(texts["source"])
         estimate = read_estimate(with_prefix(arrays, ESTIMATE))
         steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
-    except SPOILT as error:
-        raise InputError(str(file), reason(error), EXPECTED) from None
     if steps < 0:
         raise InputError(str(file), f"{steps} steps", EXPECTED)
     if not UNKNOWN <= earlier <= steps:
         raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
-    for name, like in ODOMETRY.items():
-        if like in session:
-            session.setdefault(name, np.full((len(session[like]), 3), np.nan))
+    fill_odometry(session)
     return SavedMap(
         file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
         with_prefix(arrays, FRONTEND),
@@ -250,10 +230,8 @@ def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], 
     in a run directory, where it stands beside it."""
     if "source" in arrays:
         config: RunConfig = validate(parse(text_of(file, arrays, "config"), f"{file}: config"), LoopConfig)
-        try:
+        with malformed(file, EXPECTED, found="{}"):
             readings = SourceDescription.from_json(text_of(file, arrays, "source"))
-        except ValueError as error:
-            raise InputError(str(file), reason(error), EXPECTED) from None
         source = describe_readings(open_touch_source(readings, config.touch))
     else:
         beside = file.with_name("config.yaml")

@@ -81,8 +81,9 @@ def sensor_of(config: RunConfig, source: Source) -> Sensor:
     else:
         kind, made = VIEWS, _view_settings(config)
     transform = made | {f"templates.{name}": value for name, value in templates.items()}
-    views = {name: value for name, value in transform.items() if name.startswith("recording.")}
-    transform = {name: value for name, value in transform.items() if value is not None} | views
+    transform = {
+        name: value for name, value in transform.items() if value is not None or name.startswith("recording.")
+    }
     plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
     unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
     return Sensor(kind, source.view_shape, source.whiskers, unit, cell, *plain)
@@ -126,14 +127,12 @@ def check_same_sensor(where: str, of_map: Sensor, other: Sensor) -> None:
     Args:
         where: the map, for the error.
     """
-    found = differences(of_map, other)
-    settings = settings_of_map(found)
-    if settings:
-        what = f"made with other settings of the sensor: {disagreement(of_map, other)}"
+    reason = disagreement(of_map, other)
+    if settings := settings_of_map(differences(of_map, other)):
+        found = f"made with other settings of the sensor: {reason}"
         cure = f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
-        raise InputError(where, what, "a map of these settings", cure)
-    if found:
-        reason = disagreement(of_map, other)
+        raise InputError(where, found, "a map of these settings", cure)
+    if reason:
         raise InputError(where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})")
 
 
@@ -144,21 +143,17 @@ def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
     Args:
         where: the map, for the error.
     """
-    fov, own = (config.recall.sector_fov for config in (of_map, other))
+    fovs = [config.recall.sector_fov for config in (of_map, other)]
     formats = [_format_of(config) for config in (of_map, other)]
-    if isinstance(fov, str) and isinstance(own, str):
+    known = [fov for fov in fovs if not isinstance(fov, str)]
+    same_format = formats[0] == formats[1] or "" in formats
+    if not known or (abs(known[0] - known[1]) <= SAME_FOV if len(known) == 2 else same_format):
         return
-    if isinstance(fov, str) or isinstance(own, str):
-        if formats[0] == formats[1] or "" in formats:
-            return
-    elif abs(fov - own) <= SAME_FOV:
-        return
-    angles = ["an unknown angle" if isinstance(angle, str) else f"{angle:.4g} rad" for angle in (fov, own)]
-    found = (
-        f"made with another sensor: {formats[0] or 'views'} over {angles[0]}, and not {formats[1] or 'views'}"
-    )
+    angles = ["an unknown angle" if isinstance(fov, str) else f"{fov:.4g} rad" for fov in fovs]
+    ours, theirs = (f"{views or 'views'} over {angle}" for views, angle in zip(formats, angles, strict=True))
     cure = "if it is the same sensor, set recall.sector_fov in both configurations to its field of view"
-    raise InputError(where, f"{found} over {angles[1]}", "a map of this sensor", cure)
+    found = f"made with another sensor: {ours}, and not {theirs}"
+    raise InputError(where, found, "a map of this sensor", cure)
 
 
 def _format_of(config: RunConfig) -> str:

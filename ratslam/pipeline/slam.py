@@ -23,6 +23,7 @@ from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
@@ -162,11 +163,9 @@ class Slam:
         saved.restore(slam.session, saved.config)
         slam.estimate = saved.estimate
         if slam._frontend is not None and saved.frontend:
-            try:
+            found = "the front end's arrays do not fit it ({})"
+            with malformed(saved.path, "a map of this front end", found=found):
                 slam._frontend.restore(dict(saved.frontend))
-            except (LookupError, ValueError, TypeError) as error:
-                found = f"the front end's arrays do not fit it ({error})"
-                raise InputError(str(path), found, "a map of this front end") from None
         return slam
 
     def _observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation | None:

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 from ratslam.pipeline.progress import MapReport, Observer, RunDescription, StepReport
 from robot.drivers.process_priority import put_last
+from tactile.base.errors import tell
 
 QUEUE = 256
 """Messages that wait at most; one is a chunk of a run."""
@@ -114,7 +115,7 @@ class Viewer:
         if late or self.dropped:
             lost = f", {self.dropped} of {self.offered} messages were dropped" if self.dropped else ""
             state = "did not keep up" if late or code == 0 else "ended early"
-            _warn(f"the view at {self.target} {state}{lost}; the results are complete")
+            tell(f"warning: the view at {self.target} {state}{lost}; the results are complete")
 
 
 @contextmanager
@@ -125,7 +126,3 @@ def open_viewer(target: str | None) -> Iterator[list[Observer]]:
         return
     with Viewer(target) as viewer:
         yield [viewer]
-
-
-def _warn(sentence: str) -> None:
-    print(f"ratslam: warning: {sentence}", file=sys.stderr, flush=True)

@@ -29,11 +29,7 @@ def session_fault(outcome: SessionOutcome, detail: str) -> SessionFault:
 
 
 def wait_until(
-    poll: Callable[[], None],
-    done: Callable[[], bool],
-    longest: float,
-    late: SessionOutcome,
-    what: str,
+    poll: Callable[[], None], done: Callable[[], bool], longest: float, late: SessionOutcome, what: str
 ) -> None:
     """Polls until a condition is true.
 

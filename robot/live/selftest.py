@@ -18,7 +18,7 @@ from robot.live.head_stream import HeadStream
 from robot.live.polling import TICK, SessionFault
 from robot.live.rig import Rig
 from robot.live.route import check_targets, plan_path
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 LISTEN_TIME = 1.5
@@ -34,17 +34,13 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
         InputError: it cannot be made, or there is not enough free space.
     """
     there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
-    try:
+    with os_errors_of(directory, "cannot be made", "a writable folder", "choose another with -o"):
         tempfile.TemporaryFile(dir=there).close()
-    except OSError as error:
-        found = f"cannot be made ({error.strerror})"
-        raise InputError(str(directory), found, "a writable folder", "choose another with -o") from None
     free = shutil.disk_usage(there).free
     if free < config.room:
         found = f"{free / 1e9:.2g} GB free"
-        raise InputError(
-            str(directory), found, f"{config.room / 1e9:.2g} GB", "make room, or choose another disk with -o"
-        )
+        cure = "make room, or choose another disk with -o"
+        raise InputError(str(directory), found, f"{config.room / 1e9:.2g} GB", cure)
     return f"disk: {free / 1e9:.0f} GB free"
 
 
@@ -94,12 +90,8 @@ def check_stream(head: HeadReader, stream: HeadStream, residual: float, listen: 
             "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
         )
     if after.bad > before.bad:
-        raise InputError(
-            "head",
-            f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s",
-            "none",
-            "change the cable",
-        )
+        found = f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s"
+        raise InputError("head", found, "none", "change the cable")
     if stream.clock.residual > residual:
         found = f"clock residual of {stream.clock.residual * 1e3:.1f} ms"
         raise InputError("head", found, f"{residual * 1e3:g} ms", "check the load of this machine")

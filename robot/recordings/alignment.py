@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import prod
-from typing import NamedTuple
 
 import numpy as np
 
 from robot.recordings.input_judge import Cures, InputJudge, MotionTrack, unit_cure
-from robot.recordings.sanity_checks import RowName
+from robot.recordings.sanity_checks import RowName, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
 from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
@@ -19,46 +18,34 @@ from tactile.base.errors import InputError
 RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
 
 
-class NearestRows(NamedTuple):
-    """Odometry rows of M values.
-
-    Attributes:
-        rows: [M] the row nearest in time. away: [M] s from it. reach: s, how far a value may be away.
-    """
-
-    rows: np.ndarray
-    away: np.ndarray
-    reach: float
-
-
 @dataclass(eq=False)
 class RecordingRows:
     """Rows of a recording while it is put together; N rows of odometry.
 
     Attributes:
-        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous row.
+        where: names the recording. time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the
+            previous row.
         shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
-        errors: found so far. views, seen, label, truth, contact, point: as in `InMemorySource`.
-        sensors: the whiskers that make contacts, if any.
-        held: whether the odometry was recorded as velocities. poses: [N, 3] as recorded, where poses were.
-        place: names a row; None: by its number. clock: what to do if the clock is at fault. cures: what to
-        set for a unit.
+        errors: found so far. held: whether the odometry was recorded as velocities. poses: [N, 3] as
+            recorded, where poses were. place: names a row; None: by its number. cures: of wrong units.
+        views, seen, label, truth, contact, point: as in `InMemorySource`. sensors: the whiskers that make
+            contacts, if any.
     """
 
+    where: str
     time: np.ndarray
     motion: np.ndarray
     shape: tuple[int, int, int]
     whiskers: int = 0
     errors: list[InputError] = field(default_factory=list)
+    held: bool = False
+    poses: np.ndarray | None = None
+    place: RowName | None = None
+    cures: Cures = unit_cure
     truth: np.ndarray | None = None
     contact: np.ndarray | None = None
     point: np.ndarray | None = None
     sensors: PlanarWhiskersInfo | None = None
-    held: bool = False
-    poses: np.ndarray | None = None
-    place: RowName | None = None
-    clock: str = ""
-    cures: Cures = unit_cure
     views: np.ndarray = field(init=False)
     seen: np.ndarray = field(init=False)
     label: np.ndarray = field(init=False)
@@ -67,7 +54,9 @@ class RecordingRows:
         rows, pixels = len(self.time), prod(self.shape)
         if rows * pixels > MOST_PIXELS:
             found = f"{rows} views of {pixels} pixels"
-            raise InputError("views", found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns")
+            raise InputError(
+                self.where, found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns"
+            )
         self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
         self.label = np.full(rows, -1, np.int32)
 
@@ -80,7 +69,7 @@ class RecordingRows:
         tips = base + sensors.length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.point = tips * self.contact[:, :, None]
 
-    def source(self, name: str, digest: str, where: str, judge: InputJudge) -> InMemorySource:
+    def source(self, name: str, digest: str, judge: InputJudge) -> InMemorySource:
         """The recording as a `Source`, after it was judged.
 
         Raises:
@@ -88,8 +77,9 @@ class RecordingRows:
         """
         everywhere = np.ones(len(self.time), bool)
         track = MotionTrack(self.time, everywhere, self.motion, self.truth, self.held, self.poses)
-        place = self.place or (lambda row: f"{where}, row {row}")
-        raise_errors(self.errors + judge.errors(track, place, where, self.clock, self.cures, not self.errors))
+        place = self.place or (lambda row: f"{self.where}, row {row}")
+        judged = judge.errors(track, place, self.where, cures=self.cures, in_order=not self.errors)
+        raise_errors(self.errors + judged)
         return InMemorySource(
             name=name,
             digest=judge.stretch.digest(digest),
@@ -134,25 +124,24 @@ def range_errors(
     Args:
         lowest: [M] smallest range of each view, m. typical: median of all. key: setting of `max_range`.
     """
-    errors = []
-    negative = lowest < 0
-    if negative.any():
-        row = int(negative.argmax())
-        errors.append(InputError(place(row), f"{what} is {lowest[row]}", "ranges of 0 m or more"))
+    errors = first_error(lowest < 0, place, lambda row: f"{what} is {lowest[row]}", "ranges of 0 m or more")
     if typical > RANGE_UNIT_FACTOR * max_range:
-        unit = "set recording.table.views.unit to mm" if key.startswith("table") else "divide by 1000"
+        unit = "--set recording.table.views.unit=mm" if key.startswith("table") else "divide by 1000"
         cure = f"{unit} if they are millimetres, else raise {key}"
         errors.append(InputError(where, f"half of the ranges are over {typical:.4g} m", "metres", cure))
     return errors
 
 
-def nearest_rows(moments: np.ndarray, time: np.ndarray, tolerance: float | None) -> NearestRows | None:
+def nearest_rows(
+    moments: np.ndarray, time: np.ndarray, tolerance: float | None
+) -> tuple[np.ndarray, np.ndarray, float] | None:
     """The odometry row nearest in time to each of the times [M] s.
 
     Args:
         time: [N] s of the odometry. tolerance: how far a value may be away, s; None: the median step.
 
     Returns:
+        The rows [M], how far they are away [M] s, and how far they may be, s;
         None if the odometry's times do not increase, which is an error of its own.
     """
     steps = np.diff(time)
@@ -160,7 +149,7 @@ def nearest_rows(moments: np.ndarray, time: np.ndarray, tolerance: float | None)
         return None
     rows = np.searchsorted(time[:-1] + steps / 2, moments)
     reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
-    return NearestRows(rows, np.abs(time[rows] - moments), reach)
+    return rows, np.abs(time[rows] - moments), reach
 
 
 def interpolated_poses(

@@ -42,38 +42,21 @@ RANGE_QUANTILE, RANGE_MARGIN = 0.9, 1.25
 """The largest range of a view is this quantile of all ranges, times the margin."""
 
 
-class Clock(NamedTuple):
-    """Times of a file: first, last, median step, longest step, and where that begins; in the file's unit."""
-
-    first: float
-    last: float
-    step: float
-    gap: float
-    gap_at: float
-
-
-class Column(NamedTuple):
-    """A column: its name, and its least and greatest value."""
-
-    name: str
-    low: float
-    high: float
-
-
 class CsvDescription(NamedTuple):
     """A file and its companions.
 
     Attributes:
-        rows: number of lines with values. clock: of its time column, None without one.
-        columns: all, but numbered ones are joined: `r0 .. r179`. parts: what was found for each setting.
+        rows: number of lines with values. time: [N] s, finite; None without a column of times.
+        columns: name, least and greatest value of all, but numbered ones are joined: `r0 .. r179`.
+        parts: what was found for each setting.
         table: the settings that read it, {} if it has no time or no odometry.
         max_range: of the views, m; NaN without ranges. missing: what it lacks, in words.
     """
 
     path: Path
     rows: int
-    clock: Clock | None
-    columns: tuple[Column, ...]
+    time: np.ndarray | None
+    columns: tuple[tuple[str, float, float], ...]
     parts: dict[str, str]
     table: dict[str, Any]
     max_range: float
@@ -87,10 +70,10 @@ def describe_csv(path: Path) -> CsvDescription:
         InputError: it is not a CSV file of numbers.
     """
     file = read_csv(path)
-    time = time_column(file)
+    time = _named(file, TIMES)
     parts, table, missing = dict[str, str](), dict[str, Any](), list[str]()
     if time is None or not np.isfinite(file.column(time)).any():
-        faults = file.faults(time) if time is not None else []
+        faults = file.judge([time])[1] if time is not None else []
         missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
         return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
@@ -113,7 +96,11 @@ def describe_csv(path: Path) -> CsvDescription:
             table |= views
             parts["views"] = _words({"views": views["views"]})
             max_range = ranges
-        given = {"truth": _truth(file, other), "labels": _labels(file, other), "pairs": _pairs(file, other)}
+        given = {"truth": _truth(file, other)}
+        if label := _named(other, LABELS):
+            given["labels"] = _file(file, other) | {"column": label}
+        if other is not file and {"t1", "t2", "score"} <= set(other.names):
+            given["pairs"] = {"file": str(other.path)}
         for name, part in given.items():
             if part is not None and name not in table:
                 table[name] = part
@@ -129,22 +116,10 @@ def describe_csv(path: Path) -> CsvDescription:
         table["rate"] = float(f"{rate:.6g}")
         parts["rate"] = f"rounded times: rows share each, so they are counted instead, {rate:.6g} a second"
         moments = moments[0] + np.arange(len(moments)) / rate
-    clock = _clock(moments[np.isfinite(moments)])
+    moments, found = moments[np.isfinite(moments)], table if odometry else {}
     return CsvDescription(
-        path,
-        len(file.values),
-        clock,
-        _columns(file),
-        parts,
-        table if odometry else {},
-        max_range,
-        tuple(missing),
+        path, len(file.values), moments, _columns(file), parts, found, max_range, tuple(missing)
     )
-
-
-def time_column(file: CsvFile) -> str | None:
-    """The column of times, None if there is none."""
-    return _named(file, TIMES)
 
 
 def companions(file: CsvFile, time: str) -> list[CsvFile]:
@@ -160,7 +135,7 @@ def companions(file: CsvFile, time: str) -> list[CsvFile]:
             other = read_csv(path, file.clock)
         except InputError:
             continue
-        column = time_column(other) or (other.names[0] if "t2" in other.names else None)
+        column = _named(other, TIMES) or (other.names[0] if "t2" in other.names else None)
         times = other.column(column, "time") if column else np.zeros(0)
         times = times[np.isfinite(times)]
         if len(times) and times.min() <= last and times.max() >= first:
@@ -193,7 +168,7 @@ def _units(file: CsvFile, time: str, odometry: dict[str, Any]) -> dict[str, str]
     }
     units = {}
     for kind, names in columns.items():
-        stated = {file.header.units[file.at(name)].removesuffix("/s") for name in names}
+        stated = {file.units[file.at(name)].removesuffix("/s") for name in names}
         unit = next(iter(stated)) if len(stated) == 1 else ""
         if kind == "time" and not unit and file.at(time) not in file.dates:
             first = float(np.nanmin(file.column(time)))
@@ -280,63 +255,38 @@ def _stems(file: CsvFile) -> Counter[str]:
     return Counter(name.rstrip("0123456789") for name in file.names if name[-1:] in set("0123456789"))
 
 
-def _labels(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
-    column = _named(other, LABELS)
-    return None if column is None else _file(file, other) | {"column": column}
-
-
-def _pairs(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
-    if other is file or not {"t1", "t2", "score"} <= set(other.names):
-        return None
-    return {"file": str(other.path)}
-
-
 def _file(file: CsvFile, other: CsvFile) -> dict[str, Any]:
     """The settings that name another file and its times."""
     if other is file:
         return {}
-    time = time_column(other) or ""
+    time = _named(other, TIMES) or ""
     return {"file": str(other.path)} | ({"time": time} if time != "t" else {})
 
 
-def _columns(file: CsvFile) -> tuple[Column, ...]:
-    found, joined, stems = list[Column](), set[str](), _stems(file)
+def _columns(file: CsvFile) -> tuple[tuple[str, float, float], ...]:
+    found, stems = dict[str, np.ndarray](), _stems(file)
     for place, name in enumerate(file.names):
         prefix = name.rstrip("0123456789")
-        values = file.values[:, place]
-        if prefix in joined and prefix != name:
-            continue
         if prefix != name and stems[prefix] >= FEWEST_PIXELS:
-            joined.add(prefix)
             numbers = list(file.numbered(prefix))
-            name, values = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}", file.block(prefix)[0]
-        known = values[np.isfinite(values)]
-        found.append(
-            Column(name, *((float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)))
-        )
-    return tuple(found)
-
-
-def _clock(time: np.ndarray) -> Clock:
-    steps = np.diff(time)
-    if not len(steps):
-        return Clock(float(time[0]), float(time[0]), 0.0, 0.0, float(time[0]))
-    longest = int(np.argmax(steps))
-    return Clock(
-        float(time[0]), float(time[-1]), float(np.median(steps)), float(steps[longest]), float(time[longest])
-    )
+            joined = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}"
+            if joined not in found:
+                found[joined] = file.block(prefix)[0]
+        else:
+            found[name] = file.values[:, place]
+    known = {name: values[np.isfinite(values)] for name, values in found.items()}
+    nothing = np.array([np.nan])
+    known = {name: values if len(values) else nothing for name, values in known.items()}
+    return tuple((name, float(values.min()), float(values.max())) for name, values in known.items())
 
 
 def _words(settings: dict[str, Any]) -> str:
     """Settings in one line: `pose: x, y, heading`."""
-    named = ("prefix", "max_range")
     lines = []
     for name, part in settings.items():
-        words = []
-        for key, value in part.items():
-            word = Path(value).name if key == "file" else str(value)
-            words.append(f"{key} {word}" if key in named else word)
-        lines.append(f"{name}: {', '.join(words)}")
+        words = {key: Path(value).name if key == "file" else str(value) for key, value in part.items()}
+        words |= {key: f"{key} {words[key]}" for key in ("prefix", "max_range") if key in words}
+        lines.append(f"{name}: {', '.join(words.values())}")
     return "; ".join(lines)
 
 

@@ -7,17 +7,16 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from robot.recordings.csv_units import PER_UNIT, is_unit, per_unit, plain_unit, split_unit
+from robot.recordings.csv_units import PER_UNIT, per_unit, split_unit
 from robot.recordings.sanity_checks import count_others
-from robot.sources.input_files import digest_of, missing_error, read_bytes, require_file
+from robot.recordings.stretch import utc_seconds
+from robot.sources.input_files import missing_error, read_bytes, require_file
 from tactile.base.errors import InputError
 
 MAX_BYTES, MAX_LINES, MAX_COLUMNS, MAX_CELLS = 1 << 28, 1 << 22, 1 << 12, 1 << 25
@@ -27,27 +26,6 @@ EMPTY, WORD, CUT = 1, 2, 3
 """Why a cell has no number: nothing in it, text in it, or its row has another number of cells."""
 COMMENT = "#%"  # a line that begins so is a comment, or the header
 QUATERNION_TOLERANCE = 0.05  # of the length 1; three decimals leave 0.002
-DATE = re.compile(
-    r"\s*(\d{4})[-/](\d\d?)[-/](\d\d?)[T ]+(\d\d?):(\d\d):(\d\d)(?:[.,](\d*))?"
-    r"\s*(?:Z|UTC|([+-]\d\d):?(\d\d)?)?\s*",
-    re.IGNORECASE,
-)
-
-
-class Header(NamedTuple):
-    """The header row.
-
-    Attributes:
-        line: its number, from 1. separator: of cells; a space stands for any white space.
-        full: names of the C columns as written. names: without their units where that is unambiguous.
-        units: of the columns, '' where the header states none.
-    """
-
-    line: int
-    separator: str
-    full: tuple[str, ...]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +33,20 @@ class CsvFile:
     """The numbers of one file.
 
     Attributes:
+        line: number of the header, from 1. separator: of cells; a space stands for any white space.
+        full: names of the C columns as written. names: without their units where that is unambiguous.
+        units: of the columns, '' where the header states none.
         values: [N, C]; NaN where there is no number. fault: [N, C] uint8, why: `EMPTY`, `WORD`, `CUT` or 0.
         dates: columns of dates, which are s since 1970 (UTC). lines: [N] line numbers, from 1.
         content: the file's bytes. clock: unit of times whose header states none.
     """
 
     path: Path
-    header: Header
+    line: int
+    separator: str
+    full: tuple[str, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
     values: np.ndarray
     fault: np.ndarray
     dates: frozenset[int]
@@ -70,13 +55,9 @@ class CsvFile:
     clock: str | None = None
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.header.names
-
-    @property
     def top(self) -> str:
         """The place of the header."""
-        return f"{self.path}:{self.header.line}"
+        return f"{self.path}:{self.line}"
 
     def place(self, row: int) -> str:
         return f"{self.path}:{self.lines[row]}"
@@ -88,8 +69,7 @@ class CsvFile:
     @cached_property
     def _places(self) -> dict[str, int]:
         """The first position of each name, in full or without its unit."""
-        named = (*enumerate(self.header.full), *enumerate(self.names))
-        return {name: place for place, name in reversed(named)}
+        return {name: place for place, name in reversed([*enumerate(self.full), *enumerate(self.names)])}
 
     def column(self, name: str, quantity: str = "", unit: str | None = None) -> np.ndarray:
         """[N] the named column, which must exist; in s, m and rad if its quantity is given.
@@ -101,18 +81,18 @@ class CsvFile:
             InputError: the header states no unit of this quantity.
         """
         place = self.at(name)
-        values, found = self.values[:, place], unit or self.header.units[place]
+        values, found = self.values[:, place], unit or self.units[place]
         if quantity == "time" and place in self.dates:
             return values
         if not found and quantity == "time":
             found = self.clock or ""
         factor = per_unit(found, quantity) if found and quantity else 1.0
         if factor is None:
-            if name == self.header.full[place] and name[-1] not in ")]":
+            if name == self.full[place] and name[-1] not in ")]":
                 return values  # the end of a name that the user gave in full
             kind = quantity.split("/")[0]
             cure = f"correct the header, or set recording.table.units.{kind}"
-            said = f"{self.header.full[place]!r} states the unit {found!r}"
+            said = f"{self.full[place]!r} states the unit {found!r}"
             raise InputError(self.top, said, f"a unit of {quantity} ({', '.join(PER_UNIT[kind])})", cure)
         return values if factor == 1 else values / factor
 
@@ -144,17 +124,13 @@ class CsvFile:
             errors.append(InputError(self.place(row), found, "a quaternion of length 1", drop))
         return bad | crooked, errors
 
-    def faults(self, *names: str) -> list[InputError]:
-        """An error for each kind of fault of the named columns: a cut row, text, nothing, NaN or infinite."""
-        return self.judge(names)[1]
-
     def _fault(self, row: int, place: int) -> tuple[str, str, str]:
         """What is wrong with a cell, what is expected, and the cure."""
-        cells = _split(_lines_of(self.content, self.path)[self.lines[row] - 1], self.header.separator)
+        cells = _split(_lines_of(self.content, self.path)[self.lines[row] - 1], self.separator)
         name, fault, drop = self.names[place], int(self.fault[row, place]), "correct or drop the row"
         if fault == CUT:
             few = len(cells) < len(self.names)
-            cure = "the row may be cut off" if few else f"quote text that holds {self.header.separator!r}"
+            cure = "the row may be cut off" if few else f"quote text that holds {self.separator!r}"
             return f"{len(cells)} cells", f"{len(self.names)}, as in the header", cure
         if fault == WORD:
             comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", cells[place])
@@ -171,12 +147,12 @@ class CsvFile:
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
         """Errors for (column, configuration key) pairs whose column is missing, or there more than once."""
         errors = [
-            missing_error(self.top, "column", name, self.header.full, key)
+            missing_error(self.top, "column", name, self.full, key)
             for name, key in wanted
             if name not in self._places
         ]
         for name in dict.fromkeys(name for name, _ in wanted):
-            if max(self.names.count(name), self.header.full.count(name)) > 1:
+            if max(self.names.count(name), self.full.count(name)) > 1:
                 errors.append(InputError(self.top, f"several columns are called {name!r}", "every name once"))
         return errors
 
@@ -193,7 +169,7 @@ class CsvFile:
         """The numbered columns in order: values [N, B], in m if they have a unit; fault [N, B]."""
         places = list(self.numbered(prefix).values())
         values = self.values[:, places]
-        unit = unit or (self.header.units[places[0]] if places else "")
+        unit = unit or (self.units[places[0]] if places else "")
         factor = per_unit(unit, "length") or 1.0
         return values if factor == 1 else values / factor, self.fault[:, places]
 
@@ -213,25 +189,26 @@ def read_csv(path: Path, clock: str | None = None) -> CsvFile:
     _limit(str(path), path.stat().st_size, MAX_BYTES, "bytes")
     content = read_bytes(path)
     lines = _lines_of(content, path)
-    header = _header(path, lines)
-    rows = [number for number in range(header.line, len(lines)) if not _is_skipped(lines[number])]
+    line, separator, full = _header(path, lines)
+    rows = [number for number in range(line, len(lines)) if not _is_skipped(lines[number])]
     if not rows:
         raise InputError(str(path), "has no rows under its header", "at least one row")
-    _limit(str(path), len(rows) * len(header.full), MAX_CELLS, "cells (rows x columns)")
-    full = [lines[number] for number in rows]
-    fault, dates = np.zeros((len(full), len(header.full)), np.uint8), frozenset[int]()
+    _limit(str(path), len(rows) * len(full), MAX_CELLS, "cells (rows x columns)")
+    text = [lines[number] for number in rows]
+    fault, dates = np.zeros((len(text), len(full)), np.uint8), frozenset[int]()
     try:
-        values = np.loadtxt(full, delimiter=header.separator.strip(" ") or None, comments=None, ndmin=2)
+        values = np.loadtxt(text, delimiter=separator.strip(" ") or None, comments=None, ndmin=2)
     except ValueError:  # a cell is no number
         values = np.zeros(0)
     if values.shape != fault.shape:
-        values, dates = _cells(full, header, fault)
-    return CsvFile(path, header, values, fault, dates, np.array(rows) + 1, content, clock)
-
-
-def digest_of_files(files: Sequence[CsvFile]) -> str:
-    """SHA-256 (hex) of the contents of the files in order, each file once."""
-    return digest_of({file.path: file.content for file in files}.values())
+        values, dates = _cells(text, separator, fault)
+    bare, units = zip(*map(split_unit, full), strict=True)
+    count = Counter(bare) + Counter(full)
+    names = (
+        short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
+    )
+    return CsvFile(path, line, separator, full, tuple(names), units, values, fault, dates,
+                   np.array(rows) + 1, content, clock)  # fmt: skip
 
 
 def _limit(where: str, count: int, most: int, what: str) -> None:
@@ -245,9 +222,8 @@ def _lines_of(content: bytes, path: Path) -> list[str]:
     try:
         text = content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            str(path), f"is not text (byte {error.start})", "a CSV file in UTF-8", "save it as CSV in UTF-8"
-        ) from error
+        found = f"is not text (byte {error.start})"
+        raise InputError(str(path), found, "a CSV file in UTF-8", "save it as CSV in UTF-8") from error
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     _limit(str(path), text.count("\n"), MAX_LINES, "lines")
@@ -263,17 +239,16 @@ def _is_skipped(line: str) -> bool:
     return not begin or begin in COMMENT
 
 
-def _header(path: Path, lines: list[str]) -> Header:
-    """The header: the first line that is no comment, or the comment above the numbers that names as many."""
-    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 9))
-    while len(rows) > 1 and _width(lines[rows[0]]) == 1 < _width(lines[rows[1]]):
-        del rows[0]  # a title
-    number, row = rows[0] if rows else len(lines) - 1, lines[rows[1]] if len(rows) > 1 else ""
-    above = [comment for comment in range(number) if lines[comment].strip()]
+def _header(path: Path, lines: list[str]) -> tuple[int, str, tuple[str, ...]]:
+    """Number of the header line, from 1, separator and names: the first line that is no comment, or the
+    comment above the numbers that names as many."""
+    rows = list(islice((number for number, line in enumerate(lines) if not _is_skipped(line)), 2))
+    number, below = rows[0] if rows else len(lines) - 1, lines[rows[1]] if len(rows) > 1 else ""
     if not rows or any(map(_is_number, _names(lines[number], lines[number])[1])):
-        row = lines[number] if rows else ""
-        number = next((k for k in reversed(above) if not rows or _name_columns(lines[k], row)), number)
-    where, (mark, full) = f"{path}:{number + 1}", _names(lines[number], row)
+        below = lines[number] if rows else ""
+        above = [k for k in reversed(range(number)) if lines[k].strip()]
+        number = next((k for k in above if not rows or _name_columns(lines[k], below)), number)
+    where, (separator, full) = f"{path}:{number + 1}", _names(lines[number], below)
     _limit(where, len(full), MAX_COLUMNS, "columns")
     if any(map(_is_number, full)):
         found = f"the first line is {lines[number][:60]!r}"
@@ -282,20 +257,7 @@ def _header(path: Path, lines: list[str]) -> Header:
     if strange is not None:
         found = f"the header names a column {strange[:40]!r}, {len(strange)} characters"
         raise InputError(where, found, f"text without control characters, at most {MAX_NAME} a name")
-    units = [plain_unit(cell.strip(" []()")) for cell in _split(row, mark)]
-    if any(units) and all(map(is_unit, filter(None, units))) and len(units) == len(full):
-        number = lines.index(row, number + 1)  # a second row of the header states the units
-        full = [f"{name} [{unit}]" for name, unit in zip(full, units, strict=True)]
-    bare, units = (list(parts) for parts in zip(*map(split_unit, full), strict=True))
-    count = Counter(bare) + Counter(full)
-    names = [
-        short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
-    ]
-    return Header(number + 1, mark, tuple(full), tuple(names), tuple(units))
-
-
-def _width(line: str) -> int:
-    return len(_names(line, line)[1]) if any(mark in line for mark in ",;\t") else 1
+    return number + 1, separator, tuple(full)
 
 
 def _names(line: str, row: str) -> tuple[str, list[str]]:
@@ -324,12 +286,11 @@ def _split(line: str, separator: str) -> list[str]:
     return line.split(separator)
 
 
-def _cells(full: list[str], header: Header, fault: np.ndarray) -> tuple[np.ndarray, frozenset[int]]:
+def _cells(text: list[str], separator: str, fault: np.ndarray) -> tuple[np.ndarray, frozenset[int]]:
     """[N, C] values, parsed cell by cell, and the columns of dates; writes into `fault`, as in `CsvFile`."""
-    width, dates = len(header.full), set[int]()
-    values = np.full(fault.shape, np.nan)
-    for row, line in enumerate(full):
-        cells = _split(line, header.separator)
+    width, dates, values = fault.shape[1], set[int](), np.full(fault.shape, np.nan)
+    for row, line in enumerate(text):
+        cells = _split(line, separator)
         while len(cells) > width and not cells[-1].strip():
             cells.pop()  # commas after the last cell
         if len(cells) != width:
@@ -339,8 +300,7 @@ def _cells(full: list[str], header: Header, fault: np.ndarray) -> tuple[np.ndarr
             try:
                 values[row, column] = float(cell)
             except ValueError:
-                seconds = _seconds(cell)
-                if seconds is None:
+                if (seconds := _seconds(cell)) is None:
                     fault[row, column] = WORD if cell.strip() else EMPTY
                 else:
                     values[row, column] = seconds
@@ -357,14 +317,8 @@ def _is_number(cell: str) -> bool:
 
 
 def _seconds(cell: str) -> float | None:
-    """s since 1970 (UTC) of a date with a time of day, without a zone that of UTC; None if it is none."""
-    found = DATE.fullmatch(cell)
-    if found is None:
-        return None
+    """s since 1970 (UTC) of a date with a time of day; None if it is none."""
     try:
-        year, month, day, hour, minute, second = map(int, found.groups()[:6])
-        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+        return utc_seconds(cell.strip().replace("/", "-").removesuffix("UTC")) if ":" in cell else None
     except ValueError:
         return None
-    east = int(found[8] or 0) * 60 + int(f"{(found[8] or '+')[0]}{found[9] or 0}")
-    return whole - 60 * east + float(f"0.{found[7] or 0}")

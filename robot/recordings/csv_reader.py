@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,13 +16,21 @@ from robot.recordings.alignment import (
     range_errors,
     range_pixels,
 )
-from robot.recordings.csv_file import EMPTY, CsvFile, digest_of_files, read_csv
+from robot.recordings.csv_file import EMPTY, CsvFile, read_csv
 from robot.recordings.csv_units import split_unit
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
-from robot.recordings.sanity_checks import RowName, clock_errors, view_errors
+from robot.recordings.sanity_checks import (
+    SPOILT,
+    RowName,
+    clock_errors,
+    first_error,
+    leave_out,
+    still_axis,
+    view_errors,
+)
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import missing_error, raise_errors
+from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
 from robot.sources.registry import Warn
 from robot.sources.source_info import PlanarWhiskersInfo
@@ -30,19 +39,30 @@ from tactile.base.errors import InputError
 
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
-RATE = "set recording.table.rate={:.6g}, the rows per second"
+RATE = "--set recording.table.rate={:.6g}, the rows per second"
 HOLE = 3
 """Rows one after another that may be left out of velocities and motions; the next row stands for them."""
-MAX_PIXELS = 1 << 26
-"""Of all views of a recording."""
-Odometry = columns.PoseColumns | columns.VelocityColumns | columns.MotionColumns
-AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
-LEAVE_OUT = 0.05
-"""Share of the rows, but at least one row, that may be left out because a number is missing."""
 SHARED = 0.2
 """Share of the steps without time that makes times rounded."""
-UPRIGHT, LEVEL = 10.0, 0.2
-"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
+AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
+
+
+class Files(NamedTuple):
+    """The files of a recording.
+
+    Attributes:
+        base: that of the odometry, with the rows that are used. others: all by path. time: [N] s of the rows
+            of the odometry, also of those left out. warn: is told where rows of a file are left out.
+    """
+
+    base: CsvFile
+    others: Mapping[Path, CsvFile]
+    time: np.ndarray
+    warn: Warn
+
+    def of(self, file: Path | None) -> CsvFile:
+        """The file of a part of the table."""
+        return self.others[file or self.base.path]
 
 
 def read_csv_recording(
@@ -58,30 +78,37 @@ def read_csv_recording(
     """
     parts = (config.views, config.contacts, config.labels, config.pairs, config.truth)
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
-    files = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
-    raise_errors(_absences(files[path], files, config))
-    digest, limits, warn = digest_of_files(list(files.values())), judge.limits, judge.warn
+    found = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
+    raise_errors(_absences(found[path], found, config))
+    digest, limits, warn = digest_of(file.content for file in found.values()), judge.limits, judge.warn
     if judge.stretch != WHOLE:
-        files = _within(files, path, config, judge.stretch)
+        found = _within(found, path, config, judge.stretch)
 
-    whole, part = files[path], config.pose or config.velocity or config.motion
+    whole, part = found[path], config.pose or config.velocity or config.motion
     assert part is not None  # checked by `_absences`
     names = [name for name, _ in column_keys(part, "")]
     stamps = config.time if config.rate is None else ""
     turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, HOLE)
-    kept, errors = sound_rows(whole, names, "rows are", warn, stamps, turn or (), hole=hole)
-    base = files[path] = whole.rows(kept)
-    time, faults = _times(base, config, kept)
-    motion, poses, others = _motion(base, time, part, config.units, kept, limits)
-    size = len(time) * config.rows * config.columns
-    if size > MAX_PIXELS:
-        found = f"{len(time)} rows of {config.rows} x {config.columns} pixels"
-        raise InputError(str(path), found, f"at most {MAX_PIXELS}", "lower table.rows or table.columns")
-    recording = RecordingRows(time, motion, (config.rows, config.columns, 1), errors=errors + faults + others)
-    recording.held, recording.poses = isinstance(part, columns.VelocityColumns), poses
-    recording.place, recording.cures = base.place, _unit_cure
-    clock = _whole_clock(time, kept, len(whole.lines))  # what belongs to a row that is left out, is too
-    row_of = np.full(len(clock), -1)
+    kept, errors = sound_rows(whole, names, "rows", warn, stamps, turn or (), hole=hole)
+    base = found[path] = whole.rows(kept)
+    if config.rate is None:
+        time = base.column(config.time, "time", config.units.time)
+        errors += _clock_errors(base, config.time, time, RATE)
+    else:
+        there = config.time in (*base.names, *base.full)
+        start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
+        time = np.nan_to_num(start) + kept / config.rate
+    motion, poses, faults = _motion(base, time, kept, config, limits)
+    shape, place, held = (
+        (config.rows, config.columns, 1),
+        base.place,
+        isinstance(part, columns.VelocityColumns),
+    )
+    recording = RecordingRows(str(path), time, motion, shape, 0, errors + faults, held, poses, place)
+    recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
+    # What belongs to a row that is left out, is left out too.
+    files = Files(base, found, _whole_clock(time, kept, len(whole.lines)), warn)
+    row_of = np.full(len(files.time), -1)
     row_of[kept] = np.arange(len(kept))
 
     def placed(file: Path | None, aligned: AlignedRows) -> tuple[np.ndarray, np.ndarray]:
@@ -90,30 +117,27 @@ def read_csv_recording(
         recording.errors += faults
         if faults:
             return np.zeros(0, int), values[:0]
-        rows = rows if files[file or path] is base else row_of[rows]
+        rows = rows if files.of(file) is base else row_of[rows]
         return rows[rows >= 0], values[rows >= 0]
 
     if config.views is not None:
-        views = align_views(base, files, config.views, clock, recording.shape, warn)
-        rows, values = placed(config.views.file, views)
+        rows, values = placed(config.views.file, _views(files, config.views, recording.shape))
         recording.views[rows], recording.seen[rows] = values.reshape(-1, *recording.shape), True
-    if config.contacts is not None:
-        rows, values = placed(config.contacts.file, align_contacts(base, files, config.contacts, clock, warn))
-        recording.set_contacts(rows, values, sensors_of(config.contacts))
-    if labels := config.pairs or config.labels:
-        rows, values = placed(labels.file, align_labels(base, files, config.labels, config.pairs, clock))
-        recording.label[rows] = values
+    if (touch := config.contacts) is not None:
+        rows, values = placed(touch.file, _contacts(files, touch))
+        mounts = tuple((0.0, 0.0, direction) for direction in touch.directions.values())
+        recording.set_contacts(rows, values, PlanarWhiskersInfo(mounts=mounts, length=touch.distance))
+    if config.pairs is not None:
+        rows, recording.label[rows] = placed(config.pairs.file, _pairs(files, config.pairs))
+    elif config.labels is not None:
+        rows, recording.label[rows] = placed(config.labels.file, _labels(files, config.labels))
     if config.truth is not None:
-        same = files[config.truth.file or path] is base
-        file, clock = (base, time) if same else (files[config.truth.file or path], clock)
+        file = files.of(config.truth.file)
+        same, clock = file is base, time if file is base else files.time
         truth, faults = align_truth(file, config.truth, clock, limits, same, warn)
         recording.truth = truth if same else truth[kept]
         recording.errors += faults
-    return recording.source(path.stem, digest, str(path), judge)
-
-
-def _unit_cure(quantity: str, unit: str) -> str:
-    return f"set recording.table.units.{quantity} to {unit}"
+    return recording.source(path.stem, digest, judge)
 
 
 def _within(
@@ -136,16 +160,6 @@ def _within(
         times = np.column_stack([file.column(name, "time") for name in names])
         found[part.file] = file.rows(((first <= times) & (times <= last)).all(axis=1))
     return found
-
-
-def _times(base: CsvFile, config: columns.CsvConfig, kept: np.ndarray) -> tuple[np.ndarray, list[InputError]]:
-    """Times [N] s of the rows at positions [N], and their errors."""
-    if config.rate is not None:
-        there = config.time in (*base.names, *base.header.full)
-        time = base.column(config.time, "time", config.units.time) if there else np.zeros(1)
-        return np.nan_to_num(time[0]) + kept / config.rate, []
-    time = base.column(config.time, "time", config.units.time)
-    return time, _clock_errors(base, config.time, time, RATE)
 
 
 def _clock_errors(file: CsvFile, name: str, time: np.ndarray, cure: str) -> list[InputError]:
@@ -187,29 +201,20 @@ def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvC
         own_time = file is base and hasattr(part, "time")  # then that of the odometry is used
         errors += file.absences(column_keys(part, f"table.{key}")[own_time:])
         if isinstance(part, columns.ViewColumns):
-            errors += _gap_errors(file, part.prefix)
+            there = file.numbered(part.prefix)
+            wanted = range(min(there), max(there)) if there else [0]
+            absent = [f"{part.prefix}{number}" for number in wanted if number not in there]
+            errors += [missing_error(file.top, "column", name, file.names, "table.views.prefix")
+                       for name in absent[:1]]  # fmt: skip
     return errors
 
 
-def _gap_errors(file: CsvFile, prefix: str) -> list[InputError]:
-    """The error for view columns whose numbers have a gap."""
-    there = file.numbered(prefix)
-    wanted = range(min(there), max(there)) if there else [0]
-    absent = next((number for number in wanted if number not in there), None)
-    if absent is None:
-        return []
-    return [missing_error(file.top, "column", f"{prefix}{absent}", file.names, "table.views.prefix")]
-
-
 def _motion(
-    base: CsvFile,
-    time: np.ndarray,
-    part: Odometry,
-    units: columns.TableUnits,
-    kept: np.ndarray,
-    limits: UnitLimits,
+    base: CsvFile, time: np.ndarray, kept: np.ndarray, config: columns.CsvConfig, limits: UnitLimits
 ) -> tuple[np.ndarray, np.ndarray | None, list[InputError]]:
     """Motions [N, 4] of the rows at positions [N], poses [N, 3] where these are given, and errors."""
+    units, part = config.units, config.pose or config.velocity or config.motion
+    assert part is not None
     with np.errstate(all="ignore"):  # faulty values are already reported
         if isinstance(part, columns.PoseColumns):
             poses, errors = read_poses(base, part, units, time, limits, "table.pose")
@@ -242,20 +247,17 @@ def sound_rows(
         hole: how many rows one after another may be left out.
     """
     bad, errors = file.judge([*names, *([time] if time else [])], quaternion, far)
-    most = max(1, LEAVE_OUT * len(bad))
     if time:
         moments = file.column(time)
         latest = np.maximum.accumulate(np.where(bad, -np.inf, moments))
         late = ~bad & np.append(False, moments[1:] <= latest[:-1])
         set_back = (late[1:] & late[:-1]).any() and hole < np.inf  # without its rows their motion is lost
-        if late.any() and (bad | late).sum() <= most and not set_back:
+        if late.any() and (bad | late).sum() <= max(1, SPOILT * len(bad)) and not set_back:
             bad, errors = bad | late, errors + clock_errors(moments, time, file.place)
     kept = np.flatnonzero(~bad)
-    if bad.any() and (bad.sum() > most or bad.all() or np.diff(kept).max(initial=0) > hole + 1):
+    many = np.diff(kept).max(initial=0) > hole + 1
+    if bad.any() and (many or leave_out(int(bad.sum()), len(bad), what, errors[0], warn)):
         return np.arange(len(bad)), errors
-    if bad.any() and warn is not None:
-        said = f"{errors[0].where}: {errors[0].found}; expected {errors[0].expected}"
-        warn(f"{said}; {bad.sum()} of {len(bad)} {what} left out")
     return kept, []
 
 
@@ -275,18 +277,11 @@ def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
     return float((change[-1] - change[0]) / (time[change[-1]] - time[change[0]]))
 
 
-def align_views(
-    base: CsvFile,
-    files: Mapping[Path, CsvFile],
-    part: columns.ViewColumns,
-    time: np.ndarray,
-    shape: tuple[int, int, int],
-    warn: Warn = None,
-) -> AlignedRows:
+def _views(files: Files, part: columns.ViewColumns, shape: tuple[int, int, int]) -> AlignedRows:
     """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
-    file = files[part.file or base.path]
+    file = files.of(part.file)
     there = np.flatnonzero(~(file.block(part.prefix)[1] == EMPTY).all(axis=1))
-    beams = [file.header.full[place] for place in file.numbered(part.prefix).values()]
+    beams = [file.full[place] for place in file.numbered(part.prefix).values()]
     what, pixels, width = f"{part.prefix}*", int(np.prod(shape)), len(beams)
     if width % pixels or (part.max_range is None and width != pixels):
         expected = f"{pixels} (table.rows {shape[0]} x table.columns {shape[1]})"
@@ -294,8 +289,8 @@ def align_views(
         error = InputError(file.top, f"{width} columns {part.prefix}0, {part.prefix}1, ...", expected)
         return there, file.values, [error]
     seen = file.rows(there)
-    clock = "" if file is base else part.time
-    good, errors = sound_rows(seen, beams, "views are", warn, clock, far=part.max_range is not None)
+    clock = "" if file is files.base else part.time
+    good, errors = sound_rows(seen, beams, "views", files.warn, clock, far=part.max_range is not None)
     if errors:
         return there, file.values, errors
     there, seen = there[good], seen.rows(good)
@@ -308,74 +303,53 @@ def align_views(
         lowest, key = values.min(axis=1), "table.views.max_range"
         errors += range_errors(lowest, typical, part.max_range, what, seen.place, str(file.path), key)
         values = range_pixels(values, pixels, part.max_range)
-    rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
+    rows, faults = _match_rows(files, file, there, part)
     return rows, values.reshape(-1, *shape), errors + faults
 
 
-def align_contacts(
-    base: CsvFile,
-    files: Mapping[Path, CsvFile],
-    part: columns.ContactColumns,
-    time: np.ndarray,
-    warn: Warn = None,
-) -> AlignedRows:
+def _contacts(files: Files, part: columns.ContactColumns) -> AlignedRows:
     """Contacts [M, W] bool, in the order of the sensors in the settings."""
-    file, names = files[part.file or base.path], tuple(part.directions)
-    there, errors = sound_rows(file, names, "contacts are", warn)
+    file, names = files.of(part.file), tuple(part.directions)
+    there, errors = sound_rows(file, names, "contacts", files.warn)
     values = np.column_stack([file.column(name)[there] for name in names])
     bad = ~np.isin(values, (0, 1)) & np.isfinite(values)
     if bad.any():
         row, sensor = np.argwhere(bad)[0].tolist()
         found = f"{names[sensor]} is {values[row, sensor]:g}"
         errors.append(InputError(file.place(there[row]), found, "1 in contact, 0 without"))
-    rows, faults = _match_rows(file, base, there, part.time, part.tolerance, time)
+    rows, faults = _match_rows(files, file, there, part)
     return rows, values == 1, errors + faults
 
 
-def sensors_of(part: columns.ContactColumns) -> PlanarWhiskersInfo:
-    """The touch sensors as whiskers from the origin of base_link to what they touch."""
-    mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
-    return PlanarWhiskersInfo(mounts=mounts, length=part.distance)
-
-
-def align_labels(
-    base: CsvFile,
-    files: Mapping[Path, CsvFile],
-    labels: columns.LabelColumns | None,
-    pairs: columns.PairColumns | None,
-    time: np.ndarray,
-) -> AlignedRows:
-    """Place labels [M] int32, given or derived from pairs."""
-    if pairs is not None:
-        return _labels_of_file(base, files[pairs.file], pairs, time)
-    assert labels is not None
-    file = files[labels.file or base.path]
+def _labels(files: Files, labels: columns.LabelColumns) -> AlignedRows:
+    """Place labels [M] int32 as given."""
+    file = files.of(labels.file)
     ids, fault = file.column(labels.column), file.fault[:, file.at(labels.column)]
     there = np.flatnonzero((fault != EMPTY) & (ids != -1))
     ids = ids[there]
-    rows, errors = _match_rows(file, base, there, labels.time, labels.tolerance, time)
+    rows, errors = _match_rows(files, file, there, labels)
     bad = ~((ids >= 0) & (ids <= np.iinfo(np.int32).max) & (ids == np.round(ids)))
-    if bad.any():
-        row = int(bad.argmax())
-        found, expected = f"{labels.column} is {ids[row]}", "an integer from 0; -1 or an empty cell for none"
-        return rows, ids, [InputError(file.place(int(there[row])), found, expected), *errors]
-    return rows, ids.astype(np.int32), errors
+    found, place = (lambda row: f"{labels.column} is {ids[row]}"), file.rows(there).place
+    errors = first_error(bad, place, found, "an integer from 0; -1 or an empty cell for none") + errors
+    return rows, ids if errors else ids.astype(np.int32), errors
 
 
-def _labels_of_file(base: CsvFile, file: CsvFile, part: columns.PairColumns, time: np.ndarray) -> AlignedRows:
+def _pairs(files: Files, part: columns.PairColumns) -> AlignedRows:
+    """Place labels [V] int32 derived from pairs."""
+    file = files.of(part.file)
     later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
     score = file.column(part.score)
-    errors = file.faults(part.later, part.earlier, part.score)
+    errors = file.judge([part.later, part.earlier, part.score])[1]
     crossed = later <= earlier
-    if crossed.any():
-        row = int(crossed.argmax())
-        found = f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"
-        cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
-        errors.append(InputError(file.place(row), found, "the later time of a pair first", cure))
+    found = lambda row: f"{part.later} {later[row]} is not after {part.earlier} {earlier[row]}"  # noqa: E731
+    cure = "swap table.pairs.later and earlier" if crossed.mean() > 0.5 else ""
+    errors += first_error(crossed, file.place, found, "the later time of a pair first", cure)
     if errors:
         return later, later, errors
     moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = each_nearest(moments, time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}")
+    rows, errors = each_nearest(
+        moments, files.time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}"
+    )
     return rows, ids, errors
 
 
@@ -423,7 +397,7 @@ def align_truth(
     """
     names = [name for name, _ in column_keys(part, "")[same_rows:]]
     clock = "" if same_rows else part.time
-    good, errors = sound_rows(file, names, "true poses are", warn, clock, part.quaternion or ())
+    good, errors = sound_rows(file, names, "true poses", warn, clock, part.quaternion or ())
     unknown = np.full((len(time), 3), np.nan)
     if errors:
         return unknown, errors
@@ -465,13 +439,13 @@ def read_poses(
     errors = []
     if plane := other_plane(file, part.x, part.y):
         still, z = plane
-        lies = f"the path lies in {'x-z' if still == 'y' else 'y-z'}"
+        lies = f"the path lies in {'xy'.replace(still, '')}-z"
         said = f"{lies}: {getattr(part, still)} hardly changes, {z} does"
         errors = [InputError(file.top, said, "columns of that plane", f"name {z} as {key}.{still}")]
     if part.quaternion is not None:
         return np.column_stack([x, y, _headings(file, part, part.quaternion)]), errors
     heading = file.column(part.heading, "angle", units.angle)
-    cure = f"set recording.{'table' if key == 'table.pose' else key}.units.angle to deg"
+    cure = f"--set recording.{'table' if key == 'table.pose' else key}.units.angle=deg"
     if faults := heading_errors(heading, time, part.heading, str(file.path), limits, cure):
         errors += faults
         heading = np.deg2rad(heading)  # or every other check would report it again
@@ -497,24 +471,24 @@ def other_plane(file: CsvFile, x: str, y: str) -> tuple[str, str] | None:
     z = name[:-1] + {"y": "z", "Y": "Z"}.get(name[-1:], name[-1:])
     if z == name or z not in file.names:
         return None
-    values = file.values[:, [file.at(name) for name in (x, y, z)]]
-    values = values[np.isfinite(values).all(axis=1)]
-    span = np.ptp(values, axis=0) if len(values) else np.zeros(3)
-    if span[2] <= UPRIGHT * span[:2].min() or span[2] <= LEVEL * span[:2].max() or span[2] == 0:
-        return None
-    return ("x", "y")[int(span[:2].argmin())], z
+    still = still_axis(file.values[:, [file.at(name) for name in (x, y, z)]])
+    return (still, z) if still else None
 
 
 def _match_rows(
-    file: CsvFile, base: CsvFile, there: np.ndarray, name: str, tolerance: float | None, time: np.ndarray
+    files: Files,
+    file: CsvFile,
+    there: np.ndarray,
+    part: columns.ViewColumns | columns.ContactColumns | columns.LabelColumns,
 ) -> tuple[np.ndarray, list[InputError]]:
     """Odometry rows of the rows [M] of a file: the same, or the nearest in time."""
-    if file is base:
+    if file is files.base:
         return there, []
     file = file.rows(there)
-    moments = file.column(name, "time")
-    errors = file.faults(name) or _clock_errors(file, name, moments, "write them with more digits")
-    return (there, errors) if errors else each_nearest(moments, time, tolerance, file.place)
+    moments = file.column(part.time, "time")
+    errors = file.judge([part.time])[1]
+    errors = errors or _clock_errors(file, part.time, moments, "write them with more digits")
+    return (there, errors) if errors else each_nearest(moments, files.time, part.tolerance, file.place)
 
 
 def each_nearest(
@@ -530,16 +504,11 @@ def each_nearest(
     if found is None:
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
     rows, away, reach = found
-    errors = []
-    far = away > reach
-    if far.any():
-        i = int(far.argmax())
-        text = f"the nearest odometry row is {away[i]:.4g} s away (one of {int(far.sum())} such rows)"
-        cure = "raise tolerance, or bring both to one clock"
-        errors.append(InputError(place(i), text, f"at most {reach:.4g} s", cure))
-    twice = np.flatnonzero(np.diff(rows) == 0)
-    if len(twice) and not errors:
-        i = int(twice[0]) + 1
-        text = f"belongs to the same odometry row as the previous one (one of {len(twice)} such rows)"
-        errors.append(InputError(place(i), text, "one for each odometry row", "thin them out"))
+    far, cure = away > reach, "raise tolerance, or bring both to one clock"
+    one = f"(one of {int(far.sum())} such rows)"
+    found_far = lambda i: f"the nearest odometry row is {away[i]:.4g} s away {one}"  # noqa: E731
+    errors = first_error(far, place, found_far, f"at most {reach:.4g} s", cure)
+    twice = np.append(False, np.diff(rows) == 0)
+    text = f"belongs to the same odometry row as the previous one (one of {int(twice.sum())} such rows)"
+    errors = errors or first_error(twice, place, lambda _: text, "one for each odometry row", "thin them out")
     return rows, errors

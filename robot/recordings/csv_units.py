@@ -5,25 +5,25 @@ from __future__ import annotations
 import re
 from typing import Literal
 
-TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min", "h"]
-LengthUnit = Literal["m", "mm", "cm", "km", "in", "ft"]
-AngleUnit = Literal["rad", "deg", "mrad", "rev"]
+TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min"]
+LengthUnit = Literal["m", "mm", "cm", "km"]
+AngleUnit = Literal["rad", "deg"]
 PER_UNIT: dict[str, dict[str, float]] = {
-    "time": {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "ks": 1e-3, "min": 1 / 60, "h": 1 / 3600},
-    "length": {"m": 1, "mm": 1e3, "cm": 1e2, "km": 1e-3, "in": 1 / 0.0254, "ft": 1 / 0.3048},
-    "angle": {"rad": 1, "deg": 57.29577951308232, "mrad": 1e3, "rev": 0.15915494309189535},
+    "time": {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "ks": 1e-3},
+    "length": {"m": 1, "mm": 1e3, "cm": 1e2, "km": 1e-3},
+    "angle": {"rad": 1, "deg": 57.29577951308232},
 }
 """For each quantity, how many of a unit are one s, m or rad."""
-WORDS = """s sec secs second seconds,ms msec millis milliseconds,us usec micros microseconds,ns nsec nanosec
-    nanoseconds,min minutes,h hour hours,m meter meters metre metres,mm millimeters millimetres,cm centimeters
-    centimetres,in inch inches,ft feet,deg degs degree degrees,rad rads radian radians,m/s mps,deg/s dps,km/h
-    kmh kph,rev/min rpm"""
-ALIASES = {"-": "", "1": ""} | {
-    word: words.split()[0] for words in WORDS.split(",") for word in words.split()
+WORDS = {
+    **{"s": "seconds second secs sec", "ms": "milliseconds millis msec", "us": "microseconds micros usec"},
+    **{"ns": "nanoseconds nanosec nsec", "min": "minutes", "ks": "kiloseconds"},
+    **{"m": "metres meters metre meter", "mm": "millimetres millimeters", "cm": "centimetres centimeters"},
+    **{"km": "kilometres kilometers", "rad": "radians radian rads", "deg": "degrees degree degs"},
+    **{"m/s": "mps", "deg/s": "dps", "": "- 1"},
 }
+"""Other spellings of each unit, its name first."""
+ALIASES = {word: unit for unit, words in WORDS.items() for word in words.split()}
 BRACKETS = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
-VAGUE = ("in", "ft", "h", "min", "", "rev")
-"""Units that are no unit at the end of a name: `laser_min`."""
 
 
 def plain_unit(text: str) -> str:
@@ -44,14 +44,13 @@ def per_unit(unit: str, quantity: str) -> float | None:
     return factors[0] if len(factors) == 1 else factors[0] / factors[1]
 
 
-def is_unit(unit: str) -> bool:
-    """Whether it is a unit of anything."""
-    return any(per_unit(unit, name + rate) is not None for name in PER_UNIT for rate in ("", "/time"))
-
-
 def split_unit(name: str) -> tuple[str, str]:
     """The name of a column without its unit, and the unit, '' without one; `[...]` always holds a unit unless
     it is a number: `ranges[0]` is `ranges0`."""
+
+    def is_unit(unit: str) -> bool:
+        return any(per_unit(unit, kind + rate) is not None for kind in PER_UNIT for rate in ("", "/time"))
+
     if found := BRACKETS.fullmatch(name):
         before, square, round_ = found.groups()
         if square is not None and square.isdecimal():
@@ -61,6 +60,7 @@ def split_unit(name: str) -> tuple[str, str]:
             return split_unit(before)[0] if before.endswith("]") else before, unit
     words = name.split("_")
     for count in (3, 2, 1):
-        if len(words) > count and is_unit(unit := plain_unit("_".join(words[-count:]))) and unit not in VAGUE:
+        unit = plain_unit("_".join(words[-count:]))
+        if len(words) > count and is_unit(unit) and unit not in ("min", ""):  # `laser_min` has none
             return "_".join(words[:-count]), unit
     return name, ""

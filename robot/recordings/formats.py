@@ -21,7 +21,7 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 
 
-class RecordingConfig(StretchConfig):
+class RecordingConfig(StretchConfig):  # type: ignore[misc, valid-type]
     """A recording to run on."""
 
     file: Path

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from robot.recordings.csv_units import PER_UNIT
+from robot.recordings.csv_units import PER_UNIT, WORDS
 from robot.recordings.sanity_checks import RowName, count_others
 from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.odometry_correction import (
@@ -56,21 +56,11 @@ SHORTEST, HELD = 4e-4, 5.0
 """Shortest median interval of any odometry, s, and longest over which a velocity holds."""
 RETURNS, RETURNING = 0.25, 0.1
 """Share of a step within which the next one leads back, and share of the steps of two publishers that do."""
+ENOUGH, ALIKE = 20, (0.5, 0.9)
+"""Steps that tell the unit of headings; mean agreement with the motion in a wrong and a right unit."""
 COARSE = 0.1
 """Share of the typical step above which the spacing of numbers spoils it."""
 
-TIMES, LENGTHS, ANGLES = ("ms", "us", "ns", "min", "ks"), ("mm", "cm", "km"), ("deg",)
-"""Units that recordings are found in, besides s, m and rad."""
-UNIT_NAMES = {
-    **{
-        "ms": "milliseconds",
-        "us": "microseconds",
-        "ns": "nanoseconds",
-        "min": "minutes",
-        "ks": "kiloseconds",
-    },
-    **{"mm": "millimetres", "cm": "centimetres", "km": "kilometres", "deg": "degrees"},
-}
 USUAL = np.array([0.1, 0.4, 0.5])
 """Interval (s), speed (m/s) and turn rate (rad/s) of a usual robot, for the choice among units."""
 
@@ -171,6 +161,9 @@ class InputJudge:
                 return [InputError(place(finding.row or 0), *finding[2:])]
             if (found := unit_errors(track, where, self.limits, cures or unit_cure)) or not in_order:
                 return found
+            if track.poses is not None and _are_degrees(track.poses):
+                said = "headings agree with the direction of motion in degrees, and not in radians"
+                return [InputError(where, said, "headings in radians", (cures or unit_cure)("angle", "deg"))]
             errors = []
             for finding in judge_steps(track, self.limits, clock):
                 at = where if finding.row is None else place(finding.row)
@@ -218,7 +211,8 @@ def judge_steps(
     if len(rows) < 4:
         return
     steps = _Steps(track.time[rows], track.motion[rows])
-    gaps = steps.gaps(GAP if track.held else LONG_GAP)
+    intervals = GAP if track.held else LONG_GAP
+    gaps = steps.duration > max(intervals * steps.interval, LEAST_GAP)
     if gaps.any():
         yield _gap(steps, gaps, rows, track.held, clock)
     jumps = steps.jumps() & ~gaps
@@ -234,6 +228,7 @@ class _Steps:
     def __init__(self, time: np.ndarray, motion: np.ndarray) -> None:
         self.time = time
         self.length, self.turn = np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])
+        self.length[0] = self.turn[0] = 0.0  # before the first row nothing is known
         self.duration = np.concatenate([[0.0], np.diff(time)])
         ahead = self.duration[self.duration > 0]
         self.interval = float(np.median(ahead)) if len(ahead) else 0.0
@@ -242,17 +237,9 @@ class _Steps:
         self.typical_length = _typical(self.length / self._share, np.ones(len(time)))
         self.typical_turn = _typical(self.turn / self._share, np.ones(len(time)))
 
-    def gaps(self, intervals: float) -> np.ndarray:
-        """[N] bool, steps that took more than so many median intervals, and `LEAST_GAP`."""
-        return self.duration > max(intervals * self.interval, LEAST_GAP)
-
     def jumps(self) -> np.ndarray:
         """[N] bool, the few steps that are far longer, or turn far more, than all others."""
         return _outliers(self.length / self._share, 0.0) | _outliers(self.turn / self._share, LEAST_TURN)
-
-    def longest(self, without: np.ndarray) -> tuple[float, float]:
-        """The longest step, m, and the largest turn, rad, of the others."""
-        return float(self.length[~without].max(initial=0)), float(self.turn[~without].max(initial=0))
 
 
 def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
@@ -264,9 +251,7 @@ def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     for place in range(max(first, 1), len(ordered)):
         typical = ordered[np.searchsorted(done, done[place - 1] / 2)]
         if typical > 0 and ordered[place] > max(JUMP * typical, least):
-            found = np.zeros(len(amounts), bool)
-            found[order[place:]] = True
-            return found
+            return np.asarray(amounts >= ordered[place])
     return np.zeros(len(amounts), bool)
 
 
@@ -303,13 +288,13 @@ def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits
 def _largest(steps: _Steps, wrong: np.ndarray) -> str:
     """The setting that repeats the step before each of these steps [N] bool, and of no other."""
     words = []
-    for name, amounts, most in zip(
-        ("largest_step", "largest_turn"), (steps.length, steps.turn), steps.longest(wrong), strict=True
-    ):
+    for name, amounts in (("largest_step", steps.length), ("largest_turn", steps.turn)):
+        most = float(amounts[~wrong].max(initial=0))
         beyond = amounts[wrong & (amounts > 2 * most)]
         if len(beyond) and most > 0:
-            words.append(f"recording.odometry.{name} to {min(np.sqrt(most * beyond.min()), 5 * most):.2g}")
-    return f"set {' and '.join(words)}, which repeats the step before instead" if words else "drop these rows"
+            size = min(np.sqrt(most * beyond.min()), 5 * most)
+            words.append(f"--set recording.odometry.{name}={size:.2g}")
+    return f"{' '.join(words)} repeats the step before instead" if words else "drop these rows"
 
 
 def _two_publishers(poses: np.ndarray) -> Finding | None:
@@ -323,22 +308,34 @@ def _two_publishers(poses: np.ndarray) -> Finding | None:
     path, alone = float(once.sum()), float(np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum())
     found = f"{int(back.sum())} of {len(poses)} poses lead back to where the robot was before: the path is "
     found += f"{path:.4g} m, that of every second message {alone:.4g} m, so two nodes publish here"
-    cure = "set recording.topics.odometry.every to 2, or record each node under a topic of its own"
+    cure = "--set recording.topics.odometry.every=2, or record each node under a topic of its own"
     return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
+
+
+def _are_degrees(poses: np.ndarray) -> bool:
+    """Whether headings point along the motion, forwards or backwards, in degrees and not in radians."""
+    step = np.diff(poses[:, :2], axis=0)
+    length, heading = np.hypot(*step.T), poses[:-1, 2]
+    moved = length > np.median(length[length > 0]) / 2 if (length > 0).any() else length > 0
+    along = 2j * np.arctan2(step[moved, 1], step[moved, 0])
+    agree = [abs(np.exp(2j * angle[moved] - along).mean()) for angle in (heading, np.radians(heading))]
+    wide = np.ptp(heading) > 2 * np.pi
+    return bool(wide and moved.sum() > ENOUGH and agree[0] < ALIKE[0] and agree[1] > ALIKE[1])
 
 
 def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
     """Coordinates so far from the origin that numbers lie apart by much of a step."""
     places = poses[:, :2]
     single = places.astype(np.float32)
-    far = float(np.abs(places).max())
+    far = float(np.median(np.abs(places).max(axis=1)))
     spacing = float(np.spacing(np.float32(far)) if (single == places).all() else np.spacing(far))
     if not spacing > COARSE * steps.typical_length > 0:
         return None
     found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
-    cure = "record them in double precision, or set recording.topics.odometry.use to twist for velocities"
-    return Finding(False, int(np.abs(places).max(axis=1).argmax()), found, "", cure)
+    cure = "write them in double precision or from a near origin; of a bag, take velocities: "
+    cure += "--set recording.topics.odometry.use=twist"
+    return Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
 
 
 def typical_motion(track: MotionTrack) -> TypicalMotion:
@@ -363,7 +360,7 @@ def unit_cure(quantity: str, unit: str) -> str:
     per = PER_UNIT[quantity][unit]
     if quantity == "time":
         return f"divide the times by {per:g}" if per > 1 else f"multiply the times by {1 / per:g}"
-    return f"set recording.odometry.{'length' if quantity == 'length' else 'turn'}_scale to {1 / per:.6g}"
+    return f"--set recording.odometry.{'length' if quantity == 'length' else 'turn'}_scale={1 / per:.6g}"
 
 
 def unit_errors(
@@ -389,35 +386,36 @@ def _absurd(
     robot: TypicalMotion, held: bool, limits: UnitLimits, cures: Cures
 ) -> Iterator[tuple[str, str, str]]:
     """What no robot does: finding, expectation, cure; the cure names the units that explain all of it."""
-    if not _faults(robot, held, limits):
+    faults = _faults(robot, held, limits)
+    if not faults:
         return
-    units = _explanation(robot, held, limits)
     named = {"time": "times in seconds", "length": "odometry in metres", "angle": "odometry in radians"}
     limit = {"time": "interval", "length": "speed", "angle": "turn_rate"}
-    if units:
-        parts = [f"these are {UNIT_NAMES[unit]}: {cures(key, unit)}" for key, unit in units.items()]
+    if units := _explanation(robot, held, limits):
+        typical = (
+            f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
+        )
+        parts = [f"these are {WORDS[unit].split()[0]}: {cures(key, unit)}" for key, unit in units.items()]
         for key in units:
-            words = _faults(robot, held, limits).get(key) or _in_words(robot)
-            yield words, named[key], "; ".join([*parts, _else(limit[key], limits)])
+            yield faults.get(key, typical), named[key], "; ".join([*parts, _else(limit[key], limits)])
         return
-    for key, words in _faults(robot, held, limits).items():
+    for key, words in faults.items():
         yield words, named[key], f"no unit explains it; {_else(limit[key], limits)}"
 
 
 def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, str]:
     """By quantity (time, length, angle) what is absurd, in words."""
     found = {}
-    half = f"half of the steps take over {robot.interval:.4g} s"
     if robot.interval > (min(limits.interval, HELD) if held else limits.interval):
-        found["time"] = f"{half}{', and velocities do not hold so long' * held}"
+        held_words = ", and velocities do not hold so long" * held
+        found["time"] = f"half of the steps take over {robot.interval:.4g} s{held_words}"
     elif 0 < robot.interval < SHORTEST:
         found["time"] = f"half of the steps take less than {robot.interval:.2g} s"
     if robot.speed > limits.speed:
         found["length"] = f"half of the path is driven at over {robot.speed:.4g} m/s"
     if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
-        found["angle"] = (
-            f"half of the turning is done at over {robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
-        )
+        turning = f"{robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
+        found["angle"] = f"half of the turning is done at over {turning}"
     return found
 
 
@@ -425,44 +423,38 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
     """The fewest units, of time, length and angle, with which nothing is absurd; of as many, those that make
     the robot most like a usual one. {} if there are none."""
     best: tuple[float, dict[str, str]] = (np.inf, {})
-    for time, length, angle in product(
-        ("", *TIMES), ("", *(LENGTHS if robot.speed > 0 else ())), ("", *(ANGLES if robot.turn > 0 else ()))
-    ):
-        named = {"time": time, "length": length, "angle": angle}
-        seconds, metres, radians = (1 / PER_UNIT[key].get(unit, 1.0) for key, unit in named.items())
+    there = {"time": 1.0, "length": robot.speed, "angle": robot.turn}
+    for chosen in product(*(list(PER_UNIT[key])[: None if most > 0 else 1] for key, most in there.items())):
+        named = dict(zip(there, chosen, strict=True))
+        seconds, metres, radians = (1 / PER_UNIT[key][unit] for key, unit in named.items())
         rate = 1.0 if held else seconds  # velocities have their own unit of time
-        turn = robot.turn * radians * (seconds if held else 1.0)
         changed = robot._replace(
             interval=robot.interval * seconds,
             speed=robot.speed * metres / rate,
             turn_rate=robot.turn_rate * radians / rate,
-            turn=turn,
+            turn=robot.turn * radians * (seconds if held else 1.0),
         )
         if _faults(changed, held, limits):
             continue
         values = np.array([changed.interval, changed.speed, changed.turn_rate])
         unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
-        units = {key: unit for key, unit in named.items() if unit}
+        units = {key: unit for key, unit in named.items() if PER_UNIT[key][unit] != 1}
         best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
     return best[1]
 
 
-def _in_words(robot: TypicalMotion) -> str:
-    return f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
-
-
 def _unlike_truth(robot: TypicalMotion, limits: UnitLimits) -> Iterator[tuple[str, str, str]]:
     """Units of the truth, and of an odometry that disagrees with it."""
-    truth_rushes, fast = robot.true_speed > limits.speed, _else("speed", limits)
-    if truth_rushes:
+    millimetres = "divide by 1000 if it is millimetres"
+    if robot.true_speed > limits.speed:
         found = f"half of the truth's path is driven at over {robot.true_speed:.4g} m/s"
-        yield found, "truth in metres", f"{_MILLIMETRES}; {fast}"
-    if not truth_rushes and _differ_by_unit(*robot.path):
+        yield found, "truth in metres", f"{millimetres}; {_else('speed', limits)}"
+    elif _differ_by_unit(*robot.path):
         found = "the odometry covers {:.4g} m, the truth {:.4g} m".format(*robot.path)
-        yield found, "both in metres", _MILLIMETRES
+        yield found, "both in metres", millimetres
     if _differ_by_unit(*robot.turning):
         found = "the odometry turns by {:.4g} rad, the truth by {:.4g} rad".format(*robot.turning)
-        yield found, "both in radians", _DEGREES
+        yield found, "both in radians", "multiply by pi/180 if it is degrees"
 
 
 def heading_errors(
@@ -511,10 +503,13 @@ def _compare_with_truth(
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
     length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
     speed = _typical(length[dt > 0], dt[dt > 0])
-    path = _most_of(driven), _most_of(_ruler_steps(truth[:, :2]))
+    turns = np.cumsum(motion[:, 2])[rows], np.unwrap(truth[:, 2])
     ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
-    turned = np.abs(np.diff(np.cumsum(motion[:, 2])[rows][ends]))
-    return speed, path, (_most_of(turned), _most_of(np.abs(np.diff(np.unwrap(truth[:, 2])[ends]))))
+    turned = (np.abs(np.diff(angle[ends])) for angle in turns)
+    totals = [
+        float(np.sort(each)[:-GLITCHES].sum()) for each in (driven, _ruler_steps(truth[:, :2]), *turned)
+    ]
+    return speed, (totals[0], totals[1]), (totals[2], totals[3])
 
 
 def _ruler_steps(points: np.ndarray) -> np.ndarray:
@@ -527,10 +522,6 @@ def _ruler_steps(points: np.ndarray) -> np.ndarray:
     return np.array(steps)
 
 
-def _most_of(amounts: np.ndarray) -> float:
-    return float(np.sort(amounts)[:-GLITCHES].sum())
-
-
 def _differ_by_unit(a: float, b: float) -> bool:
     """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
     least, most = min(a, b), max(a, b)
@@ -538,8 +529,4 @@ def _differ_by_unit(a: float, b: float) -> bool:
 
 
 def _else(name: str, limits: UnitLimits) -> str:
-    return f"if it really is so, raise limits.{name} ({getattr(limits, name):g})"
-
-
-_DEGREES = "multiply by pi/180 if it is degrees"
-_MILLIMETRES = "divide by 1000 if it is millimetres"
+    return f"if it really is so, raise recording.limits.{name} ({getattr(limits, name):g})"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from array import array
 from collections.abc import Iterator
 from contextlib import closing
@@ -18,9 +17,9 @@ from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner, is_foreign
 from robot.recordings.mcap_writer import McapWriter
 from robot.recordings.recorder import Recorder
-from robot.recordings.sanity_checks import clock_errors, nonfinite_errors, view_errors
+from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.recordings.schemas import TRUTH
-from robot.sources.input_files import raise_errors, require_file, unreadable_error
+from robot.sources.input_files import digest_of_files, raise_errors, require_file
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
 from tactile.base.atomic_write import flush_to_disk
 from tactile.base.errors import InputError
@@ -54,7 +53,7 @@ class Recording(ClosedSource):
         require_file(path)
         self.path = path
         self.name = path.stem
-        self.digest = _digest(path)
+        self.digest = digest_of_files([path])
         scanner = McapScanner(path)
         columns = array("d")
         events: list[Event] = []
@@ -104,10 +103,8 @@ class Recording(ClosedSource):
         )
         errors += nonfinite_errors(odd, "a number in the reading", place)
         errors += nonfinite_errors(truth, "truth", place, has_truth > 0)
-        back = motion[:, 3] < 0
-        if back.any():
-            row = int(back.argmax())
-            errors.append(InputError(place(row), f"odometry has dt {motion[row, 3]} s", "at least 0 s"))
+        dt = motion[:, 3]
+        errors += first_error(dt < 0, place, lambda row: f"odometry has dt {dt[row]} s", "at least 0 s")
         track = MotionTrack(time, moved, motion, truth if has_truth.any() else None)
         raise_errors(errors + judge.errors(track, place, str(self.path), in_order=not errors))
         return time[moved]
@@ -213,11 +210,3 @@ def _checked_values(sample: Sample) -> tuple[float, ...]:
             low, high = reading.view.min(), reading.view.max()
     odd = next((float(part[~good].flat[0]) for part in parts if not (good := np.isfinite(part)).all()), 0.0)
     return (sample.time, *reading.odometry, *truth, low, high, odd, sample.truth is not None)
-
-
-def _digest(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise unreadable_error(path, error) from error

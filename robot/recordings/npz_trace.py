@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
-from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors, view_errors
+from robot.recordings.sanity_checks import RowName, clock_errors, first_error, nonfinite_errors, view_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
@@ -107,7 +107,11 @@ def _value_errors(
     given_ids: bool,
 ) -> list[InputError]:
     """Errors of single rows: flags, times, velocities, views or place ids, true poses."""
-    errors = _flag_errors(arrays["in_flags"], place) + nonfinite_errors(track.time, "in_t", place)
+    flags = arrays["in_flags"]
+    bad = ~np.isin(flags, (VIEW, ODOMETRY, VIEW | ODOMETRY))
+    wanted = "1 (view), 2 (odometry) or 3 (both)"
+    errors = first_error(bad, place, lambda row: f"in_flags is {flags[row]}", wanted)
+    errors += nonfinite_errors(track.time, "in_t", place)
     errors += clock_errors(track.time, "in_t", place, track.moved)
     for name in ("in_v", "in_w"):
         errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved, FASTEST)
@@ -210,25 +214,11 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
     return (rows, columns, 1), width != rows * columns
 
 
-def _flag_errors(flags: np.ndarray, place: RowName) -> list[InputError]:
-    bad = ~np.isin(flags, (VIEW, ODOMETRY, VIEW | ODOMETRY))
-    if not bad.any():
-        return []
-    row = int(bad.argmax())
-    return [InputError(place(row), f"in_flags is {flags[row]}", "1 (view), 2 (odometry) or 3 (both)")]
-
-
 def _id_errors(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
     """Errors of place labels, which are integers; relative angles of matches are not supported."""
     ids, relative = np.nan_to_num(view).T
-    errors = []
     bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
-    if bad.any():
-        row = int(bad.argmax())
-        errors.append(InputError(place(row), f"in_view's place id is {ids[row]}", "an integer from 0"))
-    turned = seen & (relative != 0)
-    if turned.any():
-        row = int(turned.argmax())
-        found, cure = f"in_view's relative angle is {relative[row]} rad", "relative angles are not supported"
-        errors.append(InputError(place(row), found, "0", cure))
-    return errors
+    errors = first_error(bad, place, lambda row: f"in_view's place id is {ids[row]}", "an integer from 0")
+    found = lambda row: f"in_view's relative angle is {relative[row]} rad"  # noqa: E731
+    turned, cure = seen & (relative != 0), "relative angles are not supported"
+    return errors + first_error(turned, place, found, "0", cure)

@@ -14,13 +14,51 @@ import numpy as np
 from tactile.base.errors import InputError
 
 RowName = Callable[[int], str]  # position of a row in the user's file, for errors
+SPOILT = 0.05
+"""Share of the rows or messages, but at least one, that may be left out; more are an error."""
+UPRIGHT, LEVEL = 10.0, 0.2
+"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
+
+
+def leave_out(
+    count: int, total: int, what: str, first: InputError, warn: Callable[[str], None] | None
+) -> list[InputError]:
+    """Leaves out `count` of `total` rows or messages: told as a warning, or an error if these are too many.
+
+    Args:
+        what: names them. first: why the first cannot be used.
+    """
+    if count > max(1, SPOILT * total) or count == total > 0:
+        found = f"{first.found} (so in {count} of {total} {what})" if count > 1 else first.found
+        return [InputError(first.where, found, first.expected, first.cure)]
+    if count and warn is not None:
+        expected = f"; expected {first.expected}" if first.expected else ""
+        warn(f"{first.where}: {first.found}{expected}; {count} of {total} {what} are left out")
+    return []
+
+
+def first_error(
+    bad: np.ndarray, place: RowName, found: Callable[[int], str], expected: str, cure: str = ""
+) -> list[InputError]:
+    """The error for the first of the rows that are bad, [N] bool; none without any."""
+    row = int(bad.argmax()) if bad.any() else None
+    return [] if row is None else [InputError(place(row), found(row), expected, cure)]
+
+
+def still_axis(points: np.ndarray) -> str:
+    """The axis, x or y, along which a path [N, 3] m hardly moves although it does along z; '' for none."""
+    points = points[np.isfinite(points).all(axis=1)]
+    x, y, z = np.ptp(points, axis=0) if len(points) else np.zeros(3)
+    if z <= max(UPRIGHT * min(x, y), LEVEL * max(x, y)):
+        return ""
+    return "x" if x < y else "y"
 
 
 def nonfinite_errors(
     values: np.ndarray, what: str, place: RowName, rows: np.ndarray | None = None, most: float = 1e20
 ) -> list[InputError]:
-    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or beyond `most`:
-    beyond all measure, so that sums and squares lose or overflow what they are added to."""
+    """Errors where values [N, ...] in the given rows [N] bool (default all) are NaN, infinite or over `most`,
+    so that sums and squares lose what they are added to."""
     flat = values.reshape(len(values), -1)
     bad = ~(np.abs(flat) <= most)
     hit = bad.any(axis=1) if rows is None else bad.any(axis=1) & rows
@@ -59,11 +97,11 @@ def view_errors(low: np.ndarray, high: np.ndarray, what: str, place: RowName) ->
     hit = (low < 0) | (high > 1)
     if not hit.any():
         return []
-    row = int(hit.argmax())
-    worst = float(high[row] if high[row] > 1 else low[row])
     most = 255 if np.nanmax(high) <= 255 else f"their largest possible value, at least {np.nanmax(high):g}"
     cure = "shift and scale them" if np.nanmin(low) < 0 else f"divide them by {most}"
-    return [InputError(place(row), f"{what} holds {worst!r}{count_others(hit)}", "view values in 0..1", cure)]
+    worst = np.where(high > 1, high, low)
+    found = lambda row: f"{what} holds {float(worst[row])!r}{count_others(hit)}"  # noqa: E731
+    return first_error(hit, place, found, "view values in 0..1", cure)
 
 
 def count_others(hit: np.ndarray) -> str:

@@ -12,10 +12,16 @@ from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
 
+def utc_seconds(text: str) -> float:
+    """s since 1970 (UTC) of an ISO time, without an offset that of UTC; raises `ValueError`."""
+    found = datetime.fromisoformat(text)
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
 def _check_time(value: float | str) -> float | str:
     if isinstance(value, str):
         try:
-            datetime.fromisoformat(value)
+            utc_seconds(value)
         except ValueError:
             raise ValueError(f"{value!r} is neither a number of seconds nor an ISO time") from None
     return value
@@ -23,16 +29,13 @@ def _check_time(value: float | str) -> float | str:
 
 Moment = Annotated[float | str, AfterValidator(_check_time)]
 """s from the start of the recording, or an ISO time such as 2024-05-01T10:00:00+02:00; UTC without offset."""
-_FIELDS = {
-    "from": "the recording is read from here on, as if it began here",
-    "to": "the recording is read to here",
-}
+_WORDS = {"from": "the recording is read from here on, as if it began here", "to": "it is read to here"}
 StretchConfig = create_model(
     "StretchConfig",
     __base__=Settings,
     **{
         name: (Moment | None, Field(default=None, description=f"{words}: s from its start, or an ISO time."))
-        for name, words in _FIELDS.items()
+        for name, words in _WORDS.items()
     },
 )  # type: ignore[call-overload]
 """The settings `from` and `to`; the first is a keyword of Python, which no class can name."""
@@ -46,8 +49,9 @@ class Stretch(NamedTuple):
 
     def inside(self, time: np.ndarray, start: float) -> np.ndarray:
         """[N] bool, the times [N] s within the stretch of a recording that starts at `start` s."""
-        first, last = (_in_seconds(each, start) for each in self)
-        return (time >= (-np.inf if first is None else first)) & (time <= (np.inf if last is None else last))
+        ends = (-np.inf if self.first is None else self.first, np.inf if self.last is None else self.last)
+        first, last = (utc_seconds(end) if isinstance(end, str) else start + end for end in ends)
+        return (time >= first) & (time <= last)
 
     def rows(self, time: np.ndarray, where: str) -> np.ndarray:
         """[N] bool, the times [N] s of a recording within the stretch.
@@ -70,10 +74,3 @@ class Stretch(NamedTuple):
 
 
 WHOLE = Stretch()
-
-
-def _in_seconds(moment: float | str | None, start: float) -> float | None:
-    if isinstance(moment, str):
-        found = datetime.fromisoformat(moment)
-        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
-    return None if moment is None else start + moment

@@ -57,6 +57,23 @@ def digest_of(contents: Iterable[bytes]) -> str:
     return total.hexdigest()
 
 
+def digest_of_files(paths: Iterable[Path], more: bytes = b"") -> str:
+    """SHA-256 (hex) of the contents of files, which may be larger than the memory, and of more.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    total = hashlib.sha256()
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                hashlib.file_digest(file, lambda: total)
+        except OSError as error:
+            raise unreadable_error(path, error) from error
+    total.update(more)
+    return total.hexdigest()
+
+
 def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: str = "") -> InputError:
     """The error for a name that a file lacks; it lists the existing names and suggests a similar one.
 

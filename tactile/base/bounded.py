@@ -114,18 +114,28 @@ class _Plain(yaml.SafeLoader):
 
 
 @contextmanager
-def malformed(path: str | Path, expected: str, cure: str = "") -> Iterator[None]:
-    """Turns whatever a parser raises for a file into an `InputError`."""
+def malformed(
+    path: str | Path,
+    expected: str,
+    cure: str = "",
+    found: str = "malformed ({})",
+    spoilt: tuple[type[Exception], ...] = SPOILT,
+) -> Iterator[None]:
+    """Turns whatever a parser raises for a file into an `InputError`.
+
+    Args:
+        found: what the file is if the parser raises one of `spoilt`; {} is the cause.
+    """
     try:
         yield
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected, cure) from None
+    except spoilt as error:
+        raise InputError(str(path), found.format(reason(error)), expected, cure) from None
     except OSError as error:
         raise InputError(str(path), f"cannot be read ({error.strerror or error})", expected, cure) from None
-    except SPOILT as error:
-        raise InputError(str(path), f"malformed ({reason(error)})", expected, cure) from None
 
 
 def reason(error: Exception) -> str:
@@ -134,6 +144,6 @@ def reason(error: Exception) -> str:
         first = error.errors(include_url=False, include_input=False)[0]
         return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     if isinstance(error, KeyError):
-        return f"no {error}"
+        return f"without {error}"
     lines = str(error).splitlines()
     return lines[0][:200] if lines else type(error).__name__

@@ -1,17 +1,17 @@
-"""Errors in user input: place, finding, expectation and cure."""
+"""What users are told: errors in their input, with place, finding, expectation and cure; and sentences."""
 
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 _CONTROL = re.compile(
     "([\0-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff])\\1*"
 )
-
-
-def _short(text: str, most: int = 600) -> str:
-    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
 class InputError(ValueError):
@@ -29,7 +29,8 @@ class InputError(ValueError):
         self.found = found
         self.expected = expected
         self.cure = cure
-        found = _short(found)
+        if len(found) > 600:
+            found = f"{found[:300]} ... {found[-300:]}"
         parts = [f"{where}: {found}" if where else found]
         if expected:
             parts.append(f"expected {expected}")
@@ -42,10 +43,24 @@ class InputError(ValueError):
         return type(self), (self.where, self.found, self.expected, self.cure)
 
 
+@contextmanager
+def os_errors_of(path: str | Path, found: str, expected: str, cure: str = "") -> Iterator[None]:
+    """Turns an `OSError` into an `InputError` of a path: `found`, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(path), f"{found} ({error.strerror or error})", expected, cure) from None
+
+
 def printable(text: str) -> str:
     """A text whose control characters, but line ends, are written out: those of a terminal, of directions of
     writing, and halves of pairs, as names and contents of files may have them."""
     return _CONTROL.sub(_written_out, text)
+
+
+def tell(sentence: str) -> None:
+    """Prints one sentence beside the results."""
+    print(f"ratslam: {printable(sentence)}", file=sys.stderr, flush=True)
 
 
 def _written_out(found: re.Match[str]) -> str:

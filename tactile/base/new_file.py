@@ -13,7 +13,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 from tactile.base.atomic_write import errors_of, temporary_path
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 
 CURE = "choose another with -o"
 _BEGINNING = 1 << 13  # bytes of a file by which it is known again
@@ -83,12 +83,9 @@ def require_writable(path: Path) -> None:
     if os.path.isdir(path):
         raise InputError(str(path), "a folder", "a file")
     temporary = temporary_path(path)
-    try:
+    with os_errors_of(path, "cannot be written", "a file in a folder that can be written", CURE):
         temporary.touch()
         temporary.unlink()
-    except OSError as error:
-        found = f"cannot be written ({error.strerror})"
-        raise InputError(str(path), found, "a file in a folder that can be written", CURE) from None
 
 
 def make_new_file(path: Path, write: Callable[[Path], Any]) -> None:

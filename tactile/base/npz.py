@@ -15,8 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from tactile.base import bounded
-from tactile.base.bounded import check_size, reason
-from tactile.base.errors import InputError
+from tactile.base.bounded import check_size, malformed
 
 T = TypeVar("T")
 
@@ -35,15 +34,9 @@ def read_npz(
     Raises:
         InputError: the file is missing, malformed or lacks an array, or `parse` failed.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return parse(*read_arrays(archive, [f"{name}.npy" for name in names], str(path)))
-    except FileNotFoundError:
-        raise InputError(str(path), "no such file", expected, cure) from None
-    except InputError:
-        raise
-    except SPOILT as error:
-        raise InputError(str(path), f"another kind of file ({reason(error)})", expected, cure) from None
+    found = "another kind of file ({})"
+    with malformed(path, expected, cure, found, SPOILT), zipfile.ZipFile(path) as archive:
+        return parse(*read_arrays(archive, [f"{name}.npy" for name in names], str(path)))
 
 
 def read_arrays(archive: zipfile.ZipFile, members: Sequence[str], where: str) -> list[np.ndarray]:

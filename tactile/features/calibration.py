@@ -15,12 +15,7 @@ from pydantic import Field, PositiveFloat
 from tactile.base.errors import InputError
 from tactile.base.samples import robust_sd
 from tactile.base.types import Cycle
-from tactile.features.free_record import (
-    DirtyRecordConfig,
-    DirtyWhisker,
-    dirty_error,
-    find_dirty_whiskers,
-)
+from tactile.features.free_record import DirtyRecordConfig, DirtyWhisker, dirty_error, find_dirty_whiskers
 from tactile.features.signal_noise import estimate_noise
 
 MIN_WINDOW_SAMPLES = 8

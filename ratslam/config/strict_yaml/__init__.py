@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import os
-import stat
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
@@ -46,12 +45,8 @@ def load(path: str | os.PathLike[str], assignments: Sequence[str] = ()) -> Docum
     name = os.fspath(path)
     refuse_other_files(Path(name))
     try:
-        if stat.S_ISFIFO(os.stat(name).st_mode):
-            raise InputError(name, "a pipe, which may have no end", "a file")
         with Path(name).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
-    except InputError:
-        raise
     except OSError as error:
         raise InputError(name, f"cannot be read: {error.strerror}") from None
     except ValueError as error:  # a NUL or a lone surrogate in the name

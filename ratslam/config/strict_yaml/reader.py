@@ -41,11 +41,7 @@ class Reader:
     """
 
     def __init__(
-        self,
-        text: str,
-        place: Callable[[int, int], str],
-        root: KeyPath = (),
-        replaced: Sequence[str] = (),
+        self, text: str, place: Callable[[int, int], str], root: KeyPath = (), replaced: Sequence[str] = ()
     ) -> None:
         self.places: dict[KeyPath, Place] = {}
         self._replaced = replaced

@@ -141,10 +141,7 @@ def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
 
 def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
     """Draws the errors of all sessions."""
-    dots = {
-        "within pieces": [one.within for one in found],
-        "over all pairs": [one.over_all for one in found],
-    }
+    dots = {"within pieces": [one.within for one in found], "over all pairs": [one.over_all for one in found]}
     panel = Panel("Energy Metric, m² + rad²", "pairs of steps", dots=dots, limits={"goal": ENERGY})
     share = spread([one.unjoined for one in found])
     line = f"One dot a session. Share of the steps outside the largest piece, median (worst): {share}."

@@ -121,11 +121,7 @@ def measure_halves(task: MapTask) -> HalvesFigures:
         off_nearby=float(exceeds(nearby, BUILDING)[at].mean()) if at.any() else 0.0,
         shuffled=shares(mixed.found, mixed.pose),
         reckoned=_share_off_by_odometry(recorded),
-        paths=(
-            steps.truth[:, :2],
-            truth[:, :2],
-            np.where(localised.found[:, None], said[:, :2], np.nan),
-        ),
+        paths=(steps.truth[:, :2], truth[:, :2], np.where(localised.found[:, None], said[:, :2], np.nan)),
         error=np.where(localised.found, error, np.nan),
     )
 

@@ -24,7 +24,7 @@ from ratslam.experiments.cells.study_course import CELLS, StudyCourse, read_cour
 from ratslam.experiments.studies.executor import Executor
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.config import Settings
-from tactile.base.errors import InputError
+from tactile.base.errors import os_errors_of
 from tactile.base.random_streams import stream
 
 FOLDER = "sets"
@@ -79,14 +79,7 @@ class CellPlan(Settings):
     """Floating-point type of the networks."""
 
 
-PARAMETERS = (
-    "excite_sigma",
-    "inhibit_sigma",
-    "global_inhibition",
-    "energy",
-    "speed_noise",
-    "heading_noise",
-)
+PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "speed_noise", "heading_noise")
 """Columns of parameter sets, and the ranges of a `CellPlan`."""
 
 
@@ -154,11 +147,8 @@ def run_cell_study(
         InputError: the folder cannot be written to, or the process of a chunk was killed.
     """
     files = {task.key: folder / FOLDER / f"{task.key}.npz" for task in tasks_of(study)}
-    try:
+    with os_errors_of(folder, "cannot be made", "a folder to write to"):
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        found = f"cannot be made ({error.strerror})"
-        raise InputError(str(folder), found, "a folder to write to") from None
     missing = []
     for task, path in zip(tasks_of(study), files.values(), strict=True):
         if path.exists():

@@ -202,7 +202,7 @@ NOTES = [
     "chance is 0.5. Pairs are of a held-out image and one that was learned from. Touches of a run follow "
     "each other, so that pairs within a run would be too easy. The first run differs most from the others. "
     "An image of the taxels is the mean of a contact. These contacts showed that many pairs of few images "
-    "must not count as independent: the model holds for another sensor, but they are no longer unseen.",
+    "must not count as independent: the model holds for another sensor, but they are no longer unseen."
 ]
 
 

@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent import futures
@@ -20,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from robot.drivers.withheld_signals import withheld_signals
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, tell
 
 ANSWER_TIME = 10  # time that a scheduler has for its first answer, s
 ENVIRONMENT = (
@@ -127,7 +126,7 @@ class Executor(ExitStack):
         except ImportError:
             cure = "pip install 'ratslam[sweep]'"
             if self._scheduler is None and not self._workers:
-                print(f"ratslam: one process, for lack of Dask ({cure})", file=sys.stderr)
+                tell(f"one process, for lack of Dask ({cure})")
                 return False
             option = "--workers" if self._scheduler is None else "--scheduler"
             raise InputError(option, "Dask is not installed", "the extra 'sweep'", cure) from None
@@ -166,7 +165,7 @@ class Executor(ExitStack):
             found = f"no scheduler answers at {address!r} ({type(error).__name__})"
             raise InputError("--scheduler", found, "the address of one, such as tcp://HOST:8786") from None
         if not client.nthreads():
-            print(f"ratslam: waiting for workers to join {address} ...", file=sys.stderr)
+            tell(f"waiting for workers to join {address} ...")
         return client
 
     def _answers(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Any]:

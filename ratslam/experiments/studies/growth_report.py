@@ -25,7 +25,7 @@ from ratslam.experiments.studies.report import (
 )
 from ratslam.experiments.studies.study_runner import KILLED
 from tactile.base.atomic_write import write_atomically, write_text_atomically
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,12 +53,9 @@ def run_growth(study: GrowthStudy, folder: Path) -> None:
     Raises:
         InputError: the folder cannot be made, a session cannot be simulated, or its process was killed.
     """
-    try:
+    with os_errors_of(folder, "cannot be written to", "a folder to write to"):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / FILE).write_bytes(b"")
-    except OSError as error:
-        found = f"cannot be written to ({error.strerror})"
-        raise InputError(str(folder), found, "a folder to write to") from None
     with Executor(fresh=True) as executor:
         for _ in executor.completed(partial(_append_rows, folder / FILE), study.tasks, _killed):
             pass

@@ -12,7 +12,7 @@ from evaluation.metrics.metric import Quantity
 from ratslam.experiments.studies.machine import Machine
 from ratslam.experiments.studies.study import Job, run_key
 from tactile.base.config import Settings
-from tactile.base.errors import InputError
+from tactile.base.errors import os_errors_of
 
 FILE = "runs.jsonl"  # name of the file of records in a study's directory
 
@@ -60,11 +60,8 @@ class RunLog:
     """
 
     def __init__(self, directory: Path) -> None:
-        try:
+        with os_errors_of(directory, "cannot be made", "a folder to write to"):
             directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            found = f"cannot be made ({error.strerror})"
-            raise InputError(str(directory), found, "a folder to write to") from None
         self.path = directory / FILE
         self.records: dict[str, RunRecord] = {}
         for line in self.path.read_bytes().splitlines() if self.path.exists() else []:

@@ -123,10 +123,7 @@ class HeadDriver:
         reader.listeners.append(self._on_frames)
 
     def whisk(
-        self,
-        whisking: WhiskingConfig,
-        threshold: np.ndarray | None = None,
-        centre: np.ndarray | None = None,
+        self, whisking: WhiskingConfig, threshold: np.ndarray | None = None, centre: np.ndarray | None = None
     ) -> None:
         """Starts whisking with the next cycle; without a threshold (before calibration) there is no feedback.
 

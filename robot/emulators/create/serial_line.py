@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robot.drivers.create.protocol import BAUD
 from tactile.base.atomic_write import temporary_path
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 from tactile.base.random_streams import stream
 
 
@@ -79,11 +79,9 @@ class Terminal:
         self.plugged = True
         if self._link is not None:
             new = temporary_path(self._link)
-            try:
+            with os_errors_of(self._link, "cannot be made", "a link"):
                 new.symlink_to(self.path)
                 new.replace(self._link)
-            except OSError as error:
-                raise InputError(str(self._link), f"cannot be made ({error.strerror})", "a link") from None
             self.path = str(self._link)
 
     def has_create_baud_rate(self) -> bool:

@@ -9,10 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from robot.emulators.head.config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError
 
 
@@ -23,7 +22,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--config", type=Path, help="HeadEmulatorConfig as JSON (default values if omitted)")
     arguments = parser.parse_args(words)
     try:
-        config = _read(arguments.config)
+        config = HeadEmulatorConfig()
+        if arguments.config is not None:
+            config = read_json(arguments.config, "a HeadEmulatorConfig", HeadEmulatorConfig.model_validate)
         if arguments.host is not None:
             config = config.model_copy(update={"host": arguments.host})
         serve(config)
@@ -33,17 +34,6 @@ def main(words: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
-
-
-def _read(file: Path | None) -> HeadEmulatorConfig:
-    if file is None:
-        return HeadEmulatorConfig()
-    try:
-        return HeadEmulatorConfig.model_validate_json(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(str(file), str(error.strerror), "a readable file") from None
-    except ValidationError as error:
-        raise InputError(str(file), str(error), "a HeadEmulatorConfig") from None
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -16,8 +15,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from robot.recordings.bags.expansion import bound_expansion, expand_message
+from robot.recordings.sanity_checks import leave_out
 from robot.recordings.stretch import WHOLE, Stretch
-from robot.sources.input_files import missing_error, require_file, unreadable_error
+from robot.sources.input_files import missing_error, raise_errors, require_file, unreadable_error
 from tactile.base.errors import InputError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -33,8 +33,6 @@ CONVERT = (
 TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 """Types of /tf, of ROS 2 and 1 and of early ROS 1."""
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins with 00
-SPOILT = 0.05
-"""Share of a topic's messages that may be unusable, and at least one; more are an error."""
 
 
 class Topic(NamedTuple):
@@ -139,51 +137,31 @@ class Bag:
             raise InputError(f"{self.path}, {found.name}", "no messages", "at least one message")
         return found
 
-    def messages(self, topic: Topic) -> Iterator[tuple[int, Any]]:
-        """The messages of a topic in the order in which they were received: time of receipt in ns, content.
-
-        Raises:
-            InputError: the bag is damaged, or the topic's type is unknown or defined differently.
-        """
-        for _, time, content in self._decoded(topic):
-            if isinstance(content, InputError):
-                raise content
-            yield time, content
-
     def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
         """The messages of a topic that can be used: number, time of receipt in ns, content, and what `read`
         makes of the content and its place.
 
         Messages that cannot be decoded, or for which `read` raises `InputError`, are left out with a warning,
-        up to `SPOILT` of all.
+        if these are few (see `leave_out`).
 
         Raises:
-            InputError: as `messages`, or the first of the others, if they are more, or all.
+            InputError: the bag is damaged, the topic's type is unknown or defined differently, or more
+                messages cannot be used.
         """
-        where, good, spoilt = f"{self.path}, {topic.name}", 0, list[tuple[int, int, InputError]]()
-        few = max(1, SPOILT * topic.total)
+        good, spoilt, first = 0, 0, None
         for number, time, content in self._decoded(topic):
             try:
                 if isinstance(content, InputError):
                     raise content
-                value = read(content, f"{where}, message {number}")
+                value = read(content, f"{self.path}, {topic.name}, message {number}")
             except InputError as error:
-                spoilt.append((number, time, error))
-                if len(spoilt) > few:
-                    break
+                at, spoilt = f"{error.where}, at {time / 1e9:.3f} s", spoilt + 1
+                first = first or InputError(at, error.found, error.expected, error.cure)
             else:
                 good += 1
                 yield number, time, content, value
-        if not spoilt:
-            return
-        number, time, fault = spoilt[0]
-        if not good and len(spoilt) <= few:
-            raise fault
-        if len(spoilt) > few:
-            found = f"{fault.found} (so or alike in over {SPOILT:.0%} of its messages)"
-            raise InputError(fault.where, found, fault.expected, fault.cure)
-        count = f"{len(spoilt)} of {topic.total} messages cannot be used and are left out"
-        self.warn(f"{where}: {count}; the first is message {number}, at {time / 1e9:.3f} s: {fault.found}")
+        if first is not None:
+            raise_errors(leave_out(spoilt, good + spoilt, "messages", first, self.warn))
 
     def _decoded(self, topic: Topic) -> Iterator[tuple[int, int, Any]]:
         """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
@@ -245,15 +223,15 @@ class Bag:
         where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
             raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
-        coded = {getattr(each.ext, "serialization_format", "cdr") for reader in self._readers
-                 for each in reader.connections if each.topic == topic.name}  # fmt: skip
-        if coded - {"cdr"}:
+        connections = [
+            each for reader in self._readers for each in reader.connections if each.topic == topic.name
+        ]
+        coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
+        if coded:
             raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
-        if self._first:
-            digest = self._store.generate_msgdef(topic.kind)[1]
-            connections = (each for reader in self._readers for each in reader.connections)
-            if any(each.topic == topic.name and each.digest not in (digest, "*") for each in connections):
-                raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
+        known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
+        if self._first and any(each.digest not in known for each in connections):
+            raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
 
     def __enter__(self) -> Self:
         return self
@@ -339,25 +317,10 @@ def bag_files(path: Path) -> list[Path]:
     raise InputError(str(path), f"is a folder without {METADATA}", "a file or the folder of a bag", cure)
 
 
-def bag_digest(path: Path) -> str:
-    """SHA-256 (hex) of the files of a bag, one after the other."""
-    total = hashlib.sha256()
-    for part in bag_files(path):
-        try:
-            with part.open("rb") as file:
-                while content := file.read(1 << 20):
-                    total.update(content)
-        except OSError as error:
-            raise unreadable_error(part, error) from error
-    return total.hexdigest()
-
-
 def _plain(raw: Any) -> bytes:
     """A message, decompressed if its storage file is read without the folder that says so."""
     content = bytes(raw)
-    if content[:4] != ZSTD:
-        return content
-    return expand_message(content)
+    return expand_message(content) if content[:4] == ZSTD else content
 
 
 def _names_its_storage(metadata: Path) -> bool:

@@ -48,7 +48,7 @@ class PoseTopic(Topic):
     """Topic of Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped messages."""
     tf: Annotated[tuple[str, str] | None, FromList] = None
     """Or two frames of /tf and /tf_static: the pose of the second in the first, such as [map, base_link]."""
-    frames: Annotated[tuple[str, str] | None, FromList] = None
+    frames: Annotated[tuple[str, ...], FromList, Field(max_length=2)] = ()
     """Only messages with this frame and child frame, where several nodes publish on the topic."""
     plane: Literal["xy", "xz"] = "xy"
     """Plane of the motion: `xz` for poses of a camera (x to the right, y down, z ahead)."""

@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import SPOILT, Bag, Topic
-from robot.recordings.bags.images import COMPRESSED, IMAGES, RAW, grey_image
-from robot.recordings.bags.motions import POSES, TWISTS, twist_in_plane
+from robot.recordings.bags.bag import Bag, Topic
+from robot.recordings.bags.images import IMAGES, RAW, grey_image
+from robot.recordings.bags.motions import POSES, TWISTS, pose_in_plane, twist_in_plane
 from robot.recordings.bags.scans import (
     CLOUD,
     SCAN,
@@ -24,6 +24,7 @@ from robot.recordings.bags.stamps import leaps, nanoseconds
 from robot.recordings.bags.touch import ARRAYS, JOINTS
 from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
 from robot.recordings.input_judge import MotionTrack, typical_motion
+from robot.recordings.sanity_checks import SPOILT
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 
@@ -62,34 +63,24 @@ class ScanShape(NamedTuple):
     """LaserScan.
 
     Attributes:
-        beams: median number. fov: rad, counter-clockwise positive. ring: it covers the whole turn.
-        low, high: limits of the range, m. median: of the ranges within these, m, NaN if there are none.
-        nothing, unmeasured: shares of beams without an object in range, and without a measurement.
-        wider: directions of all messages together, if the first has fewer.
+        beams: median number. extent: directions of all messages together; wider: if the first has fewer.
+        high: limit of the range, m. median: of the ranges within the limits, m, NaN if there are none.
+        nothing: share of beams without an object in range.
     """
 
     beams: int
-    fov: float
-    ring: bool
-    low: float
+    extent: Extent
+    wider: bool
     high: float
     median: float
     nothing: float
-    unmeasured: float
-    wider: Extent | None = None
 
 
 class CloudShape(NamedTuple):
-    """PointCloud2.
-
-    Attributes:
-        points: of the first message. reach: median distance, m. low, high: of z in the sensor's frame, m.
-    """
+    """PointCloud2. Attributes: points: of the first message. reach: median distance, m."""
 
     points: int
     reach: float
-    low: float
-    high: float
 
 
 class ImageShape(NamedTuple):
@@ -109,11 +100,10 @@ class ValueShape(NamedTuple):
     """JointState, MultiArray.
 
     Attributes:
-        names: of joints. sizes: of the layout's dimensions, else the number of values. low, high: of all
-            values (positions of joints).
+        sizes: of the layout's dimensions, else the number of values. low, high: of all values (positions of
+            joints).
     """
 
-    names: tuple[str, ...]
     sizes: tuple[int, ...]
     low: float
     high: float
@@ -123,16 +113,14 @@ class MotionShape(NamedTuple):
     """Poses, velocities.
 
     Attributes:
-        pose_path, pose_speed, pose_turn_rate: length in m, typical speed in m/s and turn rate in rad/s, of
-            the poses. twist_path, twist_speed, twist_turn_rate: of the velocities. NaN without these.
+        pose_path, pose_speed: length in m and typical speed in m/s of the poses. twist_path, twist_speed: of
+            the velocities. NaN without these.
     """
 
     pose_path: float
     pose_speed: float
-    pose_turn_rate: float
     twist_path: float
     twist_speed: float
-    twist_turn_rate: float
 
 
 Shape = ScanShape | CloudShape | ImageShape | ValueShape | MotionShape
@@ -223,8 +211,8 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
         else:
 
             def read(content: Any, place: str) -> None:
-                if summary is not None and (summary.every or not contents):
-                    contents.append(summary.extract(content, topic.kind, place))
+                if summary is not None and (topic.kind not in FIRST or not contents):
+                    contents.append(summary[0](content, topic.kind, place))
 
             for _, time, content, _ in bag.usable(topic, read):
                 received.append(time)
@@ -232,9 +220,7 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
                     stamps.append(nanoseconds(content.header.stamp))
                     frames = frames if any(frames) else _frames_of(content)
             if summary is not None:
-                shape = summary.shape(contents, stamps or received)
-            if isinstance(shape, ScanShape):
-                shape = _with_wider(shape, bag, contents)
+                shape = summary[1](bag, contents, stamps or received)
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
@@ -268,53 +254,35 @@ def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
     )
 
 
-class Summary(NamedTuple):
-    """How the messages of a type are summed up.
-
-    Attributes:
-        every: whether all messages count, or the first only. extract: what is kept of a message.
-        shape: of what was kept and the times, ns.
-    """
-
-    every: bool
-    extract: Callable[[Any, str, str], Any]
-    shape: Callable[[list[Any], list[int]], Shape]
-
-
 def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
     own, (low, high) = extent_of(content, where), scan_limits(content)
     ranges = np.asarray(content.ranges, float)
-    nothing, unmeasured = ranges > high, np.isnan(ranges) | (ranges < low)
-    nothing |= np.isposinf(ranges)
-    within = ranges[~nothing & ~unmeasured]
+    nothing = (ranges > high) | np.isposinf(ranges)
+    within = ranges[~nothing & (ranges >= low)]
     median = float(np.median(within)) if len(within) else np.nan
-    shares = nothing.mean(), unmeasured.mean()
-    return len(ranges), own.width, own.ring, low, high, median, shares, content.header.frame_id, own
+    return len(ranges), high, median, nothing.mean(), content.header.frame_id, own
 
 
-def _scan_shape(values: list[Any], stamps: list[int]) -> ScanShape:
-    medians = np.array([value[5] for value in values])
-    median = float(np.nanmedian(medians)) if np.isfinite(medians).any() else np.nan
-    shares = np.mean([value[6] for value in values], axis=0)
-    beams, (fov, ring, low, high) = int(np.median([value[0] for value in values])), values[0][1:5]
-    return ScanShape(beams, fov, ring, low, high, median, float(shares[0]), float(shares[1]))
+def _scan_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ScanShape:
+    """The shape of scans; directions are those in the frame of the first."""
+    beams, highs, medians, nothing, frames, extents = zip(*values, strict=True)
+    known = [median for median in medians if np.isfinite(median)]
+    median = float(np.median(known)) if known else np.nan
+    if len(set(frames)) > 1:
+        mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
+        turned = zip(frames, extents, strict=True)
+        extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
+    wider = wider_extent(extents)
+    extent = wider or extents[0]
+    return ScanShape(
+        int(np.median(beams)), extent, wider is not None, highs[0], median, float(np.mean(nothing))
+    )
 
 
-def _with_wider(shape: ScanShape, bag: Bag, values: list[Any]) -> ScanShape:
-    """The shape with what the scans of a topic cover together, in the frame of the first."""
-    frames = dict.fromkeys(value[7] for value in values)
-    mounts = [mount_of(bag, "", frame, "header") or FORWARD for frame in frames if len(frames) > 1]
-    at = dict(zip(frames, mounts, strict=False))
-    wider = wider_extent([own.turned(at[frame], mounts[0]) if at else own for *_, frame, own in values])
-    return shape if wider is None else shape._replace(fov=wider.width, ring=wider.ring, wider=wider)
-
-
-def _cloud_shape(values: list[Any], stamps: list[int]) -> CloudShape:
+def _cloud_shape(bag: Bag, values: list[Any], stamps: list[int]) -> CloudShape:
     points = values[0][np.isfinite(values[0]).all(axis=1)]
-    if not len(points):
-        return CloudShape(len(values[0]), np.nan, np.nan, np.nan)
-    reach = float(np.median(np.hypot(points[:, 0], points[:, 1])))
-    return CloudShape(len(values[0]), reach, float(points[:, 2].min()), float(points[:, 2].max()))
+    reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
+    return CloudShape(len(values[0]), reach)
 
 
 def _image_values(content: Any, kind: str, where: str) -> ImageShape:
@@ -323,49 +291,45 @@ def _image_values(content: Any, kind: str, where: str) -> ImageShape:
     return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
 
 
-def _array_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
+def _values(content: Any, kind: str, where: str) -> tuple[tuple[int, ...], np.ndarray]:
+    if kind == JOINTS:
+        return (len(content.name),), np.asarray(content.position, float)
     sizes = tuple(int(dim.size) for dim in content.layout.dim)
-    return (), sizes or (len(content.data),), np.asarray(content.data, float)
+    return sizes or (len(content.data),), np.asarray(content.data, float)
 
 
-def _joint_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    return tuple(content.name), (len(content.name),), np.asarray(content.position, float)
-
-
-def _value_shape(values: list[Any], stamps: list[int]) -> ValueShape:
-    numbers = np.concatenate([value[2] for value in values])
+def _value_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ValueShape:
+    numbers = np.concatenate([value for _, value in values])
     low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
-    names = tuple(dict.fromkeys(name for value in values for name in value[0]))
-    return ValueShape(names, values[0][1], low, high)
+    return ValueShape(values[0][0], low, high)
 
 
 def _motion_values(content: Any, kind: str, where: str) -> np.ndarray:
     """[6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none."""
-    pose = POSES[kind](content, where) if kind in POSES else (np.nan,) * 3
+    pose = pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
     return np.array([*pose, *(twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3)])
 
 
-def _motion_shape(values: list[Any], stamps: list[int]) -> MotionShape:
-    rows, time = np.array(values), np.array(stamps, float) / 1e9
+def _motion_shape(bag: Bag, values: list[Any], stamps: list[int]) -> MotionShape:
+    rows, time, sizes = np.array(values), np.array(stamps, float) / 1e9, list[float]()
     order = np.argsort(time, kind="stable")
     rows, time = rows[order], time[order]
-    poses = _magnitudes(from_poses(time, rows[:, :3]), time)
-    return MotionShape(*poses, *_magnitudes(from_velocities(time, *rows[:, 3:].T), time))
+    for motion in (from_poses(time, rows[:, :3]), from_velocities(time, *rows[:, 3:].T)):
+        known = np.isfinite(motion[:, 0]).any()
+        track = MotionTrack(time, np.ones(len(time), bool), motion)
+        path = float(np.nansum(np.hypot(motion[:, 0], motion[:, 1])))
+        sizes += [path, typical_motion(track).speed] if known else [np.nan, np.nan]
+    return MotionShape(*sizes)
 
 
-def _magnitudes(motion: np.ndarray, time: np.ndarray) -> tuple[float, float, float]:
-    if not np.isfinite(motion).any(axis=0)[0]:
-        return np.nan, np.nan, np.nan
-    typical = typical_motion(MotionTrack(time, np.ones(len(time), bool), motion, None))
-    return float(np.nansum(np.hypot(motion[:, 0], motion[:, 1]))), typical.speed, typical.turn_rate
-
-
+Summary = tuple[Callable[[Any, str, str], Any], Callable[[Bag, list[Any], list[int]], Shape]]
 SUMMARIES: dict[str, Summary] = {
-    SCAN: Summary(True, _scan_values, _scan_shape),
-    CLOUD: Summary(False, lambda content, kind, where: cloud_points(content, where), _cloud_shape),
-    **dict.fromkeys((RAW, COMPRESSED), Summary(False, _image_values, lambda values, stamps: values[0])),
-    **dict.fromkeys(ARRAYS, Summary(True, _array_values, _value_shape)),
-    JOINTS: Summary(True, _joint_values, _value_shape),
-    **dict.fromkeys((*POSES, *TWISTS), Summary(True, _motion_values, _motion_shape)),
+    SCAN: (_scan_values, _scan_shape),
+    CLOUD: (lambda content, kind, where: cloud_points(content, where), _cloud_shape),
+    **dict.fromkeys(IMAGES, (_image_values, lambda bag, values, stamps: values[0])),
+    **dict.fromkeys((JOINTS, *ARRAYS), (_values, _value_shape)),
+    **dict.fromkeys((*POSES, *TWISTS), (_motion_values, _motion_shape)),
 }
-"""How the messages of each type are described."""
+"""What is kept of a message of each type, and what follows from that and the times, ns."""
+FIRST = (CLOUD, *IMAGES)
+"""Types of which only the first message is described."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bz2
 import io
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import IO, Any, cast
 
@@ -17,19 +16,9 @@ def _zstd(file: IO[bytes]) -> IO[bytes]:
     return cast(IO[bytes], zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True))
 
 
-def _lz4(file: IO[bytes]) -> IO[bytes]:
-    import lz4.frame
-
-    return cast(IO[bytes], lz4.frame.open(file))
-
-
-def _expander(open_reader: Callable[[IO[bytes]], IO[bytes]], what: str) -> Callable[..., bytes]:
-    """A function of compressed bytes (and a size that is said, not believed)."""
-    return lambda content, *_: expand(open_reader(io.BytesIO(content)), what, len(content))
-
-
-expand_message = _expander(_zstd, "a compressed message")
-"""What a message expands to that is compressed with zstd; an `InputError` if it is too much."""
+def expand_message(content: bytes) -> bytes:
+    """What a message expands to that is compressed with zstd; an `InputError` if it is too much."""
+    return expand(_zstd(io.BytesIO(content)), "a compressed message", len(content))
 
 
 class _Counted(io.RawIOBase):
@@ -49,14 +38,16 @@ class _Counted(io.RawIOBase):
 
 def bound_expansion() -> None:
     """Replaces the decompressors of rosbags by bounded ones."""
+    import lz4.frame
     from rosbags.rosbag1 import reader as first
     from rosbags.rosbag2 import reader as second
     from rosbags.rosbag2 import storage_mcap
 
-    chunk = "a compressed chunk"
-    openers: dict[str, Callable[..., Any]] = {"bz2": bz2.BZ2File, "lz4": _lz4, "zstd": _zstd}
-    functions = {name: _expander(reader, chunk) for name, reader in openers.items()}
+    openers: dict[str, Any] = {"bz2": bz2.BZ2File, "lz4": lz4.frame.open, "zstd": _zstd}
     for known in (first.decompressors, storage_mcap.DECOMPRESSORS):
-        known.update({name: function for name, function in functions.items() if name in known})
+        for name in known.keys() & openers.keys():  # a size that is said is not believed
+            known[name] = lambda content, *_, opener=openers[name]: expand(
+                opener(io.BytesIO(content)), "a compressed chunk", len(content)
+            )
     zstd = SimpleNamespace(decompress=expand_message, open=lambda file, _: _Counted(file))
     second.zstd = cast(Any, zstd)

@@ -41,7 +41,7 @@ def pose_in_plane(
     return place[0], place[1], yaw_of(*turn)
 
 
-PARTS: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     ODOMETRY: lambda message: (message.pose.pose.position, message.pose.pose.orientation),
     "geometry_msgs/msg/PoseStamped": lambda message: (message.pose.position, message.pose.orientation),
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: (
@@ -55,13 +55,6 @@ PARTS: dict[str, Callable[[Any], tuple[Any, Any]]] = {
 }
 """Message types with a pose: its position and orientation."""
 
-
-def _reader(kind: str) -> Callable[[Any, str], tuple[float, float, float]]:
-    return lambda message, where: pose_in_plane(*PARTS[kind](message), where)
-
-
-POSES: dict[str, Callable[[Any, str], tuple[float, float, float]]] = {kind: _reader(kind) for kind in PARTS}
-"""Message types with a pose, and how it is read."""
 
 TWISTS: dict[str, Callable[[Any], Any]] = {
     ODOMETRY: lambda message: message.twist.twist,

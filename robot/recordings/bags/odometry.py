@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
-from robot.recordings.bags.motions import PARTS, POSES, TWISTS, pose_in_plane, twist_in_plane
+from robot.recordings.bags.motions import POSES, TWISTS, pose_in_plane, twist_in_plane
 from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
-from robot.recordings.sanity_checks import nonfinite_errors
+from robot.recordings.sanity_checks import nonfinite_errors, still_axis
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
-from tactile.base.se2 import integrate
+from tactile.base.se2 import integrate, wrap
 
-FLAT = 10.0
-"""Extent in z above this many times that in y: the path does not lie in the plane."""
+AGREED = 1.2
+"""Length of the path of all frames over that of each of them, up to which their poses agree."""
+TURNED = 0.5
+"""Typical turn between poses of different frames, rad, from which they disagree."""
 
 
 class BagOdometry(NamedTuple):
@@ -114,17 +117,22 @@ def _read_series(
     if topic.kind not in POSES and not twist:
         known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
         raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
-    rows, kept, faults = list[Any](), list[Any](), _PoseFaults(config.plane)
-    wanted = None if config.frames is None else tuple(frame.lstrip("/") for frame in config.frames)
+    rows, kept, points, doubts = list[Any](), list[Any](), list[Any](), dict[str, list[str]]()
+    wanted = tuple(frame.lstrip("/") for frame in config.frames)
 
     def read(content: Any, place: str) -> Any:
-        if wanted not in (None, _frames_of(content)):
+        if wanted != _frames_of(content)[: len(wanted)]:
             return None
-        if not twist:
-            value = pose_in_plane(*PARTS[topic.kind](content), place, config.plane)
-            faults.add(content, PARTS[topic.kind](content), place)
-        elif not np.isfinite(value := twist_in_plane(TWISTS[topic.kind](content))).all():
-            raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+        if twist:
+            value = twist_in_plane(TWISTS[topic.kind](content))
+            if not np.isfinite(value).all():
+                raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+            return value
+        position, turn = POSES[topic.kind](content)
+        value = pose_in_plane(position, turn, place, config.plane)
+        points.append((position.x, position.y, position.z))
+        for doubt in _doubts(content, turn):
+            doubts.setdefault(doubt, []).append(place)
         return value
 
     for number, received, content, value in bag.usable(topic, read):
@@ -135,10 +143,17 @@ def _read_series(
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
     numbers, times, others, pairs = ([row[k] for row in rows] for k in range(4))
-    errors = _frame_errors(where, numbers, pairs, role)
-    if not errors:
-        faults.tell(where, len(rows), report)
     values = np.array(kept).reshape(-1, 3)
+    poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
+    errors = _frame_errors(where, numbers, pairs, role, poses, report)
+    for doubt, at in doubts.items() if not errors else ():
+        report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
+    if config.plane == "xy" and not (twist or errors) and still_axis(np.array(points)) == "y":
+        found = "the path spans {:.3g} m in x, {:.3g} m in y and {:.3g} m in z: another plane".format(
+            *np.ptp(points, axis=0)
+        )
+        cure = f"if the poses are a camera's (z ahead), --set recording.topics.{role}.plane=xz"
+        errors = [InputError(where, found, "a path in the plane of x and y", cure)]
     series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body
@@ -151,55 +166,40 @@ def _frames_of(message: Any) -> tuple[str, str]:
 
 
 def _frame_errors(
-    where: str, numbers: list[int], frames: list[tuple[str, str]], role: str
+    where: str, numbers: list[int], frames: list[Any], role: str, poses: np.ndarray, report: Report
 ) -> list[InputError]:
-    """The error for messages of several frames: poses of different frames cannot be compared."""
+    """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
+
+    Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
+    """
     counts = Counter(frames)
     if len(counts) < 2:
         return []
-    (usual, _), *others = counts.most_common()
-    parts = [
-        f"{' to '.join(filter(None, pair)) or 'no frame'} ({count})" for pair, count in counts.most_common()
-    ]
-    number = numbers[next(k for k, pair in enumerate(frames) if pair == others[0][0])]
-    found = (
-        f"messages of several frames: {', '.join(parts)}; several nodes publish here, or the frame changes"
-    )
-    cure = f"set recording.topics.{role}.frames to [{', '.join(map(repr, usual))}]"
-    return [InputError(f"{where}, message {number}", found, "one frame and child frame", cure)]
+    usual = counts.most_common(1)[0][0]
+    parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
+    found = f"messages of several frames: {', '.join(parts)}"
+    names = np.array([list(counts).index(pair) for pair in frames])
+    changes, places = np.flatnonzero(np.diff(names)), poses[:, :2]
+    at = f"{where}, message {numbers[changes[0] + 1]}"
+    alone = [_length(places[names == k]) for k in range(len(counts))]
+    in_turn = len(changes) > len(counts)
+    turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
+    if turned < TURNED and _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+        report(f"{at}: {found}; their poses agree, look at the publisher")
+        return []
+    cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
+    found += "; several nodes publish here, or it changes"
+    return [InputError(at, found, "one frame and child frame", cure)]
 
 
-class _PoseFaults:
-    """Counts poses that can be read, but whose publisher or plane is doubtful."""
+def _length(places: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
-    def __init__(self, plane: str) -> None:
-        self._plane, self._places = plane, list[Any]()
-        self._count, self._first = Counter[str](), dict[str, str]()
 
-    def add(self, message: Any, parts: tuple[Any, Any], place: str) -> None:
-        position, turn = parts
-        self._places.append((position.x, position.y, position.z))
-        if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
-            self._note("orientations are not unit quaternions (only their direction is used)", place)
-        covariance = getattr(getattr(message, "pose", None), "covariance", None)
-        if covariance is not None:
-            matrix = np.asarray(covariance, float)
-            if not np.isfinite(matrix).all() or (matrix[::7] < 0).any():
-                self._note(
-                    "covariances are not numbers or negative: the publisher did not know the pose", place
-                )
-
-    def _note(self, fault: str, place: str) -> None:
-        self._count[fault] += 1
-        self._first.setdefault(fault, place)
-
-    def tell(self, where: str, total: int, report: Report) -> None:
-        """Tells each fault once, with its first place."""
-        for fault, count in self._count.items():
-            report(f"{self._first[fault]}: {count} of {total} {fault}; look at the publisher")
-        if self._plane == "xy" and len(self._places) > 1:
-            x, y, z = np.ptp(np.array(self._places), axis=0)
-            if z > 0.1 * x and z > FLAT * y:
-                found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z"
-                cure = "poses of a camera (z ahead)? set recording.topics.odometry.plane to xz"
-                report(f"{where}: {found}: it lies in another plane; {cure}")
+def _doubts(message: Any, turn: Any) -> Iterator[str]:
+    """What is doubtful about a pose that can be read, and its orientation."""
+    if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
+        yield "orientations are not unit quaternions (only their direction is used)"
+    covariance = np.asarray(getattr(getattr(message, "pose", None), "covariance", 0.0), float).ravel()
+    if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
+        yield "covariances are not numbers or negative: the publisher did not know the pose"

@@ -13,7 +13,7 @@ from robot.recordings.alignment import (
     nearest_rows,
     no_overlap_error,
 )
-from robot.recordings.bags.bag import SPOILT, Bag, bag_digest
+from robot.recordings.bags.bag import Bag, bag_files
 from robot.recordings.bags.config import OdometryTopic, TopicsConfig, ViewsTopic
 from robot.recordings.bags.images import IMAGES
 from robot.recordings.bags.odometry import BagOdometry, motion_at, read_odometry, read_poses
@@ -23,8 +23,9 @@ from robot.recordings.bags.views import KEY, read_image_views, read_range_views
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
+from robot.recordings.sanity_checks import SPOILT
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import missing_error, raise_errors
+from robot.sources.input_files import digest_of_files, missing_error, raise_errors
 from tactile.base.errors import InputError
 
 NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
@@ -64,30 +65,29 @@ def read_bag(
     if views is not None:
         rows, columns = views.values.shape[1:3]
         shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
-    recording = RecordingRows(odometry.time, odometry.motion, shape, whiskers)
+    recording = RecordingRows(str(path), odometry.time, odometry.motion, shape, whiskers)
     if views is not None:
         part = config.views or config.touch
         _place_views(recording, views, part.tolerance if part else None, report)
     if truth is not None:
-        given = truth.time, truth.values, "time", truth.where
-        recording.truth, faults = interpolated_poses(odometry.time, *given)
+        recording.truth, faults = interpolated_poses(
+            odometry.time, truth.time, truth.values, "time", truth.where
+        )
         recording.errors += faults
     judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
-    return recording.source(path.stem, bag_digest(path), str(path), judge)
+    return recording.source(path.stem, digest_of_files(bag_files(path)), judge)
 
 
 def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
     """Judges the odometry as recorded, each step by the number of its message."""
-    everywhere = np.ones(len(odometry.time), bool)
-    track = MotionTrack(odometry.time, everywhere, odometry.motion, None, odometry.held, odometry.poses)
-
-    def place(row: int) -> str:
-        return f"{odometry.where}, message {odometry.numbers[row]}"
+    time, motion, where = odometry.time, odometry.motion, odometry.where
+    track = MotionTrack(time, np.ones(len(time), bool), motion, None, odometry.held, odometry.poses)
 
     def cures(quantity: str, unit: str) -> str:
         return odometry.clock or other_clock("header") if quantity == "time" else unit_cure(quantity, unit)
 
-    return judge.errors(track, place, odometry.where, odometry.clock, cures)
+    place = lambda row: f"{where}, message {odometry.numbers[row]}"  # noqa: E731
+    return judge.errors(track, place, where, odometry.clock, cures)
 
 
 def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
@@ -163,24 +163,21 @@ def _place_views(recording: RecordingRows, views: Series, tolerance: float | Non
     """Gives each view to the nearest sample; of several for one sample the nearest is used."""
     found = nearest_rows(views.time, recording.time, tolerance)
     assert found is not None  # the clock is checked
-    near = found.away <= found.reach
+    rows, away, reach = found
+    near = away <= reach
     if not near.any():
         recording.errors.append(no_overlap_error(views.time, recording.time, "time", views.where))
         return
-    _report_unused(views, ~near, f"over {found.reach:.3g} s away from every sample", report)
-    order = np.lexsort([found.away, found.rows])
+    _report_unused(views, ~near, f"over {reach:.3g} s away from every sample", report)
+    order = np.lexsort([away, rows])
     order = order[near[order]]
-    first = np.concatenate([[True], np.diff(found.rows[order]) > 0])
+    first = np.concatenate([[True], np.diff(rows[order]) > 0])
     use = np.sort(order[first])
     beaten = near.copy()
     beaten[use] = False
-    _report_unused(
-        views,
-        beaten,
-        "farther from their sample than another (or set recording.topics.samples: views)",
-        report,
-    )
-    recording.views[found.rows[use]], recording.seen[found.rows[use]] = views.values[use], True
+    why = "farther from their sample than another (or set recording.topics.samples: views)"
+    _report_unused(views, beaten, why, report)
+    recording.views[rows[use]], recording.seen[rows[use]] = views.values[use], True
 
 
 def _report_unused(views: Series, unused: np.ndarray, why: str, report: Report) -> None:

@@ -21,8 +21,6 @@ SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 RING_BEAMS = 360  # of a cloud: the nearest point of each degree
 POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types of PointField.datatype."""
-
-
 COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
@@ -70,11 +68,6 @@ class Extent(NamedTuple):
         ahead = turn @ np.array([np.cos(self.middle), np.sin(self.middle)])
         flip = float(np.sign(np.linalg.det(turn)))
         return Extent(float(np.arctan2(ahead[1], ahead[0])), self.width * flip, self.step)
-
-    def fits(self, other: Extent) -> bool:
-        """Whether the outer beams have the same directions, in any order."""
-        away = abs(_wrapped(self.middle - other.middle)) + abs(abs(self.width) - abs(other.width)) / 2
-        return bool(away <= 0.51 * max(self.step, other.step))
 
 
 def extent_of(message: Any, where: str) -> Extent:
@@ -132,6 +125,7 @@ def scan_view(
     if shared is None and len(ranges) < pixels:
         raise InputError(where, f"{len(ranges)} beams", f"at least one for each of {pixels} sectors")
     shared = shared or own
+    apart = abs(_wrapped(own.middle - shared.middle)) + abs(abs(own.width) - abs(shared.width)) / 2
     low, high = scan_limits(message)
     measured = ~np.isnan(ranges) & (ranges >= low)
     ranges = np.where(ranges > high, np.inf, ranges)
@@ -139,7 +133,7 @@ def scan_view(
         angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
         ahead = mount.rotation[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
         at = (np.arctan2(ahead[1], ahead[0]) + np.pi) / (2 * np.pi) % 1.0  # from behind, of a whole turn
-    elif own.fits(shared) and len(ranges) >= pixels:
+    elif apart <= 0.51 * max(own.step, shared.step) and len(ranges) >= pixels:  # the same outer beams
         order = slice(None, None, 1 if own.width * shared.width > 0 else -1)
         return _fan_view(ranges[order], measured[order], pixels, max_range)
     else:

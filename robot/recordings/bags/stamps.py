@@ -7,8 +7,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import SPOILT, Bag, Topic
+from robot.recordings.bags.bag import Bag, Topic
 from robot.recordings.input_judge import GAP, LEAST_GAP
+from robot.recordings.sanity_checks import leave_out
 from tactile.base.errors import InputError
 
 Clock = Literal["header", "bag"]
@@ -17,34 +18,18 @@ OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
 Report = Callable[[str], None]
 
 
-class Message(NamedTuple):
-    """A message.
-
-    Attributes:
-        number: in the order of receipt, from 0. stamp: ns, by the chosen clock.
-    """
-
-    number: int
-    stamp: int
-    content: Any
-
-
-def read_messages(bag: Bag, topic: Topic, clock: Clock) -> Iterator[Message]:
-    """The messages of a topic with their times."""
-    for number, (received, content) in enumerate(bag.messages(topic)):
-        yield Message(number, stamp_of(content, received, clock), content)
-
-
 def stamp_of(content: Any, received: int, clock: Clock) -> int:
     """The time of a message received at this time, ns, by a clock."""
     stamped = clock == "header" and hasattr(content, "header")
     return nanoseconds(content.header.stamp) if stamped else received
 
 
-def read_usable(bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]) -> Iterator[Message]:
-    """The messages of a topic that can be used, with what `read` makes of them (see `Bag.usable`)."""
+def read_usable(
+    bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]
+) -> Iterator[tuple[int, int, Any]]:
+    """Number, time in ns, and what `read` makes of each message that can be used (see `Bag.usable`)."""
     for number, received, content, value in bag.usable(topic, read):
-        yield Message(number, stamp_of(content, received, clock), value)
+        yield number, stamp_of(content, received, clock), value
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -52,29 +37,9 @@ def nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def seconds(stamp: int) -> str:
-    """ns as text in s, exact."""
-    return f"{stamp // 10**9}.{stamp % 10**9:09d}"
-
-
 def in_seconds(stamps: list[int]) -> np.ndarray:
     """[M] s, each the nearest double."""
     return np.array([stamp / 10**9 for stamp in stamps])
-
-
-def left_out(where: str, count: int, total: int, first: InputError, report: Report) -> list[InputError]:
-    """Leaves out some messages of a topic: told as a warning, or an error if they are more than `SPOILT`.
-
-    Args:
-        count: of the messages left out, of `total`. first: why the first cannot be used.
-    """
-    if not count:
-        return []
-    if count > max(1, SPOILT * total):
-        found = f"{first.found} (so in {count} of {total} messages)"
-        return [InputError(first.where, found, first.expected, first.cure)]
-    report(f"{first.where}: {first.found}; {count} of {total} messages are left out")
-    return []
 
 
 def usable_stamps(
@@ -92,39 +57,38 @@ def usable_stamps(
     worse = clock == "bag" if other is None else bool((np.diff(other) < 0).any())
     cure = "" if worse else other_clock(clock)
     errors, use = list[InputError](), times != 0
-    if not use.all():
-        number = int((~use).argmax())
-        first = InputError(
-            f"{where}, message {number}", "the stamp is 0", "the time of the measurement", cure
-        )
-        errors += left_out(where, int((~use).sum()), len(times), first, report)
-    kept = times[use]
-    if len(kept) and (np.diff(kept) < 0).any():
-        late, early = kept < np.maximum.accumulate(kept), kept > np.minimum.accumulate(kept[::-1])[::-1]
-        wrong = early if early.sum() < late.sum() else late
+
+    def drop(wrong: np.ndarray, row: int, found: str, expected: str) -> None:
+        """Leaves out the messages [M] bool; row: the first that is named."""
+        first = InputError(f"{where}, message {row}", found, expected, cure)
+        errors.extend(leave_out(int(wrong.sum()), len(times), "messages", first, report))
+        use[wrong] = False
+
+    drop(~use, int((~use).argmax()), "the stamp is 0", "the time of the measurement")
+    kept, rows = times[use], np.flatnonzero(use)
+    late, early = kept < np.maximum.accumulate(kept), kept > np.minimum.accumulate(kept[::-1])[::-1]
+    if late.any():
         row = int(late.argmax())
-        number = int(np.flatnonzero(use)[row])
-        found = f"the stamp goes back from {seconds(int(kept[row - 1]))} to {seconds(int(kept[row]))} s"
-        first = InputError(f"{where}, message {number}", found, "times that increase", cure)
-        faults = left_out(where, int(wrong.sum()), len(times), first, report)
-        errors += faults
-        if not faults:
-            use[np.flatnonzero(use)[wrong]] = False
+        before, now = (f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in kept[row - 1 : row + 1].tolist())
+        wrong = np.isin(np.arange(len(times)), rows[early if early.sum() < late.sum() else late])
+        drop(wrong, int(rows[row]), f"the stamp goes back from {before} to {now} s", "times that increase")
     if errors:
         return use, errors
-    fresh = np.concatenate([[True], np.diff(times[use]) > 0])
-    if not fresh.all():
-        number, count = int(np.flatnonzero(use)[~fresh][0]), int((~fresh).sum())
-        repeated = f"{count} of {len(times)} messages repeat the stamp of the message before"
-        tail = "; they are left out" + (f"; {cure}" if cure and count > len(times) / 2 else "")
-        report(f"{where}: {repeated}, the first at {seconds(stamps[number])} s{tail}")
-        use[np.flatnonzero(use)[~fresh]] = False
+    rows = np.flatnonzero(use)
+    repeated = rows[np.append(False, np.diff(times[rows]) == 0)]
+    if len(repeated):
+        said = (
+            f"{len(repeated)} of {len(times)} messages repeat the stamp of the message before, the first at "
+        )
+        said += f"{times[repeated[0]] / 1e9:.3f} s; they are left out"
+        report(f"{where}: {said}{f'; {cure}' if cure and len(repeated) > len(times) / 2 else ''}")
+        use[repeated] = False
     return use, errors
 
 
 def other_clock(clock: Clock) -> str:
     """The setting that takes the other times of the messages."""
-    return f"set recording.topics.clock to {OTHER_CLOCK[clock]}"
+    return f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
 
 
 def leaps(times: np.ndarray, other: np.ndarray) -> np.ndarray:

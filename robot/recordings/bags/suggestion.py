@@ -94,8 +94,8 @@ def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
             options: dict[str, Any] = {}
             if isinstance(shape, ScanShape) and shape.beams < SECTORS:
                 options = {"rows": 1, "columns": shape.beams}
-            if isinstance(shape, ScanShape) and shape.wider is not None:
-                options["span"] = [round(angle, 4) for angle in shape.wider.span]
+            if isinstance(shape, ScanShape) and shape.wider:
+                options["span"] = [round(angle, 4) for angle in shape.extent.span]
             return topic, {"topic": topic.name, **options} if options else topic.name
     return None
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import SPOILT, TRANSFORMS, Bag
+from robot.recordings.bags.bag import TRANSFORMS, Bag
 from robot.recordings.bags.motions import yaw_of
 from robot.recordings.bags.stamps import (
     Clock,
@@ -20,7 +19,8 @@ from robot.recordings.bags.stamps import (
     read_usable,
     usable_stamps,
 )
-from robot.sources.input_files import missing_error
+from robot.recordings.sanity_checks import leave_out
+from robot.sources.input_files import missing_error, raise_errors
 from tactile.base.errors import InputError
 
 STATIC, MOVING = "/tf_static", "/tf"
@@ -70,18 +70,18 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
         if topic.kind not in TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
             continue
         where = f"{bag.path}, {topic.name}"
-        spoilt, total = list[InputError](), 0
+        spoilt, total, first = 0, 0, None
         for number, received, content in read_usable(bag, topic, "bag", lambda content, place: content):
             for each in content.transforms:
                 frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
                 move, turn = each.transform.translation, each.transform.rotation
-                shift = float(move.x), float(move.y), float(move.z)
-                quaternion = float(turn.x), float(turn.y), float(turn.z), float(turn.w)
+                shift, quaternion = (move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)
                 total += 1
                 if not (np.isfinite((*shift, *quaternion)).all() and any(quaternion)):
                     place = f"{where}, message {number}, {frames[0]} to {frames[1]}"
                     found = f"the translation is {shift} and the orientation {quaternion}"
-                    spoilt.append(InputError(place, found, "numbers, and a unit quaternion"))
+                    first = first or InputError(place, found, "numbers, and a unit quaternion")
+                    spoilt += 1
                     continue
                 link = links.setdefault(frames, Link([], [], [], []))
                 if name == STATIC:
@@ -91,11 +91,8 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
                 link.shifts.append(shift)
                 link.turns.append(quaternion)
                 link.numbers.append(number)
-        if len(spoilt) > max(1, SPOILT * total) or total == len(spoilt) > 0:
-            raise spoilt[0]
-        if spoilt:
-            count = f"{len(spoilt)} of {total} transforms cannot be used and are left out"
-            bag.warn(f"{where}: {count}; the first: {spoilt[0]}")
+        if first is not None:
+            raise_errors(leave_out(spoilt, total, "transforms", first, bag.warn))
     return links
 
 
@@ -132,22 +129,16 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     bodies, sensor = (body.lstrip("/"),) if body else BODIES, sensor.lstrip("/")
     if sensor in bodies:
         return FORWARD
-    links = read_links(bag, STATIC, clock)
-    chain = _first_chain(links, bodies, sensor)
-    if chain is None:
-        links = read_links(bag, MOVING, clock) | links
-        chain = _first_chain(links, bodies, sensor)
-    if chain is None:
-        return None
-    whole = np.eye(4)
-    for frames, down in chain:
-        whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
-    return Mount(whole[:3, :3], whole[:3, 3])
-
-
-def _first_chain(links: Links, bodies: Sequence[str], sensor: str) -> Chain | None:
-    chains = (chain_between(links, body, sensor) for body in bodies)
-    return next((chain for chain in chains if chain is not None), None)
+    links: Links = {}
+    for name in (STATIC, MOVING):
+        links = read_links(bag, name, clock) | links
+        chains = (chain_between(links, each, sensor) for each in bodies)
+        if (chain := next(filter(None, chains), None)) is not None:
+            whole = np.eye(4)
+            for frames, down in chain:
+                whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
+            return Mount(whole[:3, :3], whole[:3, 3])
+    return None
 
 
 def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Report) -> Series:
@@ -174,7 +165,8 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
         use, faults = usable_stamps(links[pair].stamps, place, clock, report)
-        links[pair] = _chosen(links[pair], use)
+        kept: list[Any] = [list(compress(part, use)) for part in links[pair]]
+        links[pair] = Link(*kept)
         times[pair] = in_seconds(links[pair].stamps)
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))
@@ -195,13 +187,6 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
         whole = whole @ _matrices(links[pair], times.get(pair, np.zeros(1)), moments, down)
     values = np.column_stack([whole[:, 0, 3], whole[:, 1, 3], np.arctan2(whole[:, 1, 0], whole[:, 0, 0])])
     return Series(where, moments, values, numbers[inside], [])
-
-
-def _chosen(link: Link, use: np.ndarray) -> Link:
-    """The transforms that are used: [N] bool."""
-    stamps, shifts, turns, numbers = link
-    shifts, turns = list(compress(shifts, use)), list(compress(turns, use))
-    return Link(list(compress(stamps, use)), shifts, turns, list(compress(numbers, use)))
 
 
 def _matrices(link: Link, time: np.ndarray, moments: np.ndarray, down: bool) -> np.ndarray:

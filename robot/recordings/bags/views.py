@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,17 +34,6 @@ KEY = "recording.topics.views"
 LONGEST = 8.0  # m: of indoor scans, most show something nearer
 
 
-class BagImages(NamedTuple):
-    """Views of a camera.
-
-    Attributes:
-        views: [M, R, C, 1] over time. motion: [M, 4] visual odometry, or None.
-    """
-
-    views: Series
-    motion: np.ndarray | None
-
-
 def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, report: Report) -> Series:
     """Views [M, R, C, 1] of a topic of scans or clouds.
 
@@ -59,36 +48,26 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
     if topic.kind not in (SCAN, CLOUD):
         expected = f"one of {', '.join((SCAN, CLOUD, *IMAGES))}"
         raise InputError(where, f"messages of type {topic.kind}", expected)
-    numbers, stamps, found = list[int](), list[int](), list[RangeView]()
-    reader, empty, narrow = _RangeReader(bag, topic, config, body, clock), 0, 0
-    for number, stamp, view in read_usable(bag, topic, clock, reader.view):
-        if view is None or view.covered < COVERED:
-            empty, narrow = empty + (view is None), narrow + (view is not None)
-            continue
-        found.append(view)
-        numbers.append(number)
-        stamps.append(stamp)
-    if empty:
-        report(f"{where}: {empty} of {topic.total} messages have no measured range and are no views")
-    if narrow:
-        count = f"{narrow} of {topic.total} messages"
-        report(f"{where}: {count} cover less than half of the sectors and are no views")
+    reader = _RangeReader(bag, topic, config, body, clock)
+    read = list(read_usable(bag, topic, clock, reader.view))
+    rows = [row for row in read if row[2] is not None and row[2].covered >= COVERED]
+    empty = sum(view is None for *_, view in read)
+    for count, fault in (
+        (empty, "have no measured range"),
+        (len(read) - len(rows) - empty, "cover less than half of the sectors"),
+    ):
+        if count:
+            report(f"{where}: {count} of {topic.total} messages {fault} and are no views")
     if wider := reader.wider_span():
-        cure = f"set {KEY}.span: [{wider[0]:.4f}, {wider[1]:.4f}]"
+        cure = f"--set {KEY}.span=[{wider[0]:.4f},{wider[1]:.4f}]"
         report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
-    reach = reader.reach
+    numbers, stamps, found = (list(column) for column in zip(*rows, strict=True)) if rows else ([], [], [])
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
     series = as_series(where, numbers, stamps, pixels, clock, report)
-    lowest, typical = (np.array([getattr(view, name) for view in found]) for name in ("lowest", "typical"))
-    errors = range_errors(
-        lowest,
-        float(np.median(typical)),
-        reach or LONGEST,
-        "a range",
-        lambda row: f"{where}, message {numbers[row]}",
-        where,
-        f"{KEY}.max_range",
-    )
+    lowest, typical = np.array([(view.lowest, view.typical) for view in found]).T
+    place, key = (lambda row: f"{where}, message {numbers[row]}"), f"{KEY}.max_range"
+    reach = reader.reach or LONGEST
+    errors = range_errors(lowest, float(np.median(typical)), reach, "a range", place, where, key)
     return series._replace(errors=series.errors + errors)
 
 
@@ -99,8 +78,9 @@ def read_image_views(
     visual_odometry: VisualOdometryConfig | None,
     clock: Clock,
     report: Report,
-) -> BagImages:
-    """Views of a topic of images, and visual odometry where it is configured; one image in memory at a time.
+) -> tuple[Series, np.ndarray | None]:
+    """Views [M, R, C, 1] of a topic of images, and motions [M, 4] of visual odometry where it is configured;
+    one image in memory at a time.
 
     Raises:
         InputError: an image cannot be decoded, or does not fit the settings.
@@ -125,7 +105,7 @@ def read_image_views(
     rows = camera_rows(frames(), image, visual_odometry, where)
     views = as_series(where, numbers, stamps, rows.view, clock, report)
     motion = None if rows.motion is None else rows.motion[np.isin(numbers, views.numbers)]
-    return BagImages(views, motion)
+    return views, motion
 
 
 class _RangeReader:
@@ -145,7 +125,9 @@ class _RangeReader:
 
     def view(self, content: Any, place: str) -> RangeView | None:
         """As `scan_view` and `cloud_view`."""
-        config, sensor, reach = self._config, content.header.frame_id, self.reach or _reach(content)
+        config, sensor = self._config, content.header.frame_id
+        longest = scan_limits(content)[1] if self._topic.kind == SCAN else LONGEST
+        reach = self.reach or min(longest, LONGEST)
         pixels = config.rows * config.columns
         if self._topic.kind == CLOUD:
             view = cloud_view(content, self._mount(sensor), config.heights, pixels, reach, place)
@@ -180,12 +162,7 @@ class _RangeReader:
                 mount = mount_of(self._bag, self._body, sensor, self._clock)
             if mount is None:
                 frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
-                cure = f"the sensor is taken to look ahead (else set {KEY}.yaw)"
+                cure = f"the sensor is taken to look ahead (else --set {KEY}.yaw=ANGLE)"
                 self._bag.warn(f"{self._bag.path}: no transform {frames} in /tf_static; {cure}")
             self._mounts[sensor] = mount or FORWARD
         return self._mounts[sensor]
-
-
-def _reach(content: Any) -> float:
-    """The range that becomes 1 where none is given, m."""
-    return min(scan_limits(content)[1], LONGEST) if hasattr(content, "ranges") else LONGEST

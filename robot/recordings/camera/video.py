@@ -75,7 +75,7 @@ def describe_video(path: Path) -> VideoDescription:
 def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
     """Errors of a file of stamps: no such column, numbers that are not finite, times that do not increase."""
     errors = file.absences([(column, "video.time")])
-    return errors or file.faults(column) + clock_errors(file.column(column, "time"), column, file.place)
+    return errors or file.judge([column])[1] + clock_errors(file.column(column, "time"), column, file.place)
 
 
 def video_frames(

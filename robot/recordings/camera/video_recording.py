@@ -3,9 +3,7 @@ themselves."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,18 +11,16 @@ import numpy as np
 from robot.recordings.camera.rows import CameraRows, camera_rows
 from robot.recordings.camera.video import VideoConfig, stamp_errors, video_frames
 from robot.recordings.csv_config import CsvConfig
-from robot.recordings.csv_file import CsvFile, read_csv
+from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
 from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of, raise_errors, require_file
+from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
 from robot.sources.registry import Warn
 from tactile.base.errors import InputError
 
 if TYPE_CHECKING:
     from robot.recordings.formats import RecordingConfig
-
-BLOCK = 1 << 20  # bytes of a video read at once for its hash
 
 
 def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
@@ -45,7 +41,7 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         raise_errors(stamp_errors(stamps, video.time))
     visual = config.visual_odometry if wheels is None else None
     rows = camera_rows(video_frames(path, video, stamps, judge.warn), config.image, visual, str(path))
-    digest = _digest(path, stamps)
+    digest = digest_of_files([path], b"" if stamps is None else stamps.content)
     inside = judge.stretch.rows(rows.time, str(path))
     rows = CameraRows(*(None if part is None else part[inside] for part in rows))  # type: ignore[arg-type]
     if wheels is not None:
@@ -119,13 +115,3 @@ def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits, warn: Warn) -
     truth, errors = align_truth(file, table.truth, time, limits, same_rows=False, warn=warn)
     raise_errors(errors)
     return truth
-
-
-def _digest(path: Path, stamps: CsvFile | None) -> str:
-    """SHA-256 (hex) of the video and its stamps."""
-    total = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(BLOCK):
-            total.update(block)
-    total.update(stamps.content if stamps is not None else b"")
-    return total.hexdigest()

@@ -96,7 +96,7 @@ def read_path(config: PathFileConfig) -> RatPath:
 def _read_csv_path(file: Path) -> tuple[RatPath, RowName]:
     table = read_csv(file)
     raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
-    raise_errors(table.faults("t", "x", "y"))
+    raise_errors(table.judge(["t", "x", "y"])[1])
     position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
     return RatPath(table.column("t", "time"), position), table.place
 

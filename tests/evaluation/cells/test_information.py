@@ -124,11 +124,9 @@ def test_product_cells_are_conjunctive_and_others_are_not() -> None:
     place = place_cells(walk.truth[:, :2], np.array([[0.4, 0.6]]), width=0.2)
     turn = direction_cells(walk.truth[:, 2], np.array([1.0]))
     edges = np.linspace(0, 1, 11)
-    cells = np.concatenate([place * turn, place, turn], axis=1)
-    samples = box_samples(*walk, cells, edges, edges, 8)
-    seconds, sums = sum_into(
-        samples.heading * 100 + samples.place, samples.seconds, samples.activity, (8, 10, 10)
-    )
+    samples = box_samples(*walk, np.concatenate([place * turn, place, turn], axis=1), edges, edges, 8)
+    at = samples.heading * 100 + samples.place
+    seconds, sums = sum_into(at, samples.seconds, samples.activity, (8, 10, 10))
     rates = sums / np.where(seconds > 0, seconds, np.nan)
     both, place_only, turn_only = conjunctive_information(rates, seconds)
     assert both > 0.5

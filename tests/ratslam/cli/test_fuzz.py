@@ -142,11 +142,11 @@ def test_spoilt_recordings(seeds: range, worker: CommandWorker, square: Path, tm
         if not whole.exists():
             done = worker.run(folder, "run", "c.yaml", "-o", whole, long=300.0)
             assert done.code == 0, done.said
-            assert "warning" not in done.said
+            assert "warning:" not in done.said
         how = f"{original.parent.name}/{name}: {spoil(folder / name, rng, list(recordings))}"
 
         def judge(command: str, outcome: Outcome, run: Path = folder / "run", whole: Path = whole) -> str:
-            if not command.endswith("-o run") or outcome.code != 0 or "warning" in outcome.said:
+            if not command.endswith("-o run") or outcome.code != 0 or "warning:" in outcome.said:
                 return ""
             off, usual = error(run, whole / "truth.tum"), error(whole, whole / "truth.tum")
             return "" if off <= 1.5 * usual + FLOOR else f"in silence {off:.3f} m instead of {usual:.3f} m"

@@ -37,7 +37,7 @@ def test_folders_without_a_run_are_refused(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "page.html"
-    output.write_text("as before")
+    output.write_text(before := "<!doctype html>\n<title>before · ratslam report</title>")
     (tmp_path / "empty").mkdir()
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "manifest.json").write_text("{}")
@@ -50,7 +50,7 @@ def test_folders_without_a_run_are_refused(
         (line,) = capsys.readouterr().err.splitlines()
         assert words in line
         assert str(tmp_path / name) in line
-    assert output.read_text() == "as before"
+    assert output.read_text() == before
     assert len(list(tmp_path.iterdir())) == 3
 
 
@@ -61,7 +61,7 @@ def test_a_page_that_cannot_be_written_is_refused_before_the_runs_are_read(
     (tmp_path / "folder").mkdir()
     assert main(["report", str(tmp_path / "no run"), "-o", str(tmp_path / name)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{tmp_path / name}: " in line
+    assert f"{(tmp_path / name) if name == 'folder' else tmp_path / 'missing'}: " in line
     assert "no run" not in line
 
 

@@ -53,7 +53,7 @@ def test_without_closures_the_map_is_odometry(trace, backend, tmp_path, capsys):
     sets = ["--set", f"recording.file={file}", "--set", "experience.closures=false"]
     assert main(["run", SQUARE, "-o", str(tmp_path / "run"), *sets, "--set", f"backend={backend}"]) == 0
     check_odometry(tmp_path / "run")
-    done, error, closures, warnings, health, *_ = capsys.readouterr().out.splitlines()
+    *_, done, error, closures, warnings, health = capsys.readouterr().out.splitlines()
     assert re.fullmatch(rf"{tmp_path}/run: \d+ steps of {trace} by {backend}, \S+ s, \S+ m by odometry", done)
     assert re.fullmatch(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", error)
     assert re.fullmatch("closures: (none|0 of .*)", closures)

@@ -21,7 +21,7 @@ def test_score_refuses_a_folder_or_file_without_a_log(capsys, tmp_path):
 
 def test_a_broken_scorecard_is_one_line(square, tmp_path):
     (tmp_path / "scorecard.json").write_text('{"name": 3}')
-    with pytest.raises(InputError, match=r"not a scorecard \(.*\)") as caught:
+    with pytest.raises(InputError, match=r"malformed \(name: .*\)") as caught:
         read_scorecard(tmp_path)
     assert "http" not in str(caught.value).replace("\n", "http")
 

@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.artifacts.manifest import RUNNING
-from evaluation.artifacts.run_directory import SESSION_REPORT, read_run, read_walls
+from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
+from evaluation.artifacts.run_directory import read_run, read_walls
 from evaluation.monitor.progress import RunMonitor, RunProgress
 from evaluation.monitor.watch import draw_watch, path_length, status_line, watch_run
 from ratslam.cli import main
@@ -166,7 +166,7 @@ def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_
     assert "run: mapper_gone, " in said
     assert "the run was killed" not in said
     (folder / SESSION_REPORT).write_text("{")
-    with pytest.raises(InputError, match="not a report"):
+    with pytest.raises(InputError, match="the report of a live session"):
         RunMonitor(folder).read()
 
 

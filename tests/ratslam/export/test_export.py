@@ -14,7 +14,7 @@ from evaluation.artifacts.nav2 import read_nav2
 from evaluation.artifacts.run_directory import read_run
 from evaluation.metrics.trajectory import read_tum
 from ratslam.export.formats import export_run
-from ratslam.pose_graph.io import read_g2o
+from tests.helpers.g2o import read_g2o
 from tests.ratslam.export.export_cases import GRID, assert_same_poses, messages, nanoseconds, pose_of
 
 

@@ -49,7 +49,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_devices(
     file = tmp_path / "config.yaml"
     file.write_text(yaml.safe_dump({"live": CREATE, "backend": "grid"}))
     assert main(["live", str(file), "-o", str(file / "run")]) == 2
-    assert f"{file / 'run'}: cannot be made (Not a directory); expected a writable" in capsys.readouterr().err
+    assert f"{file}: not a folder; expected an existing folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

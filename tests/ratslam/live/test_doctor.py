@@ -32,7 +32,7 @@ def test_it_finds_both_devices_and_moves_nothing(
 
 @pytest.mark.parametrize(
     ("settings", "fault"),
-    [({"head": {"address": "127.0.0.200"}}, "no head at 127.0.0.200"), ({"room": 1e18}, "GB free")],
+    [({"head": {"address": "127.0.0.200"}}, "no head at 127.0.0.200"), ({"room": 1e15}, "GB free")],
 )
 def test_what_is_missing_is_named(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, object], fault: str

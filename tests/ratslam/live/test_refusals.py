@@ -28,7 +28,7 @@ def write_config(bench: Bench, folder: Path, **settings: Any) -> list[str]:
         ({"arm": {"speed": 0.26}}, ["live.arm.speed", "0.25"]),
         ({"arm": {"speed": float("inf")}}, ["live.arm.speed"]),
         ({"lift": 0.6}, ["outside the box"]),
-        ({"room": 1e18}, ["GB free", "-o"]),
+        ({"room": 1e15}, ["GB free", "-o"]),
     ],
     ids=["outside", "nan", "fast", "infinite", "high", "full"],
 )

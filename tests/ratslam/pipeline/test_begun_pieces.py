@@ -12,8 +12,9 @@ import pytest
 from evaluation.metrics.map_pieces import energy_within_pieces
 from ratslam.core.session import Session, Step
 from ratslam.keyframes.keyframe_graph import APART
-from ratslam.pose_graph.io import read_g2o, read_json
+from ratslam.pose_graph.io import read_json
 from tactile.base.types import Observation
+from tests.helpers.g2o import read_g2o
 from tests.ratslam.pipeline.touch_walks import (
     WIDE,
     Walk,

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.pose_graph import Edges
-from ratslam.pose_graph.io import read_g2o, read_json, write_g2o, write_json
+from ratslam.pose_graph.io import read_json, write_g2o, write_json
 from tactile.base.errors import InputError
+from tests.helpers.g2o import read_g2o
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-VERTICES = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n"
 
 
 def example(seed=0):
@@ -44,57 +44,6 @@ def test_g2o_keeps_full_information(tmp_path):
     assert (again == poses).all()
     for ours, theirs in zip(edges, read, strict=True):
         assert (ours == theirs).all()
-
-
-def test_g2o_sorts_ids_and_passes_over_other_lines(tmp_path):
-    """Ids may be sparse and out of order; comments, blank lines and other elements are ignored."""
-    path = tmp_path / "map.g2o"
-    edge = "EDGE_SE2 7 3 1 2 3 1 0 0 1 0 1"
-    path.write_text(f"# note\nVERTEX_SE2 7 7 0 0\n\nFIX 3\nVERTEX_SE2 3 3 0 0\n{edge}\n")
-    poses, edges = read_g2o(path)
-    assert poses[:, 0].tolist() == [3, 7]
-    assert (edges.i.tolist(), edges.j.tolist()) == ([1], [0])
-
-
-def test_an_empty_g2o(tmp_path):
-    """No nodes and no links keep their shapes."""
-    path = tmp_path / "map.g2o"
-    path.write_text("")
-    poses, edges = read_g2o(path)
-    assert poses.shape == (0, 3)
-    assert edges.motion.shape == (0, 3)
-    assert edges.information.shape == (0, 3, 3)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "VERTEX_SE2",
-        "VERTEX_SE2 2 0 0",
-        "VERTEX_SE2 2 0 0 0 0",
-        "VERTEX_SE2 two 0 0 0",
-        "EDGE_SE2 0",
-        "EDGE_SE2 0 1 1 0 0 1 0 0 1 0",
-        "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 x",
-        "EDGE_SE2 0 1.5 1 0 0 1 0 0 1 0 1",
-    ],
-)
-def test_a_malformed_line_is_refused_with_its_place(tmp_path, line):
-    """The error names the file and the line."""
-    path = tmp_path / "map.g2o"
-    path.write_text(VERTICES + line + "\n")
-    with pytest.raises(InputError) as raised:
-        read_g2o(path)
-    assert raised.value.where == f"{path}:3"
-
-
-def test_an_edge_to_an_unknown_node_is_refused(tmp_path):
-    """Both nodes of a link must exist."""
-    path = tmp_path / "map.g2o"
-    path.write_text(VERTICES + "EDGE_SE2 0 9 1 0 0 1 0 0 1 0 1\n")
-    with pytest.raises(InputError, match="node 9") as raised:
-        read_g2o(path)
-    assert str(path) in raised.value.where
 
 
 def graph():

@@ -228,19 +228,26 @@ def _faulty(kind: str) -> MotionTrack:
         "two nodes": _two_nodes,
         "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
         "centimetres": lambda poses: poses * [100, 100, 1],
+        "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
     }
     poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
+    time = time * (10 if "slow" in kind else 1)
     if "gap" in kind:
         time = time + np.where(np.arange(len(time)) >= 120, 60.0, 0.0)
     return MotionTrack(time, everywhere, from_poses(time, poses), poses=poses)
 
 
 JUDGED = {
-    "wild, poses": (True, "row 150: the odometry jumps by 3", "largest_step to 0.2"),
+    "wild, poses": (True, "row 150: the odometry jumps by 3", "largest_step=0.2"),
     "reset, poses": (False, "row 230: the odometry jumps by", "recording.odometry.largest_step"),
-    "two nodes, poses": (True, "two nodes publish", "recording.topics.odometry.every to 2"),
+    "two nodes, poses": (True, "two nodes publish", "recording.topics.odometry.every=2"),
     "single precision, poses": (False, "precision was lost far from the origin", "double precision"),
-    "centimetres, poses": (True, "over 40 m/s", "these are centimetres: set recording.odometry.length_scale"),
+    "centimetres, poses": (
+        True,
+        "over 40 m/s",
+        "these are centimetres: --set recording.odometry.length_scale",
+    ),
+    "slow degrees, poses": (True, "headings agree with the direction", "turn_scale=0.0174533"),
     "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
     "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
     "gap, velocities": (True, "row 220: nothing for 60.1 s", "recording.odometry.largest_step"),
@@ -261,7 +268,7 @@ def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
     for piece in pieces:
         assert piece in said
     alone = judge_motion(*_faulty(kind)[:3:2], "session")
-    assert bool(alone) == (not kind.startswith("two"))
+    assert bool(alone) == (not kind.startswith(("two", "slow")))
 
 
 def test_a_clean_drive_has_no_finding() -> None:
@@ -279,7 +286,7 @@ def test_the_printed_cure_repeats_the_step_before(kind: str) -> None:
     told: list[str] = []
     errors = InputJudge(warn=told.append).errors(track, str, "file")
     (said,) = [*map(str, errors), *told]
-    settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+) to ([\d.]+)", said)}
+    settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+)=([\d.]+)", said)}
     correction = OdometryCorrection.model_validate(settings)
     assert InputJudge(correction=correction).errors(track, str, "file") == []
     mended = integrate(replace_steps(correction, track.motion[:, :3]))
@@ -314,7 +321,7 @@ def test_a_real_row_of_five_milliseconds_passes(find_trace: Callable[[str], Path
 
 def test_limits_can_be_raised(stream: Callable[..., Path], refused: Callable[..., InputError]) -> None:
     path = stream(in_v=np.full(12, 40.0), truth=None)
-    refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise limits.speed (25)")
+    refused(lambda: read_trace(path), "over 40 m/s", "if it really is so, raise recording.limits.speed (25)")
     config = RecordingConfig(file=path, limits=UnitLimits(speed=50.0))
     assert open_recording(config).length == 12
 

@@ -155,9 +155,9 @@ def test_a_faulty_maze_file_is_refused(
 
 
 def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    refused(lambda: read_maze(tmp_path / "none.txt"), "none.txt", "cannot be read")
+    refused(lambda: read_maze(tmp_path / "none.txt"), "none.txt", "no such file")
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    refused(lambda: read_maze(tmp_path / "bytes.txt"), "bytes.txt", "cannot be read")
+    refused(lambda: read_maze(tmp_path / "bytes.txt"), "bytes.txt", "malformed")
     (tmp_path / "empty.txt").write_text("\n\n")
     refused(lambda: read_maze(tmp_path / "empty.txt"), "empty.txt", "0 lines")
 

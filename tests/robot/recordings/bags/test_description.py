@@ -76,9 +76,9 @@ def test_topics_are_described(tmp_path: Path) -> None:
         "/image": ("views",), "/lab": (), "/odom": ("odometry", "truth"), "/scan": ("views",),
         "/skin": ("touch",), "/tf": (),
     }  # fmt: skip
-    assert topics["/scan"].shape == ScanShape(4, pytest.approx(0.4), False, 0.0, 30.0, 2.0, 0.25, 0.25)
+    assert topics["/scan"].shape == ScanShape(4, pytest.approx((-0.05, 0.4, 0.1)), False, 30.0, 2.0, 0.25)
     assert topics["/image"].shape == ImageShape(60, 12, "mono8", 7.0)
-    assert topics["/skin"].shape == ValueShape((), (2,), 200.0, 919.0)
+    assert topics["/skin"].shape == ValueShape((2,), 200.0, 919.0)
     assert (topics["/lab"].total, topics["/lab"].shape) == (3, None)
     wheels = topics["/odom"]
     assert (wheels.frame, wheels.child, wheels.total) == ("odom", "base_link", 20)
@@ -170,7 +170,7 @@ def test_a_turtlebot_is_read(reference_data: Path) -> None:
     topics = {topic.name: topic for topic in describe_bag(path).topics}
     ring = topics["/scan"].shape
     assert isinstance(ring, ScanShape)
-    assert (ring.beams, ring.ring, round(ring.nothing, 3)) == (720, True, 0.239)
+    assert (ring.beams, ring.extent.ring, round(ring.nothing, 3)) == (720, True, 0.239)
     settings = suggested_topics(describe_bag(path))
     assert settings == {"odometry": "/odom", "views": "/scan"}
     told: list[str] = []
