@@ -12,8 +12,7 @@ from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.merged_odometry import take_keyframes
 from ratslam.keyframes.step_record import StepRecord
 from ratslam.keyframes.travel import HALT, Travel
-from ratslam.recall.cropped_rows import CroppedRows
-from ratslam.recall.memory import MergedRows
+from ratslam.recall.memory import CroppedRows, MergedRows
 from tactile.base.se2 import between, compose, correct_heading, inverse
 
 Arrays = dict[str, np.ndarray]

@@ -17,8 +17,7 @@ from ratslam.core.session import capacity_at
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.recall import filter
 from ratslam.recall.config import sector_shifts
-from ratslam.recall.frozen import first_keyframes, frozen_memory
-from ratslam.recall.memory import MapFeedback, Memory
+from ratslam.recall.memory import MapFeedback, Memory, first_keyframes, frozen_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.se2 import between, compose
 from tactile.base.types import Array

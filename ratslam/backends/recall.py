@@ -21,19 +21,17 @@ from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.keyframes.acceptance import Acceptance, AcceptByEvidence
-from ratslam.keyframes.appearance import Appearance, ViewAppearance, WhiskerAppearance
+from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import FULL, Ablation
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.signed_appearance import SignedAppearance
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
-from ratslam.recall.cropped_rows import CroppedRows, crop_rows
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import MapFeedback, Memory, MergedRows, Modes
+from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, Modes, crop_rows
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,

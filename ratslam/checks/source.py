@@ -18,8 +18,15 @@ from ratslam.checks.common import (
     require_settings_class,
     run_checks,
 )
-from ratslam.checks.observations import require_brightness, require_finite, require_shapes
-from ratslam.checks.source_trial import SAMPLES, SourceTrial, is_recording, read
+from ratslam.checks.source_trial import (
+    SAMPLES,
+    SourceTrial,
+    is_recording,
+    read,
+    require_brightness,
+    require_finite,
+    require_shapes,
+)
 from robot.sources.registry import SOURCES
 from robot.sources.source import Sample, rate_of
 from robot.sources.source_info import SourceInfo

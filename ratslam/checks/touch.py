@@ -18,8 +18,7 @@ from ratslam.checks.common import (
     require_settings_class,
     run_checks,
 )
-from ratslam.checks.observations import require_brightness, require_finite, require_shapes
-from ratslam.checks.source_trial import Reading, read
+from ratslam.checks.source_trial import Reading, read, require_brightness, require_finite, require_shapes
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.registry import SOURCES
 from robot.sources.source import Source

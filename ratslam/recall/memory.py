@@ -319,3 +319,85 @@ def recallable(config: RecallConfig, memory: Memory) -> Array:
 def allowed_shifts(shifts: np.ndarray, memory: Memory) -> Array:
     """[S] bool, the shifts to compare: all once the sectors are known to be ordered, else 0 alone."""
     return (shifts == 0) | (memory.angle != 0)
+
+
+class CroppedRows(NamedTuple):
+    """Rows of the memory after a map was cropped.
+
+    Attributes:
+        rows: the rows that remain; those that do not are taken to be merged with any other. left: [N] bool,
+            former rows that remain. motion, length, turn: [3], m, rad: odometry from the newest row that
+            remains to the newest former one. elsewhere: the robot is in a piece of the map that is gone, so
+            that there is no such odometry.
+    """
+
+    rows: MergedRows
+    left: np.ndarray
+    motion: np.ndarray
+    length: float
+    turn: float
+    elsewhere: bool
+
+
+def crop_rows(memory: Memory, cropped: CroppedRows) -> Memory:
+    """The memory reduced to rows; the posterior of the others becomes novelty."""
+    left = np.zeros(memory.label.shape[0], bool)
+    left[: len(cropped.left)] = cropped.left
+    dtype = memory.x.dtype
+
+    def lose(modes: Modes) -> Modes:
+        mass = np.where(left[np.asarray(modes.anchor)], modes.mass, 0)
+        rest = np.where(left, modes.rest, 0) if modes.rest.size else modes.rest
+        return modes._replace(mass=jnp.asarray(mass, dtype), rest=jnp.asarray(rest, dtype))
+
+    own = lose(Modes(*(getattr(memory, name) for name in Modes._fields)))
+    memory = merge_rows(memory._replace(**own._asdict(), control=lose(memory.control)), cropped.rows)
+    labels = np.asarray(memory.label)[: cropped.rows.rows]
+    return memory._replace(
+        distinct=jnp.asarray(len(np.unique(labels[labels >= 0])), jnp.int32),
+        motion=jnp.asarray(compose(cropped.motion, np.asarray(memory.motion)), dtype),
+        length=memory.length + jnp.asarray(cropped.length, dtype),
+        turn=memory.turn + jnp.asarray(cropped.turn, dtype),
+    )
+
+
+def frozen_memory(
+    config: RecallConfig,
+    feedback: MapFeedback,
+    views: np.ndarray,
+    labels: np.ndarray,
+    capacity: int,
+    dtype: np.dtype,
+    groups: int,
+) -> Memory:
+    """A memory of N keyframes with an empty posterior.
+
+    Args:
+        feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores them.
+        capacity: rows, at least N. groups: see `init_memory`.
+    """
+    count = len(labels)
+    empty = init_memory(config, views.shape[1], capacity, dtype, groups)
+    view = np.zeros(empty.view.shape, empty.view.dtype)
+    view[:, :count] = views.T
+    label = np.full(capacity, -1, np.int32)
+    label[:count] = labels
+    filled = empty._replace(
+        view=jnp.asarray(view),
+        label=jnp.asarray(label),
+        count=jnp.int32(count),
+        distinct=jnp.int32(len(np.unique(labels[labels >= 0]))),
+    )
+    return apply_map_feedback(filled, feedback)
+
+
+def first_keyframes(memory: Memory, count: int) -> Memory:
+    """The memory as if it held only its first `count` keyframes, and had seen no view before."""
+    label = np.array(memory.label)
+    label[count:] = -1
+    return memory._replace(
+        count=jnp.int32(count),
+        label=jnp.asarray(label),
+        distinct=jnp.int32(len(np.unique(label[label >= 0]))),
+        before=jnp.zeros_like(memory.before),
+    )

@@ -46,14 +46,18 @@ RULER = 0.05  # m: smallest step in measuring the true path, so that noise does 
 STRETCHES = 50  # net turning is compared over this many, so that noise does not add up
 JUMP = 10.0
 """Typical steps above which a step is a jump; clean recordings stay below 5.1."""
-JUMPS = 0.01
-"""Largest share of the steps that can be jumps (always four): more are how this robot moves."""
+JUMPS, LONGEST = 0.05, 4
+"""Largest share of the steps that can be jumps (always four), most of them one after another: more are how
+this robot moves."""
 LEAST_TURN = 1.0
 """Smallest turn that is a jump, rad: a robot that hardly turns may turn sharply a few times."""
 GAP, LONG_GAP, LEAST_GAP = 10.0, 100.0, 1.0
 """Median intervals above which a velocity does not hold, and above which poses have a gap; at least 1 s."""
-SHORTEST, HELD = 4e-4, 5.0
-"""Shortest median interval of any odometry, s, and longest over which a velocity holds."""
+SHORTEST, HELD, TURN = 4e-4, 5.0, 1.0
+"""Shortest median interval of any odometry, s; longest, and largest typical turn, rad, over which a velocity
+holds."""
+RARE = {"cm": 0.5, "km": 1.0, "ns": 0.2, "us": 0.2, "ks": 0.3, "min": 0.5}
+"""Decades by which a unit is less likely than one of equal fit."""
 RETURNS, RETURNING = 0.25, 0.1
 """Share of a step within which the next one leads back, and share of the steps of two publishers that do."""
 ENOUGH, ALIKE = 20, (0.5, 0.9)
@@ -251,7 +255,9 @@ def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     for place in range(max(first, 1), len(ordered)):
         typical = ordered[np.searchsorted(done, done[place - 1] / 2)]
         if typical > 0 and ordered[place] > max(JUMP * typical, least):
-            return np.asarray(amounts >= ordered[place])
+            found = np.asarray(amounts >= ordered[place])
+            runs = np.diff(np.flatnonzero(np.diff(found, prepend=False, append=False)))[::2]
+            return found if runs.max() <= LONGEST else np.zeros(len(amounts), bool)
     return np.zeros(len(amounts), bool)
 
 
@@ -317,10 +323,11 @@ def _are_degrees(poses: np.ndarray) -> bool:
     step = np.diff(poses[:, :2], axis=0)
     length, heading = np.hypot(*step.T), poses[:-1, 2]
     moved = length > np.median(length[length > 0]) / 2 if (length > 0).any() else length > 0
+    if moved.sum() <= ENOUGH or np.ptp(heading) <= 2 * np.pi:
+        return False
     along = 2j * np.arctan2(step[moved, 1], step[moved, 0])
     agree = [abs(np.exp(2j * angle[moved] - along).mean()) for angle in (heading, np.radians(heading))]
-    wide = np.ptp(heading) > 2 * np.pi
-    return bool(wide and moved.sum() > ENOUGH and agree[0] < ALIKE[0] and agree[1] > ALIKE[1])
+    return bool(agree[0] < ALIKE[0] and agree[1] > ALIKE[1])
 
 
 def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
@@ -346,6 +353,9 @@ def typical_motion(track: MotionTrack) -> TypicalMotion:
     good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
     length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
     true_speed, path, turning = _compare_with_truth(track, good)
+    share = np.maximum(dt[good] / (interval or 1.0), 1.0)
+    tame = ~(_outliers(length / share, 0.0) | _outliers(turn / share, LEAST_TURN))
+    good[good], length, turn = tame, length[tame], turn[tame]
     speed, turn_rate = _typical(length, dt[good]), _typical(turn, dt[good])
     in_step = _typical(turn, np.ones_like(turn))
     return TypicalMotion(interval, speed, turn_rate, in_step, true_speed, path, turning)
@@ -413,7 +423,8 @@ def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, s
         found["time"] = f"half of the steps take less than {robot.interval:.2g} s"
     if robot.speed > limits.speed:
         found["length"] = f"half of the path is driven at over {robot.speed:.4g} m/s"
-    if robot.turn_rate > limits.turn_rate or robot.turn > np.pi:
+    most = TURN * limits.turn_rate / DEFAULT_LIMITS.turn_rate if held else np.pi
+    if robot.turn_rate > limits.turn_rate or robot.turn > most:
         turning = f"{robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
         found["angle"] = f"half of the turning is done at over {turning}"
     return found
@@ -438,6 +449,7 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
             continue
         values = np.array([changed.interval, changed.speed, changed.turn_rate])
         unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
+        unlike += sum(RARE.get(unit, 0.0) for unit in chosen)
         units = {key: unit for key, unit in named.items() if PER_UNIT[key][unit] != 1}
         best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
     return best[1]

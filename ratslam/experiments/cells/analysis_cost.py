@@ -16,7 +16,7 @@ from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import shuffled_scores
 from ratslam.experiments.cells.figure import CellFigure
 from ratslam.experiments.cells.rat_sessions import SECONDS, record_rat, with_active_cells
-from ratslam.experiments.cells.shuffled import PLACE_SCORES, place_bins
+from ratslam.experiments.cells.shuffles import PLACE_SCORES, place_bins
 from ratslam.experiments.cells.timing import Taken, median, on_one_core, time_call
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from robot.recordings.sanity_checks import still_axis
 from tactile.base.errors import InputError
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -67,6 +68,18 @@ TWISTS: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/TwistStamped": lambda message: message.twist,
 }
 """Message types with velocities in the frame of the robot."""
+
+
+def plane_errors(points: np.ndarray, where: str, role: str, plane: str) -> list[InputError]:
+    """The error for positions [M, 3] that lie in another plane than x and y; another one is taken as told."""
+    still = still_axis(points) if plane == "xy" and len(points) > 1 else ""
+    if not still:
+        return []
+    x, y, z = np.ptp(points, axis=0)
+    found = f"the path spans {x:.3g} m in x, {y:.3g} m in y and {z:.3g} m in z: another plane"
+    camera = f"if the poses are a camera's (z ahead), --set recording.topics.{role}.plane=xz"
+    cure = camera if still == "y" else "turn the poses into the plane of x and y"
+    return [InputError(where, found, "a path in the plane of x and y", cure)]
 
 
 def twist_in_plane(twist: Any) -> tuple[float, float, float]:

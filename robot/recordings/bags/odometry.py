@@ -10,10 +10,17 @@ import numpy as np
 
 from robot.recordings.bags.bag import Bag
 from robot.recordings.bags.config import OdometryTopic, PoseTopic
-from robot.recordings.bags.motions import POSES, TWISTS, frames_of, pose_in_plane, twist_in_plane
+from robot.recordings.bags.motions import (
+    POSES,
+    TWISTS,
+    frames_of,
+    plane_errors,
+    pose_in_plane,
+    twist_in_plane,
+)
 from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
 from robot.recordings.bags.transforms import poses_between
-from robot.recordings.sanity_checks import nonfinite_errors, still_axis
+from robot.recordings.sanity_checks import nonfinite_errors
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate, wrap
@@ -54,7 +61,7 @@ def read_odometry(bag: Bag, config: OdometryTopic, clock: Clock, report: Report)
     twist = False
     if config.tf is not None:
         body = config.tf[1]
-        series = poses_between(bag, config.tf, clock, report)
+        series = poses_between(bag, config.tf, clock, report, "odometry", config.plane)
     else:
         assert config.topic is not None
         kind = bag.topic(config.topic, "recording.topics.odometry").kind
@@ -83,7 +90,7 @@ def read_poses(bag: Bag, config: PoseTopic, clock: Clock, report: Report) -> Ser
         InputError: the topic does not exist or has no poses.
     """
     if config.tf is not None:
-        series = poses_between(bag, config.tf, clock, report)
+        series = poses_between(bag, config.tf, clock, report, "truth", config.plane)
     else:
         series, _ = _read_series(bag, config, "truth", clock, report, twist=False)
     return series._replace(errors=series.errors + nonfinite_errors(series.values, "truth", series.place))
@@ -148,12 +155,8 @@ def _read_series(
     errors = _frame_errors(where, numbers, pairs, role, poses, report)
     for doubt, at in doubts.items() if not errors else ():
         report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
-    if config.plane == "xy" and not (twist or errors) and still_axis(np.array(points)) == "y":
-        found = "the path spans {:.3g} m in x, {:.3g} m in y and {:.3g} m in z: another plane".format(
-            *np.ptp(points, axis=0)
-        )
-        cure = f"if the poses are a camera's (z ahead), --set recording.topics.{role}.plane=xz"
-        errors = [InputError(where, found, "a path in the plane of x and y", cure)]
+    if not (twist or errors):
+        errors = plane_errors(np.array(points), where, role, config.plane)
     series = as_series(where, numbers, times, values, clock, report, others)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
     return series._replace(errors=errors + series.errors), body

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.recordings.bags.bag import TRANSFORMS, Bag
-from robot.recordings.bags.motions import yaw_of
+from robot.recordings.bags.motions import plane_errors, pose_in_plane
 from robot.recordings.bags.stamps import (
     Clock,
     Report,
@@ -124,9 +124,18 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     return None
 
 
-def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Report) -> Series:
+class _Axes(NamedTuple):
+    x: float
+    y: float
+    z: float
+    w: float = 0.0
+
+
+def poses_between(
+    bag: Bag, frames: tuple[str, str], clock: Clock, report: Report, role: str, plane: str
+) -> Series:
     """Poses [M, 3] of a frame in another, at the times of the moving link with most transforms; the other
-    moving links are interpolated.
+    moving links are interpolated. A single link may lie in another plane.
 
     Raises:
         InputError: the frames do not exist, are not connected or do not move.
@@ -156,8 +165,10 @@ def poses_between(bag: Bag, frames: tuple[str, str], clock: Clock, report: Repor
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        values = np.array([(*shift[:2], yaw_of(*turn)) for _, shift, turn, _ in links[lead]])
-        return Series(where, moments, values, numbers, [])
+        given = [(_Axes(*shift), _Axes(*turn)) for _, shift, turn, _ in links[lead]]
+        poses = [pose_in_plane(*pose, where, plane) for pose in given]
+        errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
+        return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)
     start, end = max(times[pair][0] for pair in moving), min(times[pair][-1] for pair in moving)
     inside = (start <= moments) & (moments <= end)
     if not inside.any():

@@ -27,10 +27,9 @@ from evaluation.artifacts.manifest import read_manifest
 from evaluation.metrics.run_arrays import UNFINISHED
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.map_plot import align_layers
-from evaluation.report.charts import overlay_chart
+from evaluation.report.charts import PALETTE, overlay_chart
 from evaluation.report.closure_records import VIEW_BYTES, closure_records, halve, view_records
 from evaluation.report.page import content_policy, embedded_json, read_citations
-from evaluation.report.palette import PALETTE
 from evaluation.report.run_files import FILES, OTHER, list_run_files
 from evaluation.report.verdict import describe_score, judge_map
 from tactile.base.errors import InputError

@@ -11,7 +11,7 @@ from ratslam.atlas.crop import crop_map, keyframes_in_box, keyframes_of_piece, k
 from ratslam.atlas.difference import difference, keyframe_content
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.recall.config import RecallConfig
-from ratslam.recall.cropped_rows import crop_rows
+from ratslam.recall.memory import crop_rows
 from tactile.base.se2 import compose
 from tests.ratslam.keyframes.map_cases import CELL, LAP, STEP, drive, new_map
 from tests.ratslam.keyframes.merging_cases import Drive, circles

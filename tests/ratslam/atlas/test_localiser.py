@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from ratslam.alignment.ground import Ground
 from ratslam.atlas.localiser import Localisation, Localiser, Place
 from ratslam.core.types import Action, Estimate
+from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.calibration import HeadingNoise
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.map import KeyframeMap
 from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation, Odometry, observation

@@ -12,8 +12,7 @@ from ratslam.alignment.gain_odds import learn_gain_odds
 from ratslam.alignment.ground import Ground
 from ratslam.atlas.localiser import Place, Visits
 from ratslam.atlas.session_changes import Touch, session_changes
-from ratslam.keyframes.appearance import WhiskerAppearance
-from ratslam.keyframes.label_appearance import LabelAppearance
+from ratslam.keyframes.appearance import LabelAppearance, WhiskerAppearance
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 

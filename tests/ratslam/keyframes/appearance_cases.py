@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from hypothesis import strategies as st
 
-from ratslam.keyframes.appearance import ConfirmedPairs, ViewAppearance, WhiskerAppearance
-from ratslam.keyframes.label_appearance import LabelAppearance
+from ratslam.keyframes.appearance import ConfirmedPairs, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.recall.whisker_likelihood import pixel_layout
 from tactile.base.types import Odometry, observation
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.piece_ties import no_tie
 from tactile.base.types import Odometry, observation

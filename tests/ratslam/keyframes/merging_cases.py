@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.keyframes.acceptance import AcceptByEvidence
+from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.map import KeyframeMap
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
 from tactile.base.types import Odometry, observation

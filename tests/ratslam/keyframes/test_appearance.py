@@ -13,10 +13,10 @@ from ratslam.keyframes.appearance import (
     NEUTRAL_IMAGE_MISFIT,
     NEUTRAL_MISFIT,
     ConfirmedPairs,
+    LabelAppearance,
     ViewAppearance,
     WhiskerAppearance,
 )
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.recall.observation_model import label_gains
 from tests.ratslam.keyframes.appearance_cases import (
     PIXELS,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.config import Ablation, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.optimizer import MapCovariance, MapFit, MapProblem, solve
 from tactile.base.se2 import between, compose, wrap

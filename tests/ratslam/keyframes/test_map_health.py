@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from ratslam.keyframes import claimed_revisits as revisits
-from ratslam.keyframes.appearance import Appearance, ViewAppearance
+from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance
 from ratslam.keyframes.claimed_revisits import CONTROLS, claimed_revisits, claims_cost
 from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_health import DOUBTED, health_features, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, solved_map

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.keyframes.appearance import LabelAppearance
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.calibration import HeadingNoise
 from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.merged_odometry import ATTACHED, merge_keyframes
 from ratslam.keyframes.merging import Merge

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.keyframes.appearance import ViewMetric
+from ratslam.keyframes.appearance import LabelAppearance, ViewMetric
 from ratslam.keyframes.config import FULL, KeyframeMapConfig
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.label_appearance import LabelAppearance
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.merging import FACING, NEAR, REACH, find_merge
 from ratslam.recall.memory import NO_LIKENESS

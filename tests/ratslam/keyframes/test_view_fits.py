@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ratslam.keyframes.appearance import SAME_ID_LOG_ODDS
 from ratslam.keyframes.carried_solution import earlier_fits, learn_odds, view_fits
-from ratslam.keyframes.label_appearance import SAME_ID_LOG_ODDS
 from tests.ratslam.keyframes.map_cases import LAP, drive, new_map
 from tests.ratslam.keyframes.track_cases import FIT, laps, places
 

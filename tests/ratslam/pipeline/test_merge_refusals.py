@@ -15,8 +15,7 @@ from ratslam.cli import main
 from ratslam.pipeline import merge as merging
 from ratslam.pipeline.map_care import crop_saved, undo_sequence
 from ratslam.pipeline.map_settings import differing_settings
-from ratslam.pipeline.merge import merge_maps
-from ratslam.pipeline.merge_refusals import check_mergeable
+from ratslam.pipeline.merge import check_mergeable, merge_maps
 from ratslam.pipeline.saved_map import read_map, write_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from tests.ratslam.pipeline.test_map_formats import FILES

@@ -14,8 +14,8 @@ import pytest
 
 from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.closure_views import read_closure_views
+from evaluation.report.charts import PALETTE
 from evaluation.report.closure_records import display_gain
-from evaluation.report.palette import PALETTE
 from ratslam.cli import main
 from ratslam.pipeline.report import write_report
 from tests.helpers.square_run import copy_square_run

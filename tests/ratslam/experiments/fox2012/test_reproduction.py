@@ -14,8 +14,16 @@ from hypothesis import strategies as st
 from ratslam.cli import main
 from ratslam.cli.reproduce import FOX2012
 from ratslam.experiments.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
-from ratslam.experiments.fox2012.report import MEASURES, Measure, rank_mappers, render_rankings
-from ratslam.experiments.fox2012.reproduction import FIELDS, PAPER, plan_jobs, run_job
+from ratslam.experiments.fox2012.reproduction import (
+    FIELDS,
+    MEASURES,
+    PAPER,
+    Measure,
+    plan_jobs,
+    rank_mappers,
+    render_rankings,
+    run_job,
+)
 from ratslam.experiments.trials import reproduction
 from ratslam.experiments.trials.arena_trial import (
     collect_marks,

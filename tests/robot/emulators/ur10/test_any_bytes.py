@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.rtde_server import Claims, RtdeSession
-from robot.emulators.ur10.server import DashboardSession, ScriptSession, emulated_controller
+from robot.emulators.ur10.server import (
+    Claims,
+    DashboardSession,
+    RtdeSession,
+    ScriptSession,
+    emulated_controller,
+)
 
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))

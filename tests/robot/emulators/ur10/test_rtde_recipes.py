@@ -6,8 +6,7 @@ import struct
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.config import UrEmulatorConfig
-from robot.emulators.ur10.rtde_server import Claims, RtdeSession
-from robot.emulators.ur10.server import emulated_controller
+from robot.emulators.ur10.server import Claims, RtdeSession, emulated_controller
 from tests.robot.emulators.ur10.controller_bench import HERE, Bench
 
 

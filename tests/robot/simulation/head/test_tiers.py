@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit, make_beam
-from robot.simulation.head.dynamic import simulate_dynamic
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
 from robot.simulation.head.quasistatic import simulate_quasistatic
+from robot.simulation.head.session import simulate_dynamic
 from robot.simulation.head.whisk_stream import (
     MechanicsModel,
     simulate_cycles,
