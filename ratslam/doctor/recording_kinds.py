@@ -219,14 +219,12 @@ def _reach(shape: Shape | None) -> float:
 def _video(path: Path) -> FileContents:
     from robot.recordings.camera.video import describe_video
 
-    found = describe_video(path)
-    what = (
-        f"{path}: a video of {found.frames} frames, {found.width} x {found.height}, {found.rate:g} a second"
-    )
-    if not found.rate > 0:
+    frames, rate, width, height = describe_video(path)
+    what = f"{path}: a video of {frames} frames, {width} x {height}, {rate:g} a second"
+    if not rate > 0:
         fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
         return FileContents(what, None, faults=(fault,))
-    recording = {"video": {"rate": found.rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
+    recording = {"video": {"rate": rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
     return FileContents(what, recording, notes=(NO_WHEELS,))
 
 

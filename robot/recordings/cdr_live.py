@@ -23,11 +23,8 @@ WORDS = ("mode", "safety", "runtime", "operation", "progress")
 
 
 class Event(NamedTuple):
-    """An event of a live session.
-
-    Attributes:
-        time: s. name: one word, such as `fault` or `discontinuity`. text: details.
-    """
+    """An event of a live session. Attributes: time: s. name: one word, such as `fault` or `discontinuity`.
+    text: details."""
 
     time: float
     name: str

@@ -124,11 +124,8 @@ class Recording(ClosedSource):
 
 
 class Recovery(NamedTuple):
-    """Result of `recover`.
-
-    Attributes:
-        samples: number of samples. reason: fault of the old file, '' if it was complete.
-    """
+    """Result of `recover`. Attributes: samples: number of samples. reason: fault of the old file, '' if it
+    was complete."""
 
     samples: int
     reason: str

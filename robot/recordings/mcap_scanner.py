@@ -35,13 +35,8 @@ UNCLOSED = "it ends without its closing record"
 
 
 class RecordingDescription(NamedTuple):
-    """The metadata of a recording.
-
-    Attributes:
-        view_shape: (R, C, K). whiskers: W. rate_hz: nominal rate, 0 if unknown.
-        created_by: program and version.
-        info: devices, world and origin of the session.
-    """
+    """The metadata of a recording. Attributes: view_shape: (R, C, K). whiskers: W. rate_hz: nominal rate, 0
+    if unknown. created_by: program and version. info: devices, world and origin of the session."""
 
     view_shape: tuple[int, int, int]
     whiskers: int
@@ -107,13 +102,9 @@ def metadata_checksum(data: Mapping[str, str]) -> str:
 
 
 class RecordingEntry(NamedTuple):
-    """One entry of a recording.
-
-    Attributes:
-        name: its schema. time: s, of the reading or of the newest part of a block.
-        message: the encoded message. truth: the encoded truth of a reading, or None.
-        content: the decoded message: a sample, frames of a head, arm states [N], or an event.
-    """
+    """One entry of a recording. Attributes: name: its schema. time: s, of the reading or of the newest part
+    of a block. message: the encoded message. truth: the encoded truth of a reading, or None. content: the
+    decoded message: a sample, frames of a head, arm states [N], or an event."""
 
     name: str
     time: float

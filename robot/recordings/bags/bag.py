@@ -36,12 +36,8 @@ ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins wi
 
 
 class Topic(NamedTuple):
-    """A topic of a bag.
-
-    Attributes:
-        kind: its message type, such as nav_msgs/msg/Odometry. total: number of messages, as the file or
-            metadata.yaml counts them (the larger one).
-    """
+    """A topic of a bag. Attributes: kind: its message type, such as nav_msgs/msg/Odometry. total: number of
+    messages, as the file or metadata.yaml counts them (the larger one)."""
 
     name: str
     kind: str

@@ -84,11 +84,8 @@ class CloudShape(NamedTuple):
 
 
 class ImageShape(NamedTuple):
-    """Image, CompressedImage.
-
-    Attributes:
-        width, height: of the first message, pixels. encoding: or format. grey: mean, 0 to 255.
-    """
+    """Image, CompressedImage. Attributes: width, height: of the first message, pixels. encoding: or format.
+    grey: mean, 0 to 255."""
 
     width: int
     height: int
@@ -97,12 +94,8 @@ class ImageShape(NamedTuple):
 
 
 class ValueShape(NamedTuple):
-    """JointState, MultiArray.
-
-    Attributes:
-        sizes: of the layout's dimensions, else the number of values. low, high: of all values (positions of
-            joints).
-    """
+    """JointState, MultiArray. Attributes: sizes: of the layout's dimensions, else the number of values. low,
+    high: of all values (positions of joints)."""
 
     sizes: tuple[int, ...]
     low: float
@@ -110,12 +103,7 @@ class ValueShape(NamedTuple):
 
 
 class MotionShape(NamedTuple):
-    """Poses, velocities.
-
-    Attributes:
-        pose_path, pose_speed: length in m and typical speed in m/s of the poses. twist_path, twist_speed: of
-            the velocities. NaN without these.
-    """
+    """Poses, velocities: length in m and typical speed in m/s of each, NaN without these."""
 
     pose_path: float
     pose_speed: float
@@ -158,11 +146,8 @@ class FrameLink(NamedTuple):
 
 
 class BagDescription(NamedTuple):
-    """A bag.
-
-    Attributes:
-        topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is left out.
-    """
+    """A bag. Attributes: topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is
+    left out."""
 
     path: Path
     topics: tuple[TopicDescription, ...]

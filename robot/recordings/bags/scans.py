@@ -26,12 +26,8 @@ COVERED = 0.5
 
 
 class RangeView(NamedTuple):
-    """One view.
-
-    Attributes:
-        pixels: [P] in 0..1. lowest, typical: smallest and median range measured, m. covered: share of the
-            sectors in which the message has beams.
-    """
+    """One view. Attributes: pixels: [P] in 0..1. lowest, typical: smallest and median range measured, m.
+    covered: share of the sectors in which the message has beams."""
 
     pixels: np.ndarray
     lowest: float
@@ -40,11 +36,8 @@ class RangeView(NamedTuple):
 
 
 class Extent(NamedTuple):
-    """The directions that a scan covers, half a beam beyond the outer ones.
-
-    Attributes:
-        middle: rad. width: rad, negative for beams in clockwise order. step: rad between beams.
-    """
+    """The directions that a scan covers, half a beam beyond the outer ones. Attributes: middle: rad. width:
+    rad, negative for beams in clockwise order. step: rad between beams."""
 
     middle: float
     width: float

@@ -36,11 +36,8 @@ Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is fol
 
 
 class Mount(NamedTuple):
-    """Where a sensor sits in the frame of the robot.
-
-    Attributes:
-        rotation: [3, 3] from the frame of the sensor. position: [3] m.
-    """
+    """Where a sensor sits in the frame of the robot. Attributes: rotation: [3, 3] from the frame of the
+    sensor. position: [3] m."""
 
     rotation: np.ndarray
     position: np.ndarray

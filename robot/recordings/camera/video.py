@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -42,34 +42,16 @@ class VideoConfig(Settings):
     """Largest time between a frame and its nearest odometry row, s; null: the median step."""
 
 
-class VideoDescription(NamedTuple):
-    """A video file, as it describes itself.
-
-    Attributes:
-        frames: number. rate: frames per second, 0 if it does not say. width, height: pixels.
-    """
-
-    frames: int
-    rate: float
-    width: int
-    height: int
-
-
-def describe_video(path: Path) -> VideoDescription:
-    """What a video file says about itself.
+def describe_video(path: Path) -> tuple[int, float, int, int]:
+    """What a video file says about itself: frames, their rate (0 if it does not say), width and height.
 
     Raises:
         InputError: it is no video, or opencv is missing.
     """
     with _opened(path) as (cv2, video):
-        keys = (
-            cv2.CAP_PROP_FRAME_COUNT,
-            cv2.CAP_PROP_FPS,
-            cv2.CAP_PROP_FRAME_WIDTH,
-            cv2.CAP_PROP_FRAME_HEIGHT,
-        )
-        frames, rate, width, height = (float(video.get(key)) for key in keys)
-    return VideoDescription(int(frames), rate, int(width), int(height))
+        names = ("FRAME_COUNT", "FPS", "FRAME_WIDTH", "FRAME_HEIGHT")
+        frames, rate, width, height = (float(video.get(getattr(cv2, f"CAP_PROP_{name}"))) for name in names)
+    return int(frames), rate, int(width), int(height)
 
 
 def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
