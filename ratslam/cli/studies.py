@@ -285,7 +285,7 @@ def _size(arguments: argparse.Namespace) -> int:
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
     found = recommend(config, scene)
-    tell("trial runs take a minute or two, and several on a busy machine")
+    print("trial runs take a minute or two, and several on a busy machine", flush=True)
     print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
     runs = try_settings(config, found, arguments.cycles)
     print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")

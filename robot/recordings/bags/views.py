@@ -61,8 +61,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
     if wider := reader.wider_span():
         cure = f"--set {KEY}.span=[{wider[0]:.4f},{wider[1]:.4f}]"
         report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
-    numbers, stamps = ([row[k] for row in rows] for k in range(2))
-    found = [row[2] for row in rows]
+    numbers, stamps, found = [row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows]
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
     series = as_series(where, numbers, stamps, pixels, clock, report)
     lowest, typical = np.array([(view.lowest, view.typical) for view in found]).T
