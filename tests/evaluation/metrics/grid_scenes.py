@@ -6,10 +6,7 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.grid_error import (
-    Convention,
-    grid_error,
-)
+from evaluation.metrics.grid_error import Convention, grid_error
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,

@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.metrics.grid_error import (
-    CONVENTIONS,
-    MAIN_CONVENTION,
-    grid_error,
-    pool_errors,
-    smooth_truth,
-)
+from evaluation.metrics.grid_error import CONVENTIONS, MAIN_CONVENTION, grid_error, pool_errors, smooth_truth
 from evaluation.metrics.grid_metrics import CLAMP
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import (

@@ -7,12 +7,7 @@ import pytest
 
 from ratslam.alignment.ground import Ground
 from ratslam.atlas.session_changes import ContactMap, contact_map, contact_points, contact_signs
-from ratslam.recall.whisker_likelihood import (
-    PRIOR,
-    estimate_background,
-    log_odds_table,
-    pixel_layout,
-)
+from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig())

@@ -8,14 +8,7 @@ import numpy as np
 
 from ratslam.grid import particle_maps
 from ratslam.grid.particle_maps import EVIDENCE
-from tests.helpers.grid_world import (
-    BLANK,
-    STEADY,
-    filter_of,
-    initial,
-    report,
-    settings,
-)
+from tests.helpers.grid_world import BLANK, STEADY, filter_of, initial, report, settings
 
 FILTER = filter_of(settings())
 MOST = FILTER.config.footprint.max_log_odds

@@ -86,10 +86,7 @@ def map_of(name):
     return file
 
 
-SELDOM = {
-    "a batch equals its members": {EXAMPLE},
-    "single precision stays single": {"grid", EXAMPLE},
-}
+SELDOM = {"a batch equals its members": {EXAMPLE}, "single precision stays single": {"grid", EXAMPLE}}
 """Checks that compile most, and the backends of which `make test` makes them."""
 
 

@@ -10,14 +10,7 @@ import pytest
 from ratslam.backends.grid import GridOutcome
 from ratslam.grid.particle_maps import EVIDENCE
 from tactile.base.types import MotionKind
-from tests.helpers.grid_world import (
-    TIPS,
-    at_pose,
-    drive,
-    initial,
-    report,
-    with_map,
-)
+from tests.helpers.grid_world import TIPS, at_pose, drive, initial, report, with_map
 from tests.ratslam.backends.grid_filters import (
     ALL,
     FILTER,

@@ -37,9 +37,7 @@ def test_maps_follow_their_particles():
 
 def test_the_literal_filter_resamples_at_every_report_with_evidence():
     _, _, evidence = drive(
-        PRINTED,
-        initial(PRINTED),
-        [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)],
+        PRINTED, initial(PRINTED), [report(0.02), report(0.02, touching=[1]), report(-0.05), report(turn=0.1)]
     )
     assert list(evidence.outcome) == [
         GridOutcome.RESAMPLED,

@@ -102,10 +102,7 @@ def test_a_known_start_is_just_believed(arena: Path) -> None:
             "create_simulation: {whiskers: {length: 0.12}, reports: 5}",
             "touch.reports.length is 0.12 and was 0.14",
         ),
-        (
-            f"create_simulation: {{whiskers: {{mounts: [{MOUNTS}]}}, reports: 5}}",
-            "when the map was made",
-        ),
+        (f"create_simulation: {{whiskers: {{mounts: [{MOUNTS}]}}, reports: 5}}", "when the map was made"),
         ("{create_simulation: {reports: 5}, touch: {reports: {walls: none}}}", "touch.reports.walls is none"),
     ],
     ids=["sensor", "size", "whiskers", "walls"],

@@ -82,11 +82,7 @@ def test_the_irat_becomes_a_configuration(write, tmp_path: Path, capsys) -> None
     settings = yaml.safe_load(output.read_text())
     assert settings["recording"] == {
         "file": "irat_red.bag",
-        "image": {
-            "crop": {"x_min": 0, "y_min": 0, "y_max": 150},
-            "rows": 20,
-            "columns": 60,
-        },
+        "image": {"crop": {"x_min": 0, "y_min": 0, "y_max": 150}, "rows": 20, "columns": 60},
         "topics": {"openratslam": "irat_red"},
     }
     assert settings["backend"] == "classic"

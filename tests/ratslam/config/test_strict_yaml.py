@@ -74,10 +74,7 @@ def test_not_a_number() -> None:
         ("\n- 1\n", "config.yaml:2:1: a list of 1; expected keys and values such as 'seed: 1'"),
         ("hello", "config.yaml:1:1: 'hello'; expected keys and values such as 'seed: 1'"),
         ("a: 1\n---\nb: 1", "config.yaml:2:1: a second document; expected only one"),
-        (
-            "a:\n  b: 1\n  c: 2\n  b: 3",
-            "config.yaml:4:3: a.b: given twice; the first is at config.yaml:2:3",
-        ),
+        ("a:\n  b: 1\n  c: 2\n  b: 3", "config.yaml:4:3: a.b: given twice; the first is at config.yaml:2:3"),
         ("a: [1, 2\nb: 3", "config.yaml:2:2: not YAML: expected ',' or ']', but got ':'"),
         ("a: 1\nb: [1, {c: 2}", "config.yaml:2:4: a bracket that is not closed"),
         ("b: [1, {c: 2", "config.yaml:1:8: a bracket that is not closed"),

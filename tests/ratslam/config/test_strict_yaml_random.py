@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 
 from ratslam.config.strict_yaml import LARGEST, MOST, SMALLEST, dump, load, parse, validate
 from tactile.base.errors import InputError
-from tests.ratslam.config.example_schema import (
-    VALID,
-    Config,
-    Simulation,
-    overridden,
-)
+from tests.ratslam.config.example_schema import VALID, Config, Simulation, overridden
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
 FLOATS = st.just(0.0) | st.floats(SMALLEST, LARGEST) | st.floats(-LARGEST, -SMALLEST)

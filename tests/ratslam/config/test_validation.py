@@ -91,10 +91,7 @@ def test_reads_every_part() -> None:
             "config.yaml:1:28: pose_cells.shape.2: 'x'; expected a whole number",
         ),
         ("pose_cells: {shape: [2, 2, 2]}", "config.yaml:1:13: pose_cells: one of x and y must be odd"),
-        (
-            f"weights: {[0] * 51}",
-            "config.yaml:1:10: weights: a list of 51; expected at most 50 values",
-        ),
+        (f"weights: {[0] * 51}", "config.yaml:1:10: weights: a list of 51; expected at most 50 values"),
     ],
 )
 def test_invalid_configurations_are_refused(text: str, message: str) -> None:

@@ -45,8 +45,7 @@ def own_names() -> Iterator[None]:
 
 @pytest.mark.usefixtures("own_names")
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(one, marks=pytest.mark.soak) if one in LONG else one for one in (*NAMES, *STEPS)],
+    "name", [pytest.param(one, marks=pytest.mark.soak) if one in LONG else one for one in (*NAMES, *STEPS)]
 )
 def test_an_example_prints_what_its_docstring_says(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

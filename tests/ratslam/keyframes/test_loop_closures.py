@@ -137,14 +137,7 @@ def test_a_break_strikes_out_later_candidates():
     log.strike(56, 2)
     assert log.accepted_rows().tolist() == [0, 1, 2]  # sequence 1 keeps its candidates before the break
     assert log.score(1) == 2.0
-    assert log.table()[:, 5].tolist() == [
-        0,
-        0,
-        1,
-        -1,
-        -1,
-        2,
-    ]  # an open sequence is spared, accepted or not
+    assert log.table()[:, 5].tolist() == [0, 0, 1, -1, -1, 2]  # an open sequence is spared, accepted or not
     assert log.table()[3, 6:9].tolist() == [np.inf, Verdict.UNDONE, 0.0]
     assert np.isnan(log.table()[3, 9])
     log.judge(2, Verdict.ACCEPTED)

@@ -8,14 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from ratslam.keyframes.optimizer import (
-    CalibrationPrior,
-    LoopClosures,
-    MapFit,
-    MapProblem,
-    System,
-    solve,
-)
+from ratslam.keyframes.optimizer import CalibrationPrior, LoopClosures, MapFit, MapProblem, System, solve
 from tactile.base.se2 import wrap
 from tests.ratslam.keyframes.optimizer_cases import (
     BOTH_WIDE,
@@ -116,9 +109,7 @@ def test_a_sequence_far_off_has_no_effect(bias):
     assert np.allclose(fit.weights[:3], right.weights, atol=0.01)
     assert apart(fit.poses, right.poses) < 5e-3
     trusting = solve(
-        from_odometry(chain, bias),
-        MapProblem(chain, both._replace(scale=np.full(4, SURE)), WIDE),
-        50,
+        from_odometry(chain, bias), MapProblem(chain, both._replace(scale=np.full(4, SURE)), WIDE), 50
     )
     assert apart(trusting.poses, right.poses) > 0.3
 
@@ -194,11 +185,7 @@ def test_one_false_closure_does_not_cost_its_sequence():
     closures = closures._replace(scale=np.full(3, 4.0))
     astray = closures._replace(i=np.where(np.arange(len(closures.i)) == 5, 20, closures.i))
     strict = solve(from_odometry(chain), MapProblem(chain, astray, WIDE), 50)
-    lenient = solve(
-        from_odometry(chain),
-        MapProblem(chain, astray._replace(cost_limit=6.0), WIDE),
-        50,
-    )
+    lenient = solve(from_odometry(chain), MapProblem(chain, astray._replace(cost_limit=6.0), WIDE), 50)
     sequence = closures.sequence[5]
     assert strict.weights[sequence] < 0.01
     assert lenient.weights[sequence] > 0.25

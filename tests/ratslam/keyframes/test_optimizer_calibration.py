@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.keyframes.optimizer import (
-    CalibrationPrior,
-    MapCovariance,
-    MapFit,
-    MapProblem,
-    solve,
-)
+from ratslam.keyframes.optimizer import CalibrationPrior, MapCovariance, MapFit, MapProblem, solve
 from tactile.base.se2 import between, compose, correct_heading, integrate, wrap
 from tests.ratslam.keyframes.optimizer_cases import (
     BOTH_WIDE,
@@ -51,10 +45,7 @@ def test_opposite_corrections_cancel_and_zero_changes_nothing(motion, length, bi
 @given(st.floats(0.5, 4), st.floats(-0.05, 0.05))
 def test_a_bias_accumulates_evenly(length, bias):
     straight = np.array([length, 0.0, 0.0])
-    whole, half = (
-        correct_heading(straight, length, bias),
-        correct_heading(straight / 2, length / 2, bias),
-    )
+    whole, half = (correct_heading(straight, length, bias), correct_heading(straight / 2, length / 2, bias))
     gap = between(whole, compose(half, half))
     assert abs(gap[2]) < 1e-12
     # The chord replaces the arc: an error of second order in the turn; a one-sided rule has first order.

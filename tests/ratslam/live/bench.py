@@ -106,11 +106,7 @@ class Bench:
             "patience": PATIENCE,
             "connect": PATIENCE,
         }
-        plan = {
-            "whisking": {"rate": 4.0},
-            "calibration": {"min_duration": 1.0},
-            "motion": {"speed": 0.05},
-        }
+        plan = {"whisking": {"rate": 4.0}, "calibration": {"min_duration": 1.0}, "motion": {"speed": 0.05}}
         head = {"address": self.host, "patience": PATIENCE, "silence": 20.0}
         usual = {
             "waypoints": LEGS,

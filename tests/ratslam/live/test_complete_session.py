@@ -76,12 +76,7 @@ def _begun(session: subprocess.Popen, log: Path) -> bool:
 
 
 def complete_session(
-    host: str,
-    folder: Path,
-    *settings: str,
-    longest: float,
-    freeze: float = 0.0,
-    options: Sequence[str] = (),
+    host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0, options: Sequence[str] = ()
 ) -> Path:
     """The run directory of a session that completes, on emulators of its own.
 

@@ -54,10 +54,7 @@ def test_a_session_reaches_its_goals(loopback: str, tmp_path: Path) -> None:
     ]  # fmt: skip
     given = [word for setting in settings for word in ("--set", setting)]
     directory = tmp_path / "live"
-    with (
-        emulated("ur10", UR_FAULTS, loopback, *given),
-        emulated("head", HEAD_FAULTS, loopback, *given),
-    ):
+    with emulated("ur10", UR_FAULTS, loopback, *given), emulated("head", HEAD_FAULTS, loopback, *given):
         command = [sys.executable, "-m", "ratslam", "live", CONFIG, "--ur-host", loopback, "--head", loopback]
         done = subprocess.run(
             [*command, "-o", str(directory), *given],

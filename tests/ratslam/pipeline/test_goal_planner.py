@@ -119,10 +119,7 @@ def test_a_wall_on_the_only_way_ends_the_drive_before_it():
     assert np.array(arm.poses)[:, 0].max() < 0.36 - 0.05, "the wall is at 0.36 m"
 
 
-@pytest.mark.parametrize(
-    ("goal", "found"),
-    [(99, "experience 99"), ((5.0, 5.0), "m from experience")],
-)
+@pytest.mark.parametrize(("goal", "found"), [(99, "experience 99"), ((5.0, 5.0), "m from experience")])
 def test_goals_off_the_map_are_refused(goal, found):
     config = GoalConfig(map=Path("map.npz"), to=(goal,))
     with pytest.raises(InputError, match=r"live\.plan\.goal\.to\[0\]") as error:

@@ -12,8 +12,7 @@ LONG = {"touch_circuits"}
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(k, marks=pytest.mark.soak) if k in LONG else k for k in touch.SESSIONS],
+    "name", [pytest.param(k, marks=pytest.mark.soak) if k in LONG else k for k in touch.SESSIONS]
 )
 def test_decisions_are_those_stored(name):
     stored = json.loads((touch.FOLDER / f"{name}.json").read_text(encoding="utf-8"))

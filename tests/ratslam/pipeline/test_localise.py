@@ -15,14 +15,7 @@ from ratslam.core.session import Session, Step
 from ratslam.recall.mirror import mirror_view
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Observation
-from tests.ratslam.pipeline.touch_walks import (
-    Walk,
-    empty_session,
-    follow,
-    shuffled,
-    simulate_walk,
-    unseen,
-)
+from tests.ratslam.pipeline.touch_walks import Walk, empty_session, follow, shuffled, simulate_walk, unseen
 
 FOUND, LOST = Localisation.FOUND, Localisation.LOST
 LAP = {"maze": {"columns": 5, "rows": 5, "loop": 12, "seed": 31003}}

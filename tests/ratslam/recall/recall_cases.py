@@ -11,12 +11,7 @@ import numpy as np
 from ratslam.recall import observation_model
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback, init_memory
 
 CELL = 0.1
 SIZE = 12

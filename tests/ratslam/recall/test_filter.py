@@ -11,11 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-)
+from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback
 from tactile.base.se2 import compose
 from tests.ratslam.recall.recall_cases import (
     ANGLE,

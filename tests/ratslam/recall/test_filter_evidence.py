@@ -14,18 +14,8 @@ from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import (
-    accumulate_motion,
-    current_pose,
-    store_keyframe,
-)
-from ratslam.recall.observation_model import (
-    LABEL_TEMPER,
-    LABELS,
-    SAMPLES,
-    ObservationLikelihood,
-    label_gains,
-)
+from ratslam.recall.memory import accumulate_motion, current_pose, store_keyframe
+from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
 from tests.ratslam.recall.recall_cases import (

@@ -20,12 +20,7 @@ from ratslam.recall.memory import (
     init_memory,
     store_keyframe,
 )
-from ratslam.recall.whisker_likelihood import (
-    DEAD,
-    HEIGHTS,
-    LEVELS,
-    pixel_levels,
-)
+from ratslam.recall.whisker_likelihood import DEAD, HEIGHTS, LEVELS, pixel_levels
 from tests.ratslam.recall.whisker_cases import (
     AHEAD,
     BOTH,

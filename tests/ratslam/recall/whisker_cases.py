@@ -10,20 +10,9 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback, init_memory
 from ratslam.recall.observation_model import touch_likelihood
-from ratslam.recall.whisker_likelihood import (
-    DEAD,
-    PRIOR,
-    estimate_background,
-    log_odds_table,
-    pixel_layout,
-)
+from ratslam.recall.whisker_likelihood import DEAD, PRIOR, estimate_background, log_odds_table, pixel_layout
 
 CELL = 0.05
 SHAPE = (3, 6, 1)

@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import (
-    assemble_cycle,
-    make_cut,
-)
+from robot.drivers.head.cycle_assembly import assemble_cycle, make_cut
 from robot.drivers.head.decoder import Frames
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder

@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.drivers.head.cycle_assembly import (
-    make_cut,
-)
+from robot.drivers.head.cycle_assembly import make_cut
 from robot.drivers.head.decoder import Frames
 from robot.drivers.outcome import SessionOutcome
 from robot.recordings.mcap_reader import Recording, recover

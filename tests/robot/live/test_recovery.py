@@ -14,14 +14,7 @@ import pytest
 from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import McapScanner
 from tactile.base.errors import InputError
-from tests.robot.live.live_recordings import (
-    START,
-    entries_of,
-    open_recorder,
-    same_bits,
-    session,
-    some_frames,
-)
+from tests.robot.live.live_recordings import START, entries_of, open_recorder, same_bits, session, some_frames
 
 
 def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:

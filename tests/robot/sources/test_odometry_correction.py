@@ -61,8 +61,7 @@ def test_a_recording_of_whiskers_is_corrected_sample_by_sample(tmp_path: Path) -
         for before, after in zip(one, two, strict=True):
             motion = np.array(before.reading.odometry, float)
             np.testing.assert_array_equal(
-                np.array(after.reading.odometry, float),
-                [*correct_motions(ERRORS, motion[:3]), motion[3]],
+                np.array(after.reading.odometry, float), [*correct_motions(ERRORS, motion[:3]), motion[3]]
             )
             np.testing.assert_array_equal(after.reading.contact, before.reading.contact)
 

@@ -11,13 +11,7 @@ from ratslam.cli import main
 from ratslam.cli.studies import PRESETS
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import load, override
-from ratslam.experiments.studies.presets import (
-    METHODS,
-    PARTS,
-    TIERS,
-    preset_study,
-    variations,
-)
+from ratslam.experiments.studies.presets import METHODS, PARTS, TIERS, preset_study, variations
 from ratslam.experiments.studies.records import RunLog
 from ratslam.experiments.studies.tiers import shortened
 from tactile.base.errors import InputError

@@ -16,13 +16,7 @@ from evaluation.metrics.statistics import pareto_optimal
 from ratslam.experiments.studies.metrics import COLUMNS, METRICS, find_error
 from ratslam.experiments.studies.report import make_report, render, save_report
 from ratslam.experiments.studies.schema import StudyPlan
-from ratslam.experiments.studies.summary import (
-    default_error,
-    label,
-    mark_optimal,
-    spread,
-    summarise,
-)
+from ratslam.experiments.studies.summary import default_error, label, mark_optimal, spread, summarise
 from tactile.base.errors import InputError
 from tests.ratslam.experiments.studies.conftest import record
 

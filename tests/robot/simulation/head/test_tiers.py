@@ -9,11 +9,7 @@ from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit,
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
 from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.session import simulate_dynamic
-from robot.simulation.head.whisk_stream import (
-    MechanicsModel,
-    simulate_cycles,
-    simulate_free_cycles,
-)
+from robot.simulation.head.whisk_stream import MechanicsModel, simulate_cycles, simulate_free_cycles
 from robot.world.head_trajectory import HeadPath, MotionConfig, plan_path
 from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.walls import Surroundings, Walls
