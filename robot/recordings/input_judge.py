@@ -56,6 +56,9 @@ GAP, LONG_GAP, LEAST_GAP = 10.0, 100.0, 1.0
 SHORTEST, HELD, TURN = 4e-4, 5.0, 1.0
 """Shortest median interval of any odometry, s; longest, and largest typical turn, rad, over which a velocity
 holds."""
+FAST, START, CRAWL, LEAST_PATH = 3.0, 15.0, 1e-3, 0.1
+"""Speed, m/s, from which starts are judged, and the fastest of any robot, m/s²; speed and whole path of one
+that hardly moves, m/s and m."""
 RARE = {"cm": 0.5, "km": 1.0, "ns": 0.2, "us": 0.2, "ks": 0.3, "min": 0.5}
 """Decades by which a unit is less likely than one of equal fit."""
 RETURNS, RETURNING = 0.25, 0.1
@@ -106,14 +109,15 @@ class TypicalMotion(NamedTuple):
 
     Attributes:
         interval: median time between rows, s. speed: m/s. turn_rate: rad/s. turn: rad in one step.
-        true_speed: of the truth, m/s. path, turning: totals (odometry, truth), m and net rad. NaN without
-            truth.
+        start: acceleration of the second fastest start from rest, m/s². true_speed: of the truth, m/s.
+        path, turning: totals (odometry, truth), m and net rad. NaN without truth.
     """
 
     interval: float
     speed: float
     turn_rate: float
     turn: float
+    start: float
     true_speed: float
     path: tuple[float, float]
     turning: tuple[float, float]
@@ -224,6 +228,10 @@ def judge_steps(
         yield finding
     elif jumps.any():
         yield _jump(steps, jumps, rows, limits)
+    path, speed = float(steps.length.sum()), steps.typical_length / (steps.interval or 1.0)
+    if 0 < path < LEAST_PATH and speed < CRAWL:
+        cure = "if these are kilometres, --set recording.odometry.length_scale=1000"
+        yield Finding(False, None, f"the whole path is {path:.3g} m, at {speed:.2g} m/s", "", cure)
 
 
 class _Steps:
@@ -357,8 +365,11 @@ def typical_motion(track: MotionTrack) -> TypicalMotion:
     tame = ~(_outliers(length / share, 0.0) | _outliers(turn / share, LEAST_TURN))
     good[good], length, turn = tame, length[tame], turn[tame]
     speed, turn_rate = _typical(length, dt[good]), _typical(turn, dt[good])
-    in_step = _typical(turn, np.ones_like(turn))
-    return TypicalMotion(interval, speed, turn_rate, in_step, true_speed, path, turning)
+    in_step, pace = _typical(turn, np.ones_like(turn)), length / dt[good]
+    starts = (pace[:-1] < 0.1 * speed) & (pace[1:] > 0.7 * speed)
+    hardest = np.sort(np.where(starts, np.diff(pace) / dt[good][1:], 0.0))[-2:]
+    start = float(hardest[0]) if len(hardest) == 2 else 0.0
+    return TypicalMotion(interval, speed, turn_rate, in_step, start, true_speed, path, turning)
 
 
 Cures = Callable[[str, str], str]
@@ -423,6 +434,8 @@ def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, s
         found["time"] = f"half of the steps take less than {robot.interval:.2g} s"
     if robot.speed > limits.speed:
         found["length"] = f"half of the path is driven at over {robot.speed:.4g} m/s"
+    elif robot.start > START * limits.speed / DEFAULT_LIMITS.speed and robot.speed > FAST:
+        found["length"] = f"it starts from rest to {robot.speed:.3g} m/s at {robot.start:.3g} m/s²"
     most = TURN * limits.turn_rate / DEFAULT_LIMITS.turn_rate if held else np.pi
     if robot.turn_rate > limits.turn_rate or robot.turn > most:
         turning = f"{robot.turn_rate:.4g} rad/s, {robot.turn:.3g} rad a step"
@@ -442,6 +455,7 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
         changed = robot._replace(
             interval=robot.interval * seconds,
             speed=robot.speed * metres / rate,
+            start=robot.start * metres / rate**2,
             turn_rate=robot.turn_rate * radians / rate,
             turn=robot.turn * radians * (seconds if held else 1.0),
         )

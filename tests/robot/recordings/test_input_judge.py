@@ -228,10 +228,12 @@ def _faulty(kind: str) -> MotionTrack:
         "two nodes": _two_nodes,
         "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
         "centimetres": lambda poses: poses * [100, 100, 1],
+        "slow centimetres": lambda poses: poses * [100, 100, 1],
+        "kilometres": lambda poses: poses * [1e-3, 1e-3, 1],
         "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
     }
     poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
-    time = time * (10 if "slow" in kind else 1)
+    time = time * {"slow degrees": 10, "slow centimetres": 2.5}.get(kind.split(",")[0], 1)
     if "gap" in kind:
         time = time + np.where(np.arange(len(time)) >= 120, 60.0, 0.0)
     return MotionTrack(time, everywhere, from_poses(time, poses), poses=poses)
@@ -247,6 +249,8 @@ JUDGED = {
         "over 40 m/s",
         "these are centimetres: --set recording.odometry.length_scale",
     ),
+    "slow centimetres, poses": (True, "starts from rest to 16 m/s", "length_scale=0.01"),
+    "kilometres, poses": (False, "the whole path is", "length_scale=1000"),
     "slow degrees, poses": (True, "headings agree with the direction", "turn_scale=0.0174533"),
     "milliseconds, velocities": (True, "over 100 s", "these are milliseconds: divide the times by 1000"),
     "kiloseconds, velocities": (True, "less than 1e-05 s", "these are kiloseconds"),
