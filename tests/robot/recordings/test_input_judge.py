@@ -272,7 +272,7 @@ def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
     for piece in pieces:
         assert piece in said
     alone = judge_motion(*_faulty(kind)[:3:2], "session")
-    assert bool(alone) == (not kind.startswith(("two", "slow")))
+    assert bool(alone) == (not kind.startswith(("two", "slow deg")))
 
 
 def test_a_clean_drive_has_no_finding() -> None:
