@@ -30,18 +30,13 @@ def spoil(path: Path, rng: np.random.Generator, others: list[Path]) -> str:
         other = others[rng.integers(len(others))]
         shutil.copy(other, path)
         return f"swapped for {other.name}"
-    special = {".csv": _cells, ".tum": _cells, ".json": _tree, ".yaml": _tree, ".npz": _arrays}.get(
-        path.suffix
-    )
-    return special(path, rng) if special and rng.random() < 0.67 else _bytes(path, rng)
+    kinds = {".csv": _cells, ".tum": _cells, ".json": _tree, ".yaml": _tree, ".npz": _arrays}
+    return kinds.get(path.suffix, _bytes)(path, rng) if rng.random() < 0.67 else _bytes(path, rng)
 
 
 def _bytes(path: Path, rng: np.random.Generator) -> str:
     content = bytearray(path.read_bytes())
     a, b, c = (int(place) for place in np.sort(rng.integers(0, len(content) + 1, 3)))
-    way = ("cut", "flipped", "zeroed", "doubled", "swapped", "inserted", "emptied", "shortened")[
-        rng.integers(8)
-    ]
     changes = {
         "cut": content[:b],
         "zeroed": content[:a] + bytes(len(content[a : a + 512])) + content[a + 512 :],
@@ -120,11 +115,9 @@ def _arrays(path: Path, rng: np.random.Generator) -> str:
     way = ("lost", "value", "values", "shape", "dtype", "longer", "header", "text")[rng.integers(8)]
     number = (np.nan, np.inf, -1.0, 1e308, 1e20, 0.0)[rng.integers(6)]
     if way in ("value", "values") and array.size and array.dtype.kind in "fi":
-        array = array.copy()
+        where = rng.integers(array.size) if way == "value" else slice(None)
         with np.errstate(all="ignore"):
-            array.flat[rng.integers(array.size) if way == "value" else slice(None)] = np.array(number).astype(
-                array.dtype
-            )
+            array.flat[where] = np.array(number).astype(array.dtype)
     elif way == "shape":
         array = array[None]
     elif way == "dtype" and array.dtype.kind in "fi":

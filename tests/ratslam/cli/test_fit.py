@@ -41,9 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_wheels_are_measured_and_the_file_is_included(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wheels_are_measured_and_the_file_is_included(folder: Path, capsys) -> None:
     rig = folder / "rig.yaml"
     assert main(["fit", str(folder / "drive_odometry.csv"), "-o", str(rig)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -62,14 +60,6 @@ def test_wheels_are_measured_and_the_file_is_included(
     assert f"# {lines[0]}" in rig.read_text()
 
 
-def test_a_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = folder / "there.yaml"
-    file.write_text("touch: {}\n")
-    assert main(["fit", str(folder / "drive_odometry.csv"), "-o", str(file)]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert file.read_text() == "touch: {}\n"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -80,11 +70,7 @@ def test_a_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[s
     ],
 )
 def test_each_mistake_gets_one_error(
-    folder: Path,
-    options: list[str],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    folder: Path, options: list[str], message: str, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(folder)
     Path("drive_truth.mcap").touch()
@@ -94,9 +80,7 @@ def test_each_mistake_gets_one_error(
     assert message in said.err
 
 
-def test_the_head_and_its_dead_whiskers_are_measured(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_head_and_its_dead_whiskers_are_measured(folder: Path, capsys) -> None:
     rig = folder / "head.yaml"
     wrong = ["--set", "touch.head.rest_deg=75", "--set", "touch.head.dead=[]"]
     assert main(["fit", str(folder / "w.mcap"), "-o", str(rig), *wrong]) == 0
@@ -110,9 +94,7 @@ def test_the_head_and_its_dead_whiskers_are_measured(
     assert head.dead == (4,)
 
 
-def test_without_truth_and_views_the_wheels_are_unknown(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_truth_and_views_the_wheels_are_unknown(folder: Path, capsys) -> None:
     rig = folder / "nothing.yaml"
     record = folder / "bare"
     record.mkdir()

@@ -109,11 +109,8 @@ def write_recordings(folder: Path) -> dict[Path, dict[str, Any]]:
         true = {"header": header(time), "pose": pose(*truth[k])}
         entries += [odometry(time, *path[k]), scan(time, REACH * views[k], -np.pi, np.pi / 9)]
         entries.append(Entry("/truth", "geometry_msgs/msg/PoseStamped", time, true))
-    topics = {
-        "odometry": "/odom",
-        "truth": "/truth",
-        "views": {"topic": "/scan", "max_range": REACH, "yaw": 0.0},
-    }
+    read = {"topic": "/scan", "max_range": REACH, "yaw": 0.0}
+    topics = {"odometry": "/odom", "truth": "/truth", "views": read}
     for kind in BAGS:
         (folder / kind).mkdir()
         bag = write_bag(folder / kind, kind, entries)
@@ -262,7 +259,6 @@ def bomb(path: Path) -> None:
 
 
 TOO_LARGE = {
-    "doctor bomb.npz": "256 MiB, or 32 times what is stored",
     f"run {SQUARE} --set recording.file=HERE/bomb.npz": "256 MiB, or 32 times what is stored",
     "doctor long.npz": "is not a plain array",
     "score ids.csv": "ids.csv:11: experience id 1e+20",

@@ -63,9 +63,7 @@ def test_an_unknown_command_is_refused(capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.parametrize(("name", "now"), RETIRED.items())
-def test_a_command_that_moved_answers_with_its_place(
-    name: str, now: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_that_moved_answers_with_its_place(name: str, now: str, capsys) -> None:
     assert main([name]) == 2
     assert capsys.readouterr().err == f"ratslam: error: `{name}` is now `ratslam {now}`\n"
     assert now.split()[0] in COMMANDS

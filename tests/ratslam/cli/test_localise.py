@@ -105,12 +105,7 @@ def refused(capsys: pytest.CaptureFixture[str], directory: Path, *arguments: str
     ids=["sensor", "whiskers", "shape", "transform", "geometry"],
 )
 def test_another_sensor_is_refused(
-    square: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    map: Path | str,
-    config: str,
-    message: str,
+    square: Path, tmp_path: Path, capsys, map: Path | str, config: str, message: str
 ) -> None:
     (tmp_path / "other.yaml").write_text(config)
     file = square / "map.npz" if map == "square" else map
@@ -138,9 +133,7 @@ def test_maps_of_methods_that_cannot_localise_are_refused(
     assert "expected a map made by `backend: recall`" in error
 
 
-def test_a_run_directory_without_a_map_is_refused(
-    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_directory_without_a_map_is_refused(square: Path, tmp_path: Path, capsys) -> None:
     shutil.copy(square / "config.yaml", tmp_path)
     for command in (
         ["localise", str(tmp_path), str(SQUARE)],

@@ -107,9 +107,7 @@ def test_a_known_start_is_just_believed(arena: Path) -> None:
     ],
     ids=["sensor", "size", "whiskers", "walls"],
 )
-def test_another_sensor_is_refused(
-    arena: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], config: str, message: str
-) -> None:
+def test_another_sensor_is_refused(arena: Path, tmp_path: Path, capsys, config: str, message: str) -> None:
     (tmp_path / "other.yaml").write_text(config)
     arguments = ["localise", str(arena / "map"), str(tmp_path / "other.yaml"), "-o", str(tmp_path / "run")]
     assert main(arguments) == 2
@@ -120,9 +118,7 @@ def test_another_sensor_is_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_maps_of_the_grid_filter_are_not_merged(
-    arena: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_maps_of_the_grid_filter_are_not_merged(arena: Path, tmp_path: Path, capsys) -> None:
     map = str(arena / "map")
     assert main(["merge", map, map, "-o", str(tmp_path / "both")]) == 2
     assert "has no keyframes whose views could be compared" in capsys.readouterr().err

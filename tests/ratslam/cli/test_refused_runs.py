@@ -147,12 +147,6 @@ def test_cut_and_empty_recordings_are_refused(capsys, tmp_path):
         refuses(capsys, ["run", SQUARE, "-o", tmp_path / "run", "--set", file], name)
 
 
-def test_an_existing_directory_is_not_changed(capsys, square):
-    before = {path: path.read_bytes() for path in square.iterdir()}
-    refuses(capsys, ["run", SQUARE, "-o", square], "exists")
-    assert before == {path: path.read_bytes() for path in square.iterdir()}
-
-
 def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
     again = ["run", SQUARE, "-o", tmp_path / "run", "--continue"]
     refuses(capsys, [*again, square / "map.npz"], "already")

@@ -33,9 +33,7 @@ def test_equal_runs_give_equal_pages(run: Path, tmp_path: Path, capsys: pytest.C
     assert pages[0].read_bytes() == pages[1].read_bytes()
 
 
-def test_folders_without_a_run_are_refused(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_without_a_run_are_refused(run: Path, tmp_path: Path, capsys) -> None:
     output = tmp_path / "page.html"
     output.write_text(before := "<!doctype html>\n<title>before · ratslam report</title>")
     (tmp_path / "empty").mkdir()
@@ -65,9 +63,7 @@ def test_a_page_that_cannot_be_written_is_refused_before_the_runs_are_read(
     assert "no run" not in line
 
 
-def test_without_its_libraries_nothing_is_begun(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_its_libraries_nothing_is_begun(run: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(page, "find_spec", lambda name: None if name == "plotly" else find_spec(name))
     for command in (
         ["report", str(run), "-o", str(tmp_path / "page.html")],

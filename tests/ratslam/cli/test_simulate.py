@@ -103,12 +103,6 @@ def test_a_recorded_session_gives_the_observations_of_the_simulation(raw, tmp_pa
         assert all(np.array_equal(part, same) for part, same in zip(one[1:], other[1:], strict=True))
 
 
-def test_an_existing_file_is_not_changed(capsys, folder):
-    before = (folder / "session.mcap").read_bytes()
-    refuses(capsys, ["simulate", folder / "config.yaml", "-o", folder / "session.mcap"], "exists already")
-    assert (folder / "session.mcap").read_bytes() == before
-
-
 def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_path):
     refuses(capsys, ["simulate", folder / "replay.yaml", "-o", tmp_path / "a.mcap"], "simulation: missing")
     assert not (tmp_path / "a.mcap").exists()

@@ -11,23 +11,9 @@ from tests.ratslam.config.example_schema import VALID, Config, PoseCells, Simula
 
 def test_override() -> None:
     document = parse(VALID, "config.yaml")
-    config = validate(
-        override(
-            document,
-            [
-                "pose_cells.excite_sigma=2e-3",
-                "pose_cells.shape.0=23",
-                "others.0.simulation=4",
-                "optional.excite_sigma=3",
-                "gains={up: 1}",
-                "gains.down=2",
-                "name=a=b",
-                "steps=1",
-                "steps=2",
-            ],
-        ),
-        Config,
-    )
+    set_first = ["pose_cells.excite_sigma=2e-3", "pose_cells.shape.0=23", "others.0.simulation=4"]
+    set_then = ["optional.excite_sigma=3", "gains={up: 1}", "gains.down=2", "name=a=b", "steps=1", "steps=2"]
+    config = validate(override(document, set_first + set_then), Config)
     assert config.pose_cells == PoseCells(excite_sigma=2e-3, shape=(23, 21, 36))
     assert config.others[0] == Simulation(simulation=4)
     assert config.optional == PoseCells(excite_sigma=3)
@@ -40,30 +26,24 @@ def test_override() -> None:
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("steps", "--set steps: not an assignment; expected key=value such as pose_cells.excite_sigma=1e-3"),
-        ("=1", "--set : not an assignment"),
-        ("a..b=1", "--set a..b: not an assignment"),
-        ("steps=", "--set steps: empty; expected a value"),
-        ("steps=yes", "--set steps: 'yes'; expected a whole number"),
-        ("steps=[1", "--set steps: a bracket that is not closed"),
-        ("steps=010", "--set steps: 010; expected a number without leading zeros"),
-        ("steps.x=1", "--set steps.x: steps is 5; expected a section to put a key in"),
-        ("weights.2=1", "--set weights.2: weights has 2 items; expected an index below 2"),
-        ("weights.x=1", "--set weights.x: weights has 2 items; expected an index below 2"),
-        ("stepz=1", "--set stepz: unknown key; did you mean 'steps'?"),
-        (
-            "pose_cells.exite_sigma=1",
-            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
-        ),
-        (
-            "pose_cells={exite_sigma: 1}",
-            "--set pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
-        ),
-        ("optional.shape.x=1", "--set optional.shape: a section of keys and values; expected a list"),
-        ("source.kind=bag", "--set source.path: missing; The file of the recording."),
+        ("steps", "steps: not an assignment; expected key=value such as pose_cells.excite_sigma=1e-3"),
+        ("=1", ": not an assignment"),
+        ("a..b=1", "a..b: not an assignment"),
+        ("steps=", "steps: empty; expected a value"),
+        ("steps=yes", "steps: 'yes'; expected a whole number"),
+        ("steps=[1", "steps: a bracket that is not closed"),
+        ("steps=010", "steps: 010; expected a number without leading zeros"),
+        ("steps.x=1", "steps.x: steps is 5; expected a section to put a key in"),
+        ("weights.2=1", "weights.2: weights has 2 items; expected an index below 2"),
+        ("weights.x=1", "weights.x: weights has 2 items; expected an index below 2"),
+        ("stepz=1", "stepz: unknown key; did you mean 'steps'?"),
+        ("pose_cells.exite_sigma=1", "pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?"),
+        ("pose_cells={exite_sigma: 1}", "pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?"),
+        ("optional.shape.x=1", "optional.shape: a section of keys and values; expected a list"),
+        ("source.kind=bag", "source.path: missing; The file of the recording."),
     ],
 )
 def test_override_errors(assignment: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         overridden(assignment, text="steps: 5\nweights: [1, 2]")
-    assert str(caught.value).startswith(message)
+    assert str(caught.value).startswith(f"--set {message}")

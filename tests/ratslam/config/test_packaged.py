@@ -80,9 +80,7 @@ def test_nothing_is_suggested_for_an_unlike_name() -> None:
         "reproduce templates {} -o new.npz",
     ],
 )  # fmt: skip
-def test_every_command_takes_a_name(
-    command: str, elsewhere: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_takes_a_name(command: str, elsewhere: Path, capsys) -> None:
     """A wrong setting is the error of a command that found the configuration."""
     assert main(command.format("squarre").split()) == 2
     assert "no such file or packaged configuration" in capsys.readouterr().err

@@ -30,72 +30,57 @@ def test_reads_every_part() -> None:
     [
         (
             "steps: 1\npose_cells:\n  exite_sigma: 2",
-            "config.yaml:3:3: pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
+            "3:3: pose_cells.exite_sigma: unknown key; did you mean 'excite_sigma'?",
         ),
-        (
-            "source: {sped: 3}",
-            "config.yaml:1:1: source.kind: missing; expected 'recording', 'bag' or 'simulation'",
-        ),
+        ("source: {sped: 3}", "1:1: source.kind: missing; expected 'recording', 'bag' or 'simulation'"),
         (
             "source: {kind: simulation, sped: 3}",
-            "config.yaml:1:28: source.sped: unknown key; the keys here are kind, simulation",
+            "1:28: source.sped: unknown key; the keys here are kind, simulation",
         ),
         (
             "source:\n  kind: simulation\n  simulation: x",
-            "config.yaml:3:15: source.simulation: 'x'; expected a whole number",
+            "3:15: source.simulation: 'x'; expected a whole number",
         ),
         (
             "others:\n- kind: simulatoin",
-            "config.yaml:2:9: others.0.kind: 'simulatoin'; expected 'recording', 'bag' or 'simulation'; "
+            "2:9: others.0.kind: 'simulatoin'; expected 'recording', 'bag' or 'simulation'; "
             "did you mean 'simulation'?",
         ),
         (
             "others:\n- kind: simulation\n- kind: bag",
-            "config.yaml:3:3: others.1.path: missing; The file of the recording.",
+            "3:3: others.1.path: missing; The file of the recording.",
         ),
-        ("source:\n  kind: bag", "config.yaml:1:1: source.path: missing; The file of the recording."),
+        ("source:\n  kind: bag", "1:1: source.path: missing; The file of the recording."),
         (
             "pose_cells:\n  excite_sigma: -1",
-            "config.yaml:2:17: pose_cells.excite_sigma: -1; expected a number greater than 0",
+            "2:17: pose_cells.excite_sigma: -1; expected a number greater than 0",
         ),
-        ("steps: -1", "config.yaml:1:8: steps: -1; expected a number greater than or equal to 0"),
-        ("steps: 1.5", "config.yaml:1:8: steps: 1.5; expected a whole number"),
-        ("steps: '5'", "config.yaml:1:8: steps: '5'; expected a whole number"),
-        ("steps: true", "config.yaml:1:8: steps: true; expected a whole number"),
-        ("steps:", "config.yaml:1:7: steps: nothing; expected a whole number"),
-        ("learn: yes", "config.yaml:1:8: learn: 'yes'; expected true or false"),
-        ("learn: 1", "config.yaml:1:8: learn: 1; expected true or false"),
-        ("name: 3", "config.yaml:1:7: name: 3; expected text"),
-        ("gains: 3", "config.yaml:1:8: gains: 3; expected a section of keys and values"),
-        ("gains:\n  left: 12:30", "config.yaml:2:9: gains.left: '12:30'; expected a number"),
-        ("gains: {left: .inf}", "config.yaml:1:15: gains.left: inf; expected a finite number"),
-        (
-            "pose_cells: [1]",
-            "config.yaml:1:13: pose_cells: a list of 1; expected a section of keys and values",
-        ),
-        ("optional: {shape: 3}", "config.yaml:1:19: optional.shape: 3; expected a list"),
-        ("metric: L1", "config.yaml:1:9: metric: 'L1'; expected 'l1' or 'cosine'; did you mean 'l1'?"),
-        (
-            "motion: Turns",
-            "config.yaml:1:9: motion: 'Turns'; expected 'forward' or 'turn'; did you mean 'turn'?",
-        ),
-        ("motion: back", "config.yaml:1:9: motion: 'back'; expected 'forward' or 'turn'"),
-        ("width: wide", "config.yaml:1:8: width: 'wide'; expected a number or a list"),
-        ("pose_cells: {shape: [1]}", "config.yaml:1:21: pose_cells.shape: a list of 1; expected 3 values"),
-        (
-            "pose_cells: {shape: [1, 2, 3, 4]}",
-            "config.yaml:1:21: pose_cells.shape: a list of 4; expected 3 values",
-        ),
-        (
-            "pose_cells: {shape: [1, 2, x]}",
-            "config.yaml:1:28: pose_cells.shape.2: 'x'; expected a whole number",
-        ),
-        ("pose_cells: {shape: [2, 2, 2]}", "config.yaml:1:13: pose_cells: one of x and y must be odd"),
-        (f"weights: {[0] * 51}", "config.yaml:1:10: weights: a list of 51; expected at most 50 values"),
+        ("steps: -1", "1:8: steps: -1; expected a number greater than or equal to 0"),
+        ("steps: 1.5", "1:8: steps: 1.5; expected a whole number"),
+        ("steps: '5'", "1:8: steps: '5'; expected a whole number"),
+        ("steps: true", "1:8: steps: true; expected a whole number"),
+        ("steps:", "1:7: steps: nothing; expected a whole number"),
+        ("learn: yes", "1:8: learn: 'yes'; expected true or false"),
+        ("learn: 1", "1:8: learn: 1; expected true or false"),
+        ("name: 3", "1:7: name: 3; expected text"),
+        ("gains: 3", "1:8: gains: 3; expected a section of keys and values"),
+        ("gains:\n  left: 12:30", "2:9: gains.left: '12:30'; expected a number"),
+        ("gains: {left: .inf}", "1:15: gains.left: inf; expected a finite number"),
+        ("pose_cells: [1]", "1:13: pose_cells: a list of 1; expected a section of keys and values"),
+        ("optional: {shape: 3}", "1:19: optional.shape: 3; expected a list"),
+        ("metric: L1", "1:9: metric: 'L1'; expected 'l1' or 'cosine'; did you mean 'l1'?"),
+        ("motion: Turns", "1:9: motion: 'Turns'; expected 'forward' or 'turn'; did you mean 'turn'?"),
+        ("motion: back", "1:9: motion: 'back'; expected 'forward' or 'turn'"),
+        ("width: wide", "1:8: width: 'wide'; expected a number or a list"),
+        ("pose_cells: {shape: [1]}", "1:21: pose_cells.shape: a list of 1; expected 3 values"),
+        ("pose_cells: {shape: [1, 2, 3, 4]}", "1:21: pose_cells.shape: a list of 4; expected 3 values"),
+        ("pose_cells: {shape: [1, 2, x]}", "1:28: pose_cells.shape.2: 'x'; expected a whole number"),
+        ("pose_cells: {shape: [2, 2, 2]}", "1:13: pose_cells: one of x and y must be odd"),
+        (f"weights: {[0] * 51}", "1:10: weights: a list of 51; expected at most 50 values"),
     ],
 )
 def test_invalid_configurations_are_refused(text: str, message: str) -> None:
-    assert refusal(text) == message
+    assert refusal(text) == f"config.yaml:{message}"
 
 
 def test_all_errors_are_reported_at_once_in_the_order_of_the_file() -> None:

@@ -47,9 +47,7 @@ def own_names() -> Iterator[None]:
 @pytest.mark.parametrize(
     "name", [pytest.param(one, marks=pytest.mark.soak) if one in LONG else one for one in (*NAMES, *STEPS)]
 )
-def test_an_example_prints_what_its_docstring_says(
-    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_example_prints_what_its_docstring_says(name: str, capsys, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     text = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
     said = re.findall(r"^    (.+)$", ast.get_docstring(ast.parse(text)) or "", re.MULTILINE)

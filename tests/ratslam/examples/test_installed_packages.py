@@ -74,9 +74,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_a_broken_package_is_named(
-    kind: str, site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_package_is_named(kind: str, site: Path, tmp_path: Path, capsys) -> None:
     module, target, cause = BROKEN[kind]
     name = f"broken_{kind}"
     install(site, name, module, {POINT: target.replace("module", name)})
@@ -92,9 +90,7 @@ def test_a_broken_package_harms_nothing_else(site: Path, tmp_path: Path) -> None
     assert main(["run", SQUARE, "-o", str(tmp_path / "run")]) == 0
 
 
-def test_a_name_of_two_packages_is_refused(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_of_two_packages_is_refused(site: Path, tmp_path: Path, capsys) -> None:
     for name in ("first_package", "second_package"):
         install(site, name, MODULE, {POINT: f"{name}:ENTRY"})
     told = refusal(capsys, tmp_path / "run", "reckoning")
@@ -103,9 +99,7 @@ def test_a_name_of_two_packages_is_refused(
         assert part in told
 
 
-def test_a_misspelt_name_of_an_installed_backend_is_corrected(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_misspelt_name_of_an_installed_backend_is_corrected(site: Path, tmp_path: Path, capsys) -> None:
     install(site, "unloaded", "1 / 0", {POINT: "unloaded:ENTRY"})
     assert "did you mean 'reckoning'?" in refusal(capsys, tmp_path / "run", "reconing")
 

@@ -101,9 +101,7 @@ def test_the_map_of_a_stage_is_scored_on_rows_held_out(scrambled: bool, tmp_path
     ("plugin", "text"),
     [("whisker_reach", "row,x\n0,1\n"), ("whisker_stage", ",px,py\n0,1,2\n"), ("whisker_stage", "")],
 )
-def test_bad_files_are_refused(
-    plugin: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_files_are_refused(plugin: str, text: str, tmp_path: Path, capsys) -> None:
     (tmp_path / "bad.csv").write_text(text)
     config = tmp_path / "bad.yaml"
     config.write_text(f"source: {{plugin: {plugin}, settings: {{file: {str(tmp_path / 'bad.csv')!r}}}}}\n")

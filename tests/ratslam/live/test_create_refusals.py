@@ -43,9 +43,7 @@ def test_invalid_sessions_are_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_refused_before_the_devices(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_cannot_be_made_is_refused_before_the_devices(tmp_path: Path, capsys) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(yaml.safe_dump({"live": CREATE, "backend": "grid"}))
     assert main(["live", str(file), "-o", str(file / "run")]) == 2
@@ -61,9 +59,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_devices(
         (["create", "live_create", "--set", "live.head.address=usb"], ["live.head.address"]),
     ],
 )
-def test_emulators_that_do_not_fit_are_refused(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], messages: list[str]
-) -> None:
+def test_emulators_that_do_not_fit_are_refused(capsys, arguments: list[str], messages: list[str]) -> None:
     assert main(["emulate", *arguments]) == 2
     output = capsys.readouterr().err
     for text in messages:

@@ -17,9 +17,7 @@ def check(bench: Bench, folder: Path, **settings: object) -> int:
     return main(["doctor", "--live", str(config)])
 
 
-def test_it_finds_both_devices_and_moves_nothing(
-    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_finds_both_devices_and_moves_nothing(bench: Bench, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("robot.live.selftest.MIN_RATE_SHARE", 0.0)  # a busy machine may be late
     before = bench.arm.state()
     assert check(bench, tmp_path, residual=1.0) == 0

@@ -13,9 +13,7 @@ from tests.ratslam.live.test_complete_session import PATIENT, SAME, check_sessio
 
 
 @pytest.mark.soak
-def test_it_maps_live_and_its_replay_gives_the_same_bits(
-    loopback: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_maps_live_and_its_replay_gives_the_same_bits(loopback: str, tmp_path: Path, monkeypatch) -> None:
     module = Path(dead_reckoning.__file__).read_text(encoding="utf-8")
     point = {"ratslam.backends:reckoning": "own_reckoning:ENTRY"}
     install(tmp_path / "site", "own_reckoning", module, point)

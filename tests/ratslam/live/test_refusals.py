@@ -33,11 +33,7 @@ def write_config(bench: Bench, folder: Path, **settings: Any) -> list[str]:
     ids=["outside", "nan", "fast", "infinite", "high", "full"],
 )
 def test_invalid_configurations_are_refused(
-    bench: Bench,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    settings: dict[str, Any],
-    messages: list[str],
+    bench: Bench, tmp_path: Path, capsys, settings: dict[str, Any], messages: list[str]
 ) -> None:
     before = bench.arm.state()
     assert main(write_config(bench, tmp_path, **settings)) == 2

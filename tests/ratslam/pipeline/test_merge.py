@@ -103,9 +103,7 @@ def test_a_merged_map_goes_on_as_any_other(joined: Path) -> None:
     assert np.array_equal(live, [step.pose for step in again.replay(readings)])
 
 
-def test_what_nothing_joins_stays_a_piece(
-    maps: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_nothing_joins_stays_a_piece(maps: dict[str, Path], tmp_path: Path, capsys) -> None:
     target = tmp_path / "both"
     assert main(["merge", str(maps["one"]), str(maps["other"]), "-o", str(target)]) == 0
     assert "Nothing in the views joins these maps" in capsys.readouterr().out
@@ -146,15 +144,6 @@ def test_a_map_is_not_merged_with_itself(maps: dict[str, Path], tmp_path: Path) 
     with pytest.raises(InputError, match="two or more maps"):
         merge_maps([maps["one"]], tmp_path / "both.npz")
     assert not list(tmp_path.iterdir())
-
-
-def test_an_existing_file_is_left_alone(
-    maps: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "both.npz").write_text("mine")
-    assert main(["merge", str(maps["one"]), str(maps["other"]), "-o", str(tmp_path / "both.npz")]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert (tmp_path / "both.npz").read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["both.npz", "both"])

@@ -83,9 +83,7 @@ def test_a_recording_of_a_session_has_its_readings(tmp_path: Path) -> None:
         ("rat_simulation.path.max_speed=0.1", "sargolini.npz:"),
     ],
 )
-def test_an_error_exits_with_two(
-    setting: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_exits_with_two(setting: str, message: str, tmp_path: Path, capsys) -> None:
     assert main(["run", "rat_box", "-o", str(tmp_path / "run"), "--set", setting]) == 2
     error = capsys.readouterr().err
     assert message in error

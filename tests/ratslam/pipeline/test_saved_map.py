@@ -153,11 +153,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def test_other_sensors_are_refused(run: ratslam.Result, changes: dict, message: str) -> None:
     sensor = read_map(run.directory).sensor._replace(geometry={"touch.head.length": 1})
     check_same_sensor("map.npz", sensor, sensor._replace(transform={}))
-    if message is None:
-        sensor, message = (
-            sensor._replace(geometry={"touch.head.length": 1}),
-            "touch.head.length is 2 and was 1",
-        )
     with pytest.raises(InputError, match=f"map.npz: made with another sensor: {message}"):
         check_same_sensor("map.npz", sensor, sensor._replace(**changes))
 

@@ -136,9 +136,7 @@ def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path)
     assert recover(path, tmp_path / "b.mcap").samples == recording.length
 
 
-def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "a.mcap"
     frames, recorder = some_frames(3 * RATE), open_recorder(path)
     with monkeypatch.context() as patch:

@@ -188,9 +188,7 @@ def test_touching_segments_do_not_cross() -> None:
 
 @settings(max_examples=20)
 @given(SEEDS, KINDS)
-def test_an_arena_file_is_read_back_equal(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
-) -> None:
+def test_an_arena_file_is_read_back_equal(tmp_path_factory, seed: int, config: ArenaConfig) -> None:
     arena = make_arena(config, seed)
     path = tmp_path_factory.getbasetemp() / "room.txt"
     path.write_text(arena_text(arena))

@@ -108,9 +108,7 @@ def test_joined_mazes_are_counted(maps: Path) -> None:
     assert measured("merge mazes", APART, maps)["joined"][0] == "0 of 1"
 
 
-def test_frames_of_many_sessions_are_those_of_the_merged_map(
-    maps: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_of_many_sessions_are_those_of_the_merged_map(maps: Path, monkeypatch) -> None:
     monkeypatch.setattr(merging, "SESSIONS", 3)
     found = measured("ten sessions", ORACLE, maps)
     frames, separate = found["keyframes after ten sessions, over those after one"]

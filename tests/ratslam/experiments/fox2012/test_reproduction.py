@@ -249,9 +249,7 @@ def test_an_interrupt_keeps_the_finished_sessions(tmp_path: Path, monkeypatch: p
     assert not (tmp_path / "fox-fig4.png").exists()
 
 
-def test_invalid_arguments_are_refused_before_anything_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_arguments_are_refused_before_anything_is_written(tmp_path: Path, capsys) -> None:
     folder = tmp_path / "a"
     for assignment, message in (
         ("grid.cell=-1", "grid.cell"),

@@ -20,9 +20,7 @@ def test_each_name_is_a_figure(name: str) -> None:
     assert not figure.title.endswith(".")
 
 
-def test_the_page_holds_what_was_measured_before_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_holds_what_was_measured_before_an_error(tmp_path: Path, monkeypatch) -> None:
     def measure(data: Path) -> str:
         require_recordings(data, "touch.csv")
         return "7 whiskers"

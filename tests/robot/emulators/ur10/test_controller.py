@@ -82,9 +82,7 @@ def test_the_watchdog_stops_the_arm_only_when_it_is_not_reset(frequency: float, 
 
 
 @pytest.mark.parametrize(("command", "name"), [(1, "moveJ"), (11, "servoJ"), (200, "an unknown function")])
-def test_a_command_that_is_not_emulated_ends_the_program(
-    command: int, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_that_is_not_emulated_ends_the_program(command: int, name: str, capsys) -> None:
     bench = Bench()
     assert bench.command(3, (*THERE, 0.1, 1.0), asynchronous=1)
     bench.ticks(0.1)

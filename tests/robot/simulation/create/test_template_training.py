@@ -115,16 +115,6 @@ def test_sessions_use_the_file(folder: Path, templates: StrainTemplates) -> None
     assert np.allclose(directions[0], directions[1], atol=10.01)
 
 
-def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = folder / "new" / "t.npz"
-    before = file.read_bytes()
-    assert main(["reproduce", "templates", str(folder / "create.yaml"), "-o", str(file)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("ratslam: error:") == 1
-    assert "exists" in error
-    assert file.read_bytes() == before
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -133,9 +123,7 @@ def test_an_existing_file_is_not_overwritten(folder: Path, capsys: pytest.Captur
         ("create_simulation: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
     ],
 )
-def test_invalid_sessions_are_refused(
-    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_sessions_are_refused(text: str, message: str, tmp_path: Path, capsys) -> None:
     config = tmp_path / "c.yaml"
     config.write_text(text)
     assert main(["reproduce", "templates", str(config), "-o", str(tmp_path / "t.npz")]) == 2

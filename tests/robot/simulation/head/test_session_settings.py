@@ -20,57 +20,44 @@ LOW = HeadConfig(rings=(RingConfig(length=0.16, radius=0.045, height=0.07),), re
 
 
 @pytest.mark.parametrize(
-    ("changes", "head", "pieces"),
+    ("changes", "pieces"),
     [
-        ({"maze": {"loop": 21}}, None, ["simulation.maze.loop", "21 cells", "even"]),
-        (
-            {"maze": {"heights": (0.05, 0.09)}},
-            None,
-            ["simulation.maze.heights", "0.09 m", "less than 0.082 m"],
-        ),
-        ({"maze": {"file": "ROOM"}}, None, ["simulation.path.loop", "circuits without a loop"]),
+        ({"maze": {"loop": 21}}, ["simulation.maze.loop", "21 cells", "even"]),
+        ({"maze": {"heights": (0.05, 0.09)}}, ["simulation.maze.heights", "0.09 m", "less than 0.082 m"]),
+        ({"maze": {"file": "ROOM"}}, ["simulation.path.loop", "circuits without a loop"]),
         (
             {"maze": {"file": "BLOCKED"}, "path": {"loop": LOOP}},
-            None,
             ["simulation.path.loop[0] to [1]", "the wall between cells (0, 0) and (1, 0)"],
         ),
         (
             {"maze": {"file": "BLOCKED"}, "path": {"cells": LOOP}},
-            None,
             ["simulation.path.cells[0] to [1]", "the wall between cells (0, 0) and (1, 0)"],
         ),
-        (
-            {"maze": {"file": "ROOM"}, "path": {"cells": [(0, 0), (2, 0)]}},
-            None,
-            ["cells[1]", "columns 0 to 1"],
-        ),
-        ({"maze": {"kind": "tree"}}, None, ["simulation.path", "without loops", "simulation.maze.kind"]),
-        ({"path": {"loop": [*LOOP, (3, 3)]}}, None, ["path.loop[3] to [4]", "neighbouring"]),
-        ({"path": {"loop": [(-1, 0), (0, 0)]}}, None, ["path.loop[0]", "cell (-1, 0)"]),
-        ({"path": {"cells": [(0, 0)]}}, None, ["simulation.path.cells", "at least two"]),
-        ({"path": {"circuits": "CAX"}}, None, ["simulation.path.circuits", "'CAX'"]),
-        ({"path": {"explore": 0.5}}, None, ["simulation.path", "0.5 s", "one whisk"]),
-        ({"whisking": {"amplitude_deg": 80.0}}, None, ["simulation.whisking.amplitude_deg", "70"]),
-        ({"kidnaps": {"count": 40, "ahead": 60.0}}, None, ["simulation.kidnaps", "40 times 60 s"]),
-        ({"fidelity": "kinematic", "raw": True}, None, ["simulation.fidelity", "no raw samples"]),
-        (
-            {"maze": {"share": 1.0}},
-            LOW,
-            ["simulation.path", "at 0.0 s, in cell", "whisker", "at rest is inside the", "of cell"],
-        ),
+        ({"maze": {"file": "ROOM"}, "path": {"cells": [(0, 0), (2, 0)]}}, ["cells[1]", "columns 0 to 1"]),
+        ({"maze": {"kind": "tree"}}, ["simulation.path", "without loops", "simulation.maze.kind"]),
+        ({"path": {"loop": [*LOOP, (3, 3)]}}, ["path.loop[3] to [4]", "neighbouring"]),
+        ({"path": {"loop": [(-1, 0), (0, 0)]}}, ["path.loop[0]", "cell (-1, 0)"]),
+        ({"path": {"cells": [(0, 0)]}}, ["simulation.path.cells", "at least two"]),
+        ({"path": {"circuits": "CAX"}}, ["simulation.path.circuits", "'CAX'"]),
+        ({"path": {"explore": 0.5}}, ["simulation.path", "0.5 s", "one whisk"]),
+        ({"whisking": {"amplitude_deg": 80.0}}, ["simulation.whisking.amplitude_deg", "70"]),
+        ({"kidnaps": {"count": 40, "ahead": 60.0}}, ["simulation.kidnaps", "40 times 60 s"]),
+        ({"fidelity": "kinematic", "raw": True}, ["simulation.fidelity", "no raw samples"]),
     ],
 )
 def test_impossible_settings_are_refused(
-    changes: dict[str, Any],
-    head: HeadConfig | None,
-    pieces: list[str],
-    tmp_path: Path,
-    refused: Callable[..., InputError],
+    changes: dict[str, Any], pieces: list[str], tmp_path: Path, refused: Callable[..., InputError]
 ) -> None:
     for name, drawing in {"ROOM": ROOM, "BLOCKED": BLOCKED}.items():
         (tmp_path / name).write_text(drawing)
     config = SimulationConfig.model_validate(changes).resolved(tmp_path)
-    refused(lambda: HeadSimulation(config, head), *pieces)
+    refused(lambda: HeadSimulation(config), *pieces)
+
+
+def test_a_head_that_does_not_fit_is_refused(refused: Callable[..., InputError]) -> None:
+    config = SimulationConfig.model_validate({"maze": {"share": 1.0}})
+    words = ("simulation.path", "at 0.0 s, in cell", "whisker", "at rest is inside the", "of cell")
+    refused(lambda: HeadSimulation(config, LOW), *words)
 
 
 @pytest.mark.parametrize(

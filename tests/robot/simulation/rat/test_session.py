@@ -133,22 +133,16 @@ def test_the_suggested_torus_is_larger_than_the_box() -> None:
 @pytest.mark.parametrize(
     ("phases", "message"),
     [
-        (
-            [{"start": 100, "dark": True}],
-            "phases.0.start: 100 s; expected a time within the session of 40.05 s",
-        ),
+        ([{"start": 100, "dark": True}], "0.start: 100 s; expected a time within the session of 40.05 s"),
         (
             [{"start": 1, "stretch": [2, 1]}, {"start": 30, "box": {}}],
-            "phases.1.start: the box is changed by an earlier phase too",
+            "1.start: the box is changed by an earlier phase too",
         ),
-        (
-            [{"start": 5, "kidnap": [0.0, 0.0]}],
-            r"phases.0.kidnap: the path comes no nearer to \(0, 0\) than 0.54 m",
-        ),
+        ([{"start": 5, "kidnap": [0.0, 0.0]}], r"0.kidnap: the path comes no nearer to \(0, 0\) than 0.54 m"),
     ],
 )
 def test_phases_that_cannot_be(phases: list[dict], message: str) -> None:
-    with pytest.raises(InputError, match=rf"^rat_simulation.{message}"):
+    with pytest.raises(InputError, match=rf"^rat_simulation.phases.{message}"):
         session(phases=phases)
 
 
