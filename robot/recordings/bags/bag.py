@@ -181,6 +181,10 @@ class Bag:
             return True
         return bool(self._stretch.inside(np.array([time / 1e9]), self._start)[0])
 
+    def since_start(self, received: float) -> float:
+        """s from the start of the recording to a time of receipt, ns."""
+        return received / 1e9 - self._start
+
     @cached_property
     def _start(self) -> float:
         """The first time of receipt, s."""

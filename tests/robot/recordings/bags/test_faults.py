@@ -32,8 +32,8 @@ MEMORY = 4 << 30  # bytes of address space beyond those in use
 Refused = Callable[..., InputError]
 
 
-def opened(path: Path, told: list[str] | None = None, **topics: Any) -> Source:
-    config = RecordingConfig.model_validate({"file": path, "topics": TOPICS | topics})
+def opened(path: Path, told: list[str] | None = None, to: float | None = None, **topics: Any) -> Source:
+    config = RecordingConfig.model_validate({"file": path, "topics": TOPICS | topics, "to": to})
     return open_recording(config, None if told is None else told.append)
 
 
@@ -196,6 +196,19 @@ def test_several_publishers_are_named_and_chosen(
         refused(lambda: opened(path, views=None), *pieces, cure)
     one = opened(path, views=None, odometry={"topic": "/odom", "frames": ["odom", "base_link"]})
     assert one.length == 12
+
+
+def test_a_frame_that_changes_once_is_cured_by_the_longer_part(tmp_path: Path, refused: Refused) -> None:
+    found = [odometry(time, 0.1 * row + 0.4 * (row > 7), 0.0, 0.0) for row, time in enumerate(TIMES)]
+    for row, entry in enumerate(found):
+        entry.fields["header"]["frame_id"], entry.fields["child_frame_id"] = (
+            "map" if row > 7 else "odom",
+            "base",
+        )
+    path = written(tmp_path, "ros1", found)
+    cure = f"recording.to={(TIMES[7] + TIMES[8] - 2 * TIMES[0]) / 2e9:.3f}"
+    refused(lambda: opened(path, views=None), "/odom, message 8", "several frames", f"--set {cure}")
+    assert opened(path, views=None, to=float(cure.split("=")[1])).length == 8
 
 
 def test_numbers_that_cannot_be_are_refused(tmp_path: Path, refused: Refused) -> None:
