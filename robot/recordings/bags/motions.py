@@ -37,7 +37,8 @@ def pose_in_plane(
     """
     turn = tuple(float(getattr(orientation, axis)) for axis in "xyzw")
     if not any(turn):
-        raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion")
+        cure = "of odometry, the velocities remain: --set recording.topics.odometry.use=twist"
+        raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion", cure)
     place = tuple(float(getattr(position, axis)) for axis in plane)
     for name, values in (("orientation", turn), ("position", place)):
         if not np.isfinite(values).all():

@@ -232,7 +232,7 @@ def test_numbers_that_cannot_be_are_refused(tmp_path: Path, refused: Refused) ->
     refused(
         lambda: opened(path, views=None, truth="/pose"), "/pose, message 0", "the orientation is 0, 0, 0, 0"
     )
-    refused(lambda: opened(path, views=None, odometry="/pose"), "orientation is 0")
+    refused(lambda: opened(path, views=None, odometry="/pose"), "orientation is 0", "odometry.use=twist")
     far = [scan(time, np.full(18, 5000.0), -1.5, 0.1, range_max=1e5) for time in TIMES]
     path = written(tmp_path, "sqlite3", [*WHEELS, *far])
     cure = "recording.topics.views.max_range"
