@@ -82,20 +82,9 @@ def test_some_hundred_steps_equal_those_of_the_torus(seed, often, speed):
     random_motion(41, seed, often, speed, 200)
 
 
-injections = given(
-    st.lists(
-        st.tuples(
-            st.integers(0, 119),
-            st.floats(-12, 12),
-            st.floats(-12, 12),
-            st.floats(-18, 18),
-            st.floats(1e-9, 3),
-        ),
-        max_size=8,
-    ),
-    st.floats(-1, 1),
-    st.floats(-1, 1),
-)
+places = [st.floats(-12, 12), st.floats(-12, 12), st.floats(-18, 18)]
+injection = st.tuples(st.integers(0, 119), *places, st.floats(1e-9, 3))
+injections = given(st.lists(injection, max_size=8), st.floats(-1, 1), st.floats(-1, 1))
 
 
 def injected(planted, speed, turn):

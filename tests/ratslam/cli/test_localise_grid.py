@@ -16,6 +16,7 @@ from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.localise import localising
 from ratslam.pipeline.saved_map import read_map
 from tactile.base.types import Odometry, observation
+from tests.ratslam.cli.test_localise import refused
 
 REPORTS = 600
 MOUNTS = ", ".join(
@@ -109,13 +110,10 @@ def test_a_known_start_is_just_believed(arena: Path) -> None:
 )
 def test_another_sensor_is_refused(arena: Path, tmp_path: Path, capsys, config: str, message: str) -> None:
     (tmp_path / "other.yaml").write_text(config)
-    arguments = ["localise", str(arena / "map"), str(tmp_path / "other.yaml"), "-o", str(tmp_path / "run")]
-    assert main(arguments) == 2
-    errors = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
-    assert len(errors) == 1
-    assert "made with " in errors[0]
-    assert message in errors[0]
-    assert not (tmp_path / "run").exists()
+    command = ["localise", str(arena / "map"), str(tmp_path / "other.yaml")]
+    error = refused(capsys, tmp_path / "run", *command)
+    assert "made with " in error
+    assert message in error
 
 
 def test_maps_of_the_grid_filter_are_not_merged(arena: Path, tmp_path: Path, capsys) -> None:

@@ -180,14 +180,10 @@ def test_an_output_that_appears_during_the_work_stays(tmp_path: Path, capsys, mo
         output.write_text("theirs")
 
     monkeypatch.setattr(map_care, "write_map", write)
-    assert "meanwhile" in refused(capsys, "map", "crop", FILE, "--piece", 0, "-o", output)
-    assert "meanwhile" in refused_again(capsys, output)
-    assert output.read_text() == "theirs"
-
-
-def refused_again(capsys: pytest.CaptureFixture[str], output: Path) -> str:
-    output.unlink()
-    return refused(capsys, "map", "undo", FILE, sequence(FILE), "-o", output)
+    for command in (("crop", FILE, "--piece", 0), ("undo", FILE, sequence(FILE))):
+        assert "meanwhile" in refused(capsys, "map", *command, "-o", output)
+        assert output.read_text() == "theirs"
+        output.unlink()
 
 
 def test_undo_does_not_replace_a_read_only_map_and_follows_a_link(tmp_path: Path, capsys) -> None:

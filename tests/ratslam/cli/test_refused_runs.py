@@ -29,6 +29,17 @@ from tests.ratslam.cli.run_cases import ROOT, SQUARE, refuses
         ("recording: {file: '${RATSLAM_NOT_SET}/a.npz'}\n", ["RATSLAM_NOT_SET"]),
         ("recording: {file: a.npz\n", [":"]),
         ("pose_cells: {}\nplaces: {radius: 0}\n", ["recording", "places.radius"]),
+        (
+            "touch: {}\n",
+            ["neither recording, simulation, create_simulation, rat_simulation, source nor live"],
+        ),
+        ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
+        ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
+        ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),
+        ("simulation: {maze: {file: none.txt}}\n", ["none.txt"]),
+        ("simulation: {whisking: {amplitude_deg: 75}}\n", ["simulation.whisking.amplitude_deg"]),
+        ("simulation: {}\ntouch: {head: {dead: [18]}}\n", ["touch.head", "0 to 17"]),
+        ("simulation: {maze: {loop: 7}}\n", ["simulation.maze.loop"]),
     ],
 )
 def test_a_faulty_config_is_refused(capsys, tmp_path, text, messages):

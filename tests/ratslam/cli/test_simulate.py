@@ -108,29 +108,6 @@ def test_a_configuration_without_a_simulation_is_refused(capsys, folder, tmp_pat
     assert not (tmp_path / "a.mcap").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "messages"),
-    [
-        (
-            "touch: {}\n",
-            ["neither recording, simulation, create_simulation, rat_simulation, source nor live"],
-        ),
-        ("recording: {file: a.npz}\nsimulation: {}\n", ["recording and simulation; give one"]),
-        ("simulation: {sed: 1}\n", ["did you mean 'seed'"]),
-        ("simulation: {path: {circuits: CA, explore: 3}}\n", ["circuits and explore", "exactly one"]),
-        ("simulation: {maze: {file: none.txt}}\n", ["none.txt"]),
-        ("simulation: {whisking: {amplitude_deg: 75}}\n", ["simulation.whisking.amplitude_deg"]),
-        ("simulation: {}\ntouch: {head: {dead: [18]}}\n", ["touch.head", "0 to 17"]),
-        ("simulation: {maze: {loop: 7}}\n", ["simulation.maze.loop"]),
-    ],
-)
-def test_a_faulty_config_is_refused(capsys, tmp_path, text, messages):
-    config = tmp_path / "config.yaml"
-    config.write_text(text)
-    refuses(capsys, ["run", config, "-o", tmp_path / "run"], *messages)
-    assert not (tmp_path / "run").exists()
-
-
 LONG = "simulation: {path: {explore: 30000}, mechanics: {poses: 2}}\n"
 
 

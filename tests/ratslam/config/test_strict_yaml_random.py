@@ -59,27 +59,10 @@ def _assigns_or_refuses(assignment: str) -> None:
     message.encode()
 
 
-MUTATIONS = st.lists(
-    st.tuples(
-        st.integers(0, len(VALID)),
-        st.integers(0, 6),
-        st.sampled_from(
-            [
-                *"[]{}:,-\n\t #&*!|>'\"%@`?~$\\\0\ufeff\x85\u2028",
-                "\n  ",
-                ": ",
-                "- ",
-                "1e-3",
-                "? ",
-                "${",
-                "\\U",
-            ]
-        )
-        | st.text(max_size=4),
-    ),
-    min_size=1,
-    max_size=4,
-)
+SIGNS = [*"[]{}:,-\n\t #&*!|>'\"%@`?~$\\\0\ufeff\x85\u2028", "\n  ", ": ", "- ", "1e-3", "? ", "${", "\\U"]
+INSERTED = st.sampled_from(SIGNS) | st.text(max_size=4)
+MUTATION = st.tuples(st.integers(0, len(VALID)), st.integers(0, 6), INSERTED)
+MUTATIONS = st.lists(MUTATION, min_size=1, max_size=4)
 ASSIGNMENTS = st.tuples(
     st.lists(
         st.sampled_from(["pose_cells", "shape", "others", "0", "7", "gains", "kind", ""]) | TEXTS, max_size=3

@@ -98,41 +98,28 @@ def _kill_emulator(robot: CreateBench, session: Session) -> float:
 
 
 FAULTS = (
-    Fault("Ctrl-C", "interrupted", HOLD, lambda robot, session: kill(session.process.pid, signal.SIGINT)),
-    Fault("bumper stuck", "bumper_stuck", 3.0 + HOLD, lambda robot, session: _line_fault(robot, "bump")),
-    Fault("wheel drop", "wheel_drop", HOLD, lambda robot, session: _line_fault(robot, "drop")),
-    Fault("cliff", "left_safe_mode", HOLD, lambda robot, session: _line_fault(robot, "cliff")),
-    Fault(
-        "silent",
-        "robot_silent",
-        0.3 + HOLD,
-        lambda robot, session: _line_fault(robot, "lose", replies=ENDLESS),
-    ),
+    Fault("Ctrl-C", "interrupted", HOLD, lambda _, session: kill(session.process.pid, signal.SIGINT)),
+    Fault("bumper stuck", "bumper_stuck", 3.0 + HOLD, lambda robot, _: _line_fault(robot, "bump")),
+    Fault("wheel drop", "wheel_drop", HOLD, lambda robot, _: _line_fault(robot, "drop")),
+    Fault("cliff", "left_safe_mode", HOLD, lambda robot, _: _line_fault(robot, "cliff")),
+    Fault("silent", "robot_silent", 0.3 + HOLD, lambda robot, _: _line_fault(robot, "lose", replies=ENDLESS)),
     Fault(
         "garbage",
         "robot_garbled",
         0.3 + HOLD,
-        lambda robot, session: _line_fault(robot, "scramble", replies=ENDLESS),
+        lambda robot, _: _line_fault(robot, "scramble", replies=ENDLESS),
     ),
     Fault("unplugged, plugged in", "link_lost", HOLD, _replug),
-    Fault("killed session", "", HOLD, lambda robot, session: kill(session.process.pid, signal.SIGKILL)),
+    Fault("killed session", "", HOLD, lambda _, session: kill(session.process.pid, signal.SIGKILL)),
     Fault("unplugged, killed session, plugged in", "", HOLD, _kill_unplugged),
+    Fault("killed mapper", "mapper_gone", HOLD, lambda _, session: kill(_mapper(session), signal.SIGKILL)),
     Fault(
-        "killed mapper", "mapper_gone", HOLD, lambda robot, session: kill(_mapper(session), signal.SIGKILL)
-    ),
-    Fault(
-        "killed watchdog",
-        "watchdog_gone",
-        HOLD,
-        lambda robot, session: kill(_watchdog(session), signal.SIGKILL),
+        "killed watchdog", "watchdog_gone", HOLD, lambda _, session: kill(_watchdog(session), signal.SIGKILL)
     ),
     Fault("killed emulator", "link_lost", np.inf, _kill_emulator),
     Fault("hanging session", "host_late", HANG, _hang),
     Fault(
-        "hanging watchdog",
-        "watchdog_gone",
-        HANG,
-        lambda robot, session: kill(_watchdog(session), signal.SIGSTOP),
+        "hanging watchdog", "watchdog_gone", HANG, lambda _, session: kill(_watchdog(session), signal.SIGSTOP)
     ),
 )
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
+from robot.drivers.ur10.rtde_protocol import DATA, INPUTS, OUTPUTS, PROTOCOL, START, TEXT
 from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.emulators.ur10.server import (
     Claims,
@@ -32,19 +33,7 @@ def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
         controller.tick(0.0)
 
 
-@given(
-    kind=st.sampled_from(
-        [
-            rtde_protocol.PROTOCOL,
-            rtde_protocol.OUTPUTS,
-            rtde_protocol.INPUTS,
-            rtde_protocol.START,
-            rtde_protocol.DATA,
-            rtde_protocol.TEXT,
-        ]
-    ),
-    body=st.binary(max_size=40),
-)
+@given(kind=st.sampled_from([PROTOCOL, OUTPUTS, INPUTS, START, DATA, TEXT]), body=st.binary(max_size=40))
 def test_any_package_body_leaves_the_session_working(kind: int, body: bytes) -> None:
     session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):

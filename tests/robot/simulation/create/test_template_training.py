@@ -92,18 +92,9 @@ def test_the_report_marks_large_errors_and_missing_walls() -> None:
 
 
 def test_sessions_use_the_file(folder: Path, templates: StrainTemplates) -> None:
-    config = RunConfig.model_validate(
-        {
-            "create_simulation": {"reports": 60, "seed": 1},
-            "touch": {
-                "reports": {
-                    "walls": "template",
-                    "templates": folder / "new" / "t.npz",
-                    "max_template_error": None,
-                }
-            },
-        }
-    )
+    given = {"walls": "template", "templates": folder / "new" / "t.npz", "max_template_error": None}
+    simulated = {"create_simulation": {"reports": 60, "seed": 1}, "touch": {"reports": given}}
+    config = RunConfig.model_validate(simulated)
     assert config.create_simulation is not None
     walls = []
     for reports in (config.touch.reports, config.touch.reports.model_copy(update={"templates": None})):
