@@ -201,6 +201,7 @@ def _paint_path(
     axes: style.Axes, run: RunArrays, path: np.ndarray, truth: np.ndarray | None = None, **line: Any
 ) -> None:
     """Draws the mapped path [N, 2], each piece of the map in a colour of its own, `run.main` in blue."""
+    truth = path if len(run.state) else truth  # a pose that is searched for jumps as well
 
     def drawn(rows: np.ndarray) -> np.ndarray:
         return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
@@ -227,7 +228,8 @@ def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     moving = step[np.isfinite(step) & (step > 0)]
     if len(moving) == 0:
         return line
-    return np.insert(line, 1 + np.flatnonzero(step > _JUMP * np.quantile(moving, 0.9)), np.nan, axis=0)
+    usual = np.quantile(moving, 0.9, method="lower")
+    return np.insert(line, 1 + np.flatnonzero(step > _JUMP * usual), np.nan, axis=0)
 
 
 def _paint_start(axes: style.Axes, layers: Layers) -> None:

@@ -72,6 +72,7 @@ def _path_traces(report: RunReport) -> list[Any]:
     if not report.run.has_pieces and not len(report.run.state):
         path = final if truth is None else split_at_jumps(final, truth)
         return [_line(path, "trajectory", "final", width=1.6)]
+    truth = final if len(report.run.state) else truth  # a pose that is searched for jumps as well
     for rank, number in report.run.ranked_pieces():
         rows = np.flatnonzero(report.run.piece == number)
         path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])

@@ -123,7 +123,7 @@ def read_run_report(directory: Path) -> RunReport:
         online_error=Series(*_columns(directory / "online_error.csv", "t", "error")),
         cost=Series(step, seconds / np.maximum(steps_of, 1)),
         layers=layers,
-        map_path=_map_path(directory, run),
+        map_path=_map_path(directory, measured),
         walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
         truth_lines=lines,
         grid=grid,

@@ -131,6 +131,7 @@ def test_a_path_is_interrupted_only_where_the_robot_was_moved_by_hand(circle):
     found = split_at_jumps(path, path)
     assert np.flatnonzero(np.isnan(found).all(axis=1)).tolist() == [50]
     assert np.array_equal(np.delete(found, 50, axis=0), path)
+    assert np.isnan(split_at_jumps(path[46:54], path[46:54])[4]).all()
 
 
 def test_scoring_needs_no_matplotlib_and_drawing_no_pyplot():

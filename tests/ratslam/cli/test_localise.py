@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ratslam
+from evaluation.report.run_report import read_run_report
 from ratslam.backends.localise import LOG_ODDS
 from ratslam.cli import main
 from ratslam.pipeline.localise import check_assignments
@@ -49,6 +50,7 @@ def test_a_recording_is_found_in_its_own_map(found: Path, square: Path) -> None:
     assert np.median(np.hypot(*(where - mapped)[known][:, :2].T)) < 0.1
     assert json.loads((found / "manifest.json").read_text())["status"] == "complete"
     assert (found / "map.json").read_bytes() == (square / "map.json").read_bytes()
+    assert read_run_report(found).map_path is None
 
 
 def test_a_loop_localises_to_the_same_bits(found: Path, square: Path) -> None:
