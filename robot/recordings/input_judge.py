@@ -9,7 +9,7 @@ its place and a setting that cures it. The judge changes no pose: it only refuse
 |---|---|---|
 | unit | typical interval, speed or turn beyond `UnitLimits`; the units that explain it are named | error |
 | unit | headings follow the motion only as degrees; starts of over `START` at over `FAST` m/s | error |
-| unit | the whole path is under `LEAST_PATH` at under `CRAWL` m/s: kilometres, or a robot that stood | warning |
+| unit | a path under `LEAST_PATH` at under `CRAWL` m/s: kilometres, or a robot that stood | warning |
 | jump | one of the few largest steps, over `JUMP` typical ones | error if faster than `UnitLimits.speed` |
 | gap | a velocity held over `GAP` median intervals (1 s at least), over `JUMP` typical steps | error |
 | gap | the same while the robot stands; `LONG_GAP` intervals between poses or motions | warning |

@@ -182,8 +182,13 @@ class Bag:
         return bool(self._stretch.inside(np.array([time / 1e9]), self._start)[0])
 
     def since_start(self, received: float) -> float:
-        """s from the start of the recording to a time of receipt, ns."""
-        return received / 1e9 - self._start
+        """s from the start of the recording to a time of receipt, ns.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        with damage_errors(self.path):
+            return received / 1e9 - self._start
 
     @cached_property
     def _start(self) -> float:

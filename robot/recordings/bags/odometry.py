@@ -142,17 +142,17 @@ def _read_series(
             doubts.setdefault(doubt, []).append(place)
         return value
 
-    for number, received, content, value in bag.usable(topic, read):
+    for number, time, content, value in bag.usable(topic, read):
         if value is not None:
-            stamps = (stamp_of(content, received, each) for each in (clock, OTHER_CLOCK[clock]))
-            rows.append((number, *stamps, frames_of(content), bag.since_start(received)))
+            stamps = (stamp_of(content, time, each) for each in (clock, OTHER_CLOCK[clock]))
+            rows.append((number, *stamps, frames_of(content), time))
             kept.append(value)
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
-    numbers, times, others, pairs, since = ([row[k] for row in rows] for k in range(5))
+    numbers, times, others, pairs, received = ([row[k] for row in rows] for k in range(5))
     values = np.array(kept).reshape(-1, 3)
     poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
-    errors = _frame_errors(where, numbers, pairs, role, poses, since, report)
+    errors = _frame_errors(where, numbers, pairs, role, poses, received, bag, report)
     for doubt, at in doubts.items() if not errors else ():
         report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
     if not (twist or errors):
@@ -168,13 +168,14 @@ def _frame_errors(
     frames: list[Any],
     role: str,
     poses: np.ndarray,
-    since: list[float],
+    received: list[int],
+    bag: Bag,
     report: Report,
 ) -> list[InputError]:
     """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 
     Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
-    `since`: s from the start of the recording to each message; of a single change, the longer part is read.
+    `received`: times of receipt, ns; the cure of a single change is the longer part beside it.
     """
     counts = Counter(frames)
     if len(counts) < 2:
@@ -194,7 +195,8 @@ def _frame_errors(
     cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
     if len(changes) == 1:
         end = "to" if frames[0] == usual else "from"
-        cure = f"--set recording.{end}={np.mean(since[changes[0] : changes[0] + 2]):.3f}"
+        middle = float(np.mean(received[changes[0] : changes[0] + 2]))
+        cure = f"--set recording.{end}={bag.since_start(middle):.3f}"
     found += "; several nodes publish here, or it changes"
     return [InputError(at, found, "one frame and child frame", cure)]
 
