@@ -90,7 +90,7 @@ def check_loss(folder: Path, seconds: float) -> None:
     assert blocks > 20
     assert blocks - (newest + 1) / 20 <= 20  # 0.2 s of the session
     assert whisks <= scanner.count <= whisks + 1
-    assert scanner.broken == UNCLOSED
+    assert scanner.broken in (UNCLOSED, "it ends too early")  # killed between two writes, or within one
 
 
 def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:
