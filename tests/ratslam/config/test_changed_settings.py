@@ -34,7 +34,7 @@ def test_only_other_values_are_listed(tmp_path: Path) -> None:
 
 def test_a_setting_that_must_be_given_has_no_default(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
-    path.write_text("recording: {file: '/home/me/<b>.npz'}\n")
+    path.write_text("recording: {file: '/private/<b>.npz'}\n")
     (setting,) = changed_settings(path)
     assert (setting.path, setting.default) == ("recording.file", "")
     assert setting.value == '"<b>.npz"'  # pages are shared, folders are private
