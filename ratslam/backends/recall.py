@@ -64,8 +64,8 @@ class RecallEvidence(NamedTuple):
 
     Attributes:
         keyframe to background: see `RecallResult`. mirror_match to mirror_log_ratio: the same of the control
-            (`ratslam.recall.mirror`). energy: injected into the pose cells. packet: [3] decoded,
-            cells. health: see `RecallState`. outcome: an `Outcome`, int32.
+            (`ratslam.recall.mirror`); with whiskers those of no match. energy: injected into the pose cells.
+            packet: [3] decoded, cells. health: see `RecallState`. outcome: an `Outcome`, int32.
     """
 
     keyframe: Scalar
@@ -265,7 +265,11 @@ class RecallBackend(Backend):
     def _recall(
         self, memory: Memory, view: Array, label: Array
     ) -> tuple[Memory, RecallResult, mirror.Candidate]:
-        """Recognises the view, and by the control its mirror image."""
+        """Recognises the view, and its mirror image where the rule of acceptance reads the control."""
+        if self.pixels is not None:
+            memory, likelihood = self.likelihood(self.recall, memory, view, label)
+            memory, result = filter.recognise(self.recall, self.cell, memory, likelihood, self.recall.local)
+            return memory, result, _candidate(filter.empty_result(memory))
         first = mirror.first_look(memory, view, label, self.recall.local)
 
         def look(_: None, one: mirror.Look) -> tuple[None, tuple[Modes, RecallResult]]:
@@ -294,8 +298,6 @@ class RecallBackend(Backend):
         return memory, view_likelihood(config, self.cell, memory, view)
 
     def _mirrored(self, view: Array, angle: Array) -> Array:
-        if self.pixels is not None:
-            return view[self.pixels.mirrored]
         return mirror.mirror_view(view, self.view_shape, angle) if len(view) else view
 
     def _injection(self, memory: Memory, result: RecallResult) -> tuple[Array, Array]:

@@ -84,7 +84,8 @@ class Memory(NamedTuple):
         bias, turn_error, since, angle, scale, likeness: see `MapFeedback`.
         before: [S, C] likelihoods of the previous image, rest: [S, C] posterior outside the modes; both for
             whiskers only, else of size 0.
-        control: the posterior of the control (`ratslam.recall.mirror`).
+        control: the posterior of the control (`ratslam.recall.mirror`); of size 0 for whiskers, where no rule
+            reads it.
     """
 
     view: Array
@@ -151,7 +152,7 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         scale=zeros(),
         likeness=zeros(*learned),
         **_no_modes(config.modes, shape, dtype)._asdict(),
-        control=_no_modes(config.modes, shape, dtype),
+        control=_no_modes(0 if touch else config.modes, (shape[0], 0), dtype),
     )
 
 
@@ -168,7 +169,7 @@ def begin_piece(memory: Memory) -> Memory:
     zero, due = jnp.zeros((), dtype), jnp.asarray(np.inf, dtype)
     return memory._replace(
         **_no_modes(count, shape, dtype)._asdict(),
-        control=_no_modes(count, shape, dtype),
+        control=_no_modes(len(memory.control.mass), memory.control.rest.shape, dtype),
         motion=jnp.zeros(3, dtype), length=zero, turn=due,
     )  # fmt: skip
 

@@ -45,13 +45,11 @@ class PixelLayout(NamedTuple):
 
     Attributes:
         group: [D] number of each pixel's ring and channel; pixels of a group are statistically alike.
-        opposite: [D] the pixel of the opposite whisker. mirrored: [D] the pixel of the whisker on the other
-            side of the robot; the first whisker of each row points ahead.
+        opposite: [D] the pixel of the opposite whisker; the first whisker of each row points ahead.
     """
 
     group: np.ndarray
     opposite: np.ndarray
-    mirrored: np.ndarray
 
 
 def pixel_layout(view_shape: tuple[int, int, int]) -> PixelLayout:
@@ -60,8 +58,7 @@ def pixel_layout(view_shape: tuple[int, int, int]) -> PixelLayout:
     row, _, channel = np.indices(view_shape)
     number = np.arange(row.size).reshape(view_shape)
     opposite = np.roll(number, -(columns // 2), axis=1)
-    mirrored = number[:, -np.arange(columns) % columns]
-    return PixelLayout((row * channels + channel).reshape(-1), opposite.reshape(-1), mirrored.reshape(-1))
+    return PixelLayout((row * channels + channel).reshape(-1), opposite.reshape(-1))
 
 
 def live_pixels(observation: Observation) -> Array:
