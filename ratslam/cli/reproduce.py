@@ -240,6 +240,8 @@ def _cells(arguments: argparse.Namespace) -> int:
 
 
 BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
+SESSION_FILES = ("touch.csv", "buildings.csv")
+"""Files of the sessions of tables, which may be in one folder."""
 
 Lines = Callable[[argparse.Namespace], Iterator[str]]
 
@@ -249,7 +251,7 @@ def add_tables(tables: Commands) -> None:
 
     def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
-        parser.set_defaults(lines=lines)
+        parser.set_defaults(lines=lines, file="")
         return parser
 
     touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
@@ -261,6 +263,7 @@ def add_tables(tables: Commands) -> None:
         help="sessions per row (default: of the row, 12 to 40)",
     )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
+    add_session_file(touch, "touch.csv")
     grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
@@ -295,19 +298,40 @@ def add_tables(tables: Commands) -> None:
     chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 
+def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `-o` and `--against` of a table whose sessions are written to a file."""
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
+        help=f"folder for {file}, the figures of each session as soon as it is done",
+    )  # fmt: skip
+    add_against(parser, file)
+    parser.set_defaults(file=file)
+
+
+def add_against(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `--against`."""
+    parser.add_argument(
+        "--against", type=Path, metavar="DIR",
+        help=f"compare with the same sessions in {file} of an earlier run, given -o DIR",
+    )  # fmt: skip
+
+
 def _print_table(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     for line in arguments.lines(arguments):
         print(line, flush=True)
+    if arguments.file and arguments.output is not None:
+        print(f"\nwrote {arguments.output / arguments.file}")
     return 0
 
 
 def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.comparison import Files
     from ratslam.experiments.tables.markdown import select_rows
     from ratslam.experiments.tables.touch import DEFAULT_ROWS, ROWS, touch_table
 
-    rows = select_rows(arguments.rows, ROWS, DEFAULT_ROWS)
-    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend)
+    rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
+    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
 
 
 def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
