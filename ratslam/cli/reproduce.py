@@ -272,6 +272,7 @@ def add_tables(tables: Commands) -> None:
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    add_session_file(buildings, "buildings.csv")
     health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
@@ -355,8 +356,10 @@ def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.buildings import buildings_table, choose_rows
+    from ratslam.experiments.tables.comparison import Files
 
-    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers)
+    files = Files(arguments.output, arguments.against)
+    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers, files=files)
 
 
 def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:

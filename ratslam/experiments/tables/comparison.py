@@ -164,7 +164,8 @@ def _earlier_sessions(folder: Path, name: str, planned: Iterable[Key]) -> Sessio
         found = f"no {name} in it" if folder.is_dir() else "no such folder"
         raise InputError(str(folder), found, f"a folder with the {name} of an earlier run", cure)
     sessions = read_sessions(folder / name)
-    if sessions.keys().isdisjoint(wanted := list(planned)):
+    wanted = list(planned)
+    if wanted and sessions.keys().isdisjoint(wanted):
         found = f"none of the {len(wanted)} sessions to be measured ({_some(wanted)}), but {_some(sessions)}"
         raise InputError(str(folder / name), found, "a run of the same rows and sessions", cure)
     return sessions
@@ -276,7 +277,7 @@ def compare_runs(what: Compared, log: SessionLog, rows: Sequence[str]) -> Iterat
     columns: dict[str, Callable[[Pairs], str]] = {
         "sessions": lambda pairs: str(len(pairs.keys)),
         f"{what.label}, now / before [95 %]": lambda pairs: _ratio(pairs, what.error),
-        f"live {what.label}, now / before [95 %]": lambda pairs: _ratio(pairs, what.live),
+        f"live {what.label.split()[-1]}, now / before [95 %]": lambda pairs: _ratio(pairs, what.live),
         f"{what.label} / odometry, median": lambda pairs: _over_odometry(what, pairs),
         "worse than odometry": lambda pairs: _count(what.worse, pairs, what.error, what.odometry),
         "live worse than odometry": lambda pairs: _count(what.worse, pairs, what.live, what.odometry),
@@ -312,14 +313,16 @@ def compare_figures(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
             if row == ALL and len(having) < 2:
                 continue
             keys, old, new = pairs.named(name)
+            all_of = sum(key[0] in having for key in pairs.keys)
+            number = f"{len(keys)} of {all_of}" if len(keys) < all_of else str(all_of)
             cells: tuple[str, ...]
             if any(isinstance(one.get(name), bool) for one in pairs.new):
                 cells = f"{old.sum():.0f}", f"{new.sum():.0f}", "-", _changed(old > 0, new > 0)
                 changed = [" ".join(key) for key, is_new in zip(keys, new > old, strict=True) if is_new]
                 failures += [f"{name}: {', '.join(changed)}"] if changed and row != ALL else []
             else:
-                cells = _median(old), _median(new), _ratio(pairs, name), "-"
-            yield markdown_row([row, name, len(keys), *cells])
+                cells = _median(old), _median(new), _spread(paired_ratios(old, new)), "-"
+            yield markdown_row([row, name, number, *cells])
     yield from ["", f"New failures: {'; '.join(failures) or 'none'}."]
     yield from _provenance(log, rows)
 
@@ -361,11 +364,15 @@ def _failures(what: Compared, pairs: Pairs) -> tuple[list[Key], np.ndarray, np.n
 
 def _ratio(pairs: Pairs, name: str) -> str:
     ratio = paired_ratios(*pairs.known(name))
+    return _spread(ratio) + _of(len(ratio), pairs) * bool(len(ratio))
+
+
+def _spread(ratio: np.ndarray) -> str:
+    """Median of ratios [n], with its interval."""
     if not len(ratio):
         return "-"
     low, high = median_interval(ratio)
-    interval = f"[{low:.3f}-{high:.3f}]" if low == low else "[-]"
-    return f"{np.median(ratio):.3f} {interval}{_of(len(ratio), pairs)}"
+    return f"{np.median(ratio):.3f} " + (f"[{low:.3f}-{high:.3f}]" if low == low else "[-]")
 
 
 def _over_odometry(what: Compared, pairs: Pairs) -> str:

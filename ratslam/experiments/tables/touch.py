@@ -145,6 +145,7 @@ COMPARED = Compared(
     counts={"false / closures": ("false_closures", "closures")},
     medians={"revisits closed": "revisits_closed"},
 )  # fmt: skip
+"""Of two runs of the table."""
 COLUMNS = (
     "condition", "EM (worst)", "live EM", "odometry", "failures [95 %]", "worse than odometry (worst ratio)",
     "through experiences", "ARR", "ARCR strict (worst), chain-free", "revisits closed", "false / closures",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from scipy.stats import binom
 
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
-from ratslam.experiments.tables import comparison, touch
+from ratslam.experiments.studies import machine
+from ratslam.experiments.tables import buildings, comparison, touch
 from ratslam.experiments.tables.comparison import (
     Files,
     Record,
@@ -26,8 +29,10 @@ from ratslam.experiments.tables.comparison import (
     sessions_text,
     sign_test,
 )
+from ratslam.experiments.tables.recordings import Recording
 from tactile.base.errors import InputError
 
+ROOT = Path(__file__).parents[4]
 ROWS = ("clean", "main")
 SESSION = touch.SessionFigures(
     TouchMetrics(
@@ -105,6 +110,31 @@ def test_a_run_against_itself_has_ratios_of_one_and_nothing_changed(tmp_path: Pa
     assert code == f"Code before: {digest} recall (14 sessions); now: {digest} recall (14 sessions)."
 
 
+def test_buildings_write_each_run_and_compare_final_maps_worse_than_odometry(
+    tmp_path: Path, monkeypatch
+) -> None:
+    def runs(final: float, files: Files) -> list[str]:
+        closures, sequences = np.array([True, False]), np.array([[True, True], [True, False], [False, True]])
+        figures = buildings.RunFigures(1.0, final, 1.2, closures, sequences, np.zeros(3))
+        monkeypatch.setattr(buildings, "run_tasks", lambda _, tasks, workers: iter([figures] * len(tasks)))
+        return list(buildings.buildings_table(rows, 6, folder=ROOT, files=files))
+
+    rows = {
+        "lab": buildings.BuildingsRow(Recording("lab", "configs/square.yaml"), "buildings", "miscalibrated")
+    }
+    runs(0.5, Files(tmp_path))
+    with (tmp_path / "buildings.csv").open() as file:
+        first, *others = csv.DictReader(file)
+    assert [one["session"] for one in others] == list("123456")
+    assert list(first.values())[3:] == ["1.0", "0.5", "1.2", "2", "1", "2", "1"]
+    *_, line, _, failures, _ = runs(1.5, Files(None, tmp_path))
+    assert line == (
+        "| lab | 7 | 3.000 [3.000-3.000] | 1.000 [1.000-1.000] | 0.500, 1.500 | 0, 7 | 0, 0 "
+        "| 7 / 14, 7 / 14 | 7 / 14, 7 / 14 | 0, 7 | 0, 7 (0.016) |"
+    )
+    assert failures == f"New failures: {', '.join(f'lab {seed}' for seed in range(7))}."
+
+
 def test_known_medians_intervals_and_sign_tests(tmp_path: Path) -> None:
     before = {("clean", str(k)): figures(0.1, odometry=0.2) for k in range(1, 10)}
     after = {("clean", str(k)): figures(0.1 * k, 2.0, 0.2, 0.7) for k in range(1, 10)}
@@ -136,6 +166,18 @@ def test_what_is_unknown_or_in_one_run_alone_is_left_out_and_said(tmp_path: Path
     assert alone["below"].endswith("sessions: clean 1 before, 0 now; main 0 before, 1 now.")
 
 
+def test_figures_of_any_name_are_compared_where_both_runs_know_them(tmp_path: Path) -> None:
+    old: Sessions = {("a", "1"): {"missed": False, "error": 2.0}, ("a", "2"): {"missed": True, "error": 1.0}}
+    new: Sessions = {("a", "1"): {"missed": True, "error": np.nan}, ("a", "2"): {"missed": False, "error": 3}}
+    log = SessionLog("maps", Files(against=write(tmp_path, old, "maps.csv")), new)
+    for (row, session), record in new.items():
+        log.add(row, session, record)
+    *_, missed, error, _, failures, _ = comparison.compare_figures(log, ["a"])
+    assert missed == "| a | missed | 2 | 1 | 1 | - | 1, 1 (1) |"
+    assert error == "| a | error | 1 of 2 | 1.000 | 3.000 | 3.000 [-] | - |"
+    assert failures == "New failures: missed: a 1."
+
+
 def test_ratios_of_zero_infinity_and_nan() -> None:
     old = np.array([0, 0, 2, np.inf, np.inf, 1, np.nan, 1])
     new = np.array([0, 3, 0, np.inf, 1, np.inf, 1, np.nan])
@@ -156,6 +198,18 @@ def test_the_sign_test_is_exact() -> None:
     assert sign_test(0, 0) == sign_test(3, 3) == 1
     assert sign_test(0, 6) == sign_test(6, 0) == pytest.approx(2 / 2**6)
     assert sign_test(1, 7) == pytest.approx(2 * 9 / 2**8)
+
+
+def test_other_code_has_another_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = ModuleType("planted")
+    package.__file__ = str(tmp_path / "__init__.py")
+    monkeypatch.setitem(sys.modules, "planted", package)
+    monkeypatch.setattr(machine, "PACKAGES", ("planted",))
+    digests = []
+    for text in ("x = 1", "x = 2", "x = 1"):
+        (tmp_path / "module.py").write_text(text)
+        digests.append(machine.code_digest.__wrapped__())
+    assert digests[0] == digests[2] != digests[1]
 
 
 @given(st.dictionaries(
