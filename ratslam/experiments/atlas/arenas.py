@@ -25,6 +25,7 @@ from ratslam.experiments.atlas.localising import Judged, judge
 from ratslam.experiments.atlas.pictures import Panel, draw_panels
 from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.sessions import draw_seed
+from ratslam.experiments.studies.machine import code_digest
 from ratslam.experiments.trials.arena_trial import simulate_session
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.build_session import build_session
@@ -211,8 +212,8 @@ def shuffled_contacts(drive: ArenaDrive, seed: int) -> ArenaDrive:
 
 
 def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
-    """The map of an arena; made and written to `folder` unless it is there."""
-    path = folder / f"arena_{arena}_{side:g}.npz"
+    """The map of an arena; made and written to `folder` unless the same code has done that."""
+    path = folder / f"arena_{arena}_{side:g}-{code_digest()}.npz"
     beside = path.with_suffix(".steps.npz")
     if not (path.exists() and beside.exists()):
         folder.mkdir(parents=True, exist_ok=True)

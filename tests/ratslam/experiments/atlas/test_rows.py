@@ -19,7 +19,7 @@ from ratslam.experiments.atlas.scenarios import (
     ten_circuits,
 )
 from ratslam.experiments.atlas.sessions import Recipe, record
-from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays
+from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, map_path
 from tactile.base.se2 import compose
 from tests.ratslam.experiments.atlas.stand_ins import APART, ORACLE, WRONG
 
@@ -34,7 +34,7 @@ def plant(folder: Path, *recipes: Recipe) -> Path:
         truth = record(recipe).truth
         pose = np.where(np.isfinite(truth), compose(MOTION, np.nan_to_num(truth)), 0.0)
         arrays = MapArrays(pose, truth, np.zeros(len(truth), int), len(truth) // 2)
-        path = folder / recipe.digest[:16]
+        path = map_path(recipe, folder)
         path.mkdir(parents=True)
         np.savez(path / STEPS, **arrays._asdict())
     return folder
