@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ratslam.cli.common import (
     INTERRUPTED,
+    CommandParser,
     Commands,
     add_config,
     add_count,
@@ -81,7 +82,9 @@ def add_commands(commands: Commands) -> None:
         check=own_folder("real.md"),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
-    add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", MAP_ROWS, 32000)
+    title = "maps found again, continued, merged and changed"
+    maps = add_rows(names, "maps", _maps, title, MAP_ROWS, 32000)
+    add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
     add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
     train = names.add(
@@ -97,8 +100,8 @@ def add_commands(commands: Commands) -> None:
 
 def add_rows(
     names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
-) -> None:
-    """Registers a set of tables and figures, of which each is a row.
+) -> CommandParser:
+    """Registers a set of tables and figures, of which each is a row; its parser.
 
     Args:
         title: line of the help. rows: names of the rows; the first is in the example. first: default seed of
@@ -118,6 +121,7 @@ def add_rows(
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
     add_workers(parser, 1)
+    return parser
 
 
 def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
@@ -217,11 +221,17 @@ def _maps(arguments: argparse.Namespace) -> int:
 
     names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
     lines = reproduce_maps(
-        names, PRODUCT, arguments.output, arguments.first, arguments.sessions, arguments.workers
+        names,
+        PRODUCT,
+        arguments.output,
+        arguments.first,
+        arguments.sessions,
+        arguments.workers,
+        arguments.against,
     )
     for line in lines:
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'maps.md'}")
+    print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
     return 0
 
 
