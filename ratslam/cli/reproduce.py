@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ratslam.cli.common import (
     INTERRUPTED,
+    CommandParser,
     Commands,
     add_config,
     add_count,
@@ -81,7 +82,9 @@ def add_commands(commands: Commands) -> None:
         check=own_folder("real.md"),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
-    add_rows(names, "maps", _maps, "maps found again, continued, merged and changed", MAP_ROWS, 32000)
+    title = "maps found again, continued, merged and changed"
+    maps = add_rows(names, "maps", _maps, title, MAP_ROWS, 32000)
+    add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
     add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
     train = names.add(
@@ -97,8 +100,8 @@ def add_commands(commands: Commands) -> None:
 
 def add_rows(
     names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
-) -> None:
-    """Registers a set of tables and figures, of which each is a row.
+) -> CommandParser:
+    """Registers a set of tables and figures, of which each is a row; its parser.
 
     Args:
         title: line of the help. rows: names of the rows; the first is in the example. first: default seed of
@@ -118,6 +121,7 @@ def add_rows(
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
     add_workers(parser, 1)
+    return parser
 
 
 def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
@@ -217,11 +221,17 @@ def _maps(arguments: argparse.Namespace) -> int:
 
     names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
     lines = reproduce_maps(
-        names, PRODUCT, arguments.output, arguments.first, arguments.sessions, arguments.workers
+        names,
+        PRODUCT,
+        arguments.output,
+        arguments.first,
+        arguments.sessions,
+        arguments.workers,
+        arguments.against,
     )
     for line in lines:
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'maps.md'}")
+    print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
     return 0
 
 
@@ -240,6 +250,8 @@ def _cells(arguments: argparse.Namespace) -> int:
 
 
 BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
+SESSION_FILES = ("touch.csv", "buildings.csv")
+"""Files of the sessions of tables, which may be in one folder."""
 
 Lines = Callable[[argparse.Namespace], Iterator[str]]
 
@@ -249,7 +261,7 @@ def add_tables(tables: Commands) -> None:
 
     def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
-        parser.set_defaults(lines=lines)
+        parser.set_defaults(lines=lines, file="")
         return parser
 
     touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
@@ -261,6 +273,7 @@ def add_tables(tables: Commands) -> None:
         help="sessions per row (default: of the row, 12 to 40)",
     )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
+    add_session_file(touch, "touch.csv")
     grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
@@ -269,6 +282,7 @@ def add_tables(tables: Commands) -> None:
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    add_session_file(buildings, "buildings.csv")
     health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
@@ -295,19 +309,40 @@ def add_tables(tables: Commands) -> None:
     chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 
+def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `-o` and `--against` of a table whose sessions are written to a file."""
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
+        help=f"folder for {file}, the figures of each session as soon as it is done",
+    )  # fmt: skip
+    add_against(parser, file)
+    parser.set_defaults(file=file)
+
+
+def add_against(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `--against`."""
+    parser.add_argument(
+        "--against", type=Path, metavar="DIR",
+        help=f"compare with the same sessions in {file} of an earlier run, given -o DIR",
+    )  # fmt: skip
+
+
 def _print_table(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
     for line in arguments.lines(arguments):
         print(line, flush=True)
+    if arguments.file and arguments.output is not None:
+        print(f"\nwrote {arguments.output / arguments.file}")
     return 0
 
 
 def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.comparison import Files
     from ratslam.experiments.tables.markdown import select_rows
     from ratslam.experiments.tables.touch import DEFAULT_ROWS, ROWS, touch_table
 
-    rows = select_rows(arguments.rows, ROWS, DEFAULT_ROWS)
-    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend)
+    rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
+    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
 
 
 def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
@@ -331,8 +366,10 @@ def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.buildings import buildings_table, choose_rows
+    from ratslam.experiments.tables.comparison import Files
 
-    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers)
+    files = Files(arguments.output, arguments.against)
+    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers, files=files)
 
 
 def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:

@@ -23,8 +23,10 @@ from ratslam.core.localisation import Localisation
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.localising import Judged, judge
 from ratslam.experiments.atlas.pictures import Panel, draw_panels
-from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, median, spread
 from ratslam.experiments.atlas.sessions import draw_seed
+from ratslam.experiments.studies.machine import code_digest
+from ratslam.experiments.tables.comparison import Record
 from ratslam.experiments.trials.arena_trial import simulate_session
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.pipeline.build_session import build_session
@@ -81,6 +83,25 @@ def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
         best=(bool(right[SOON - 1]), bool(right[-1])),
         reckoned=np.hypot(*reckoned[:, :2].T),
     )
+
+
+def arena_record(one: ArenaFigures) -> Record:
+    """The figures of an unknown start by name; errors in m."""
+    return {
+        "missed_soon": one.session.whisks > SOON,
+        "missed": one.session.whisks > REPORTS,
+        "sure_and_wrong": bool(one.session.wrong.any()),
+        "reports": one.session.whisks,
+        "error": median(one.session.error[one.session.found, 0]),
+        "odometry_error": median(one.reckoned),
+        "best_wrong_soon": not one.best[0],
+        "best_wrong": not one.best[1],
+        "denied": bool(one.session.foreign[-1]),
+        "found_elsewhere_soon": bool(one.other[:SOON].any()),
+        "found_elsewhere": bool(one.other.any()),
+        "not_said": not one.foreign,
+        "shuffled_sure_and_wrong": bool(one.shuffled.wrong.any()),
+    }
 
 
 def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
@@ -143,9 +164,16 @@ def _localise(session: Session, drive: ArenaDrive) -> Localised:
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
-GRID = MapRow("Localise in a grid map from an unknown start", 20, measure_arena, arena_lines, draw_arenas)
+GRID = MapRow(
+    "Localise in a grid map from an unknown start", 20, measure_arena, arena_record, arena_lines, draw_arenas
+)
 GRID_LARGE = MapRow(
-    "The same in arenas of 2.5 m", 6, partial(measure_arena, side=LARGE), arena_lines, draw_arenas
+    "The same in arenas of 2.5 m",
+    6,
+    partial(measure_arena, side=LARGE),
+    arena_record,
+    arena_lines,
+    draw_arenas,
 )
 
 
@@ -211,8 +239,8 @@ def shuffled_contacts(drive: ArenaDrive, seed: int) -> ArenaDrive:
 
 
 def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
-    """The map of an arena; made and written to `folder` unless it is there."""
-    path = folder / f"arena_{arena}_{side:g}.npz"
+    """The map of an arena; made and written to `folder` unless the same code has done that."""
+    path = folder / f"arena_{arena}_{side:g}-{code_digest()}.npz"
     beside = path.with_suffix(".steps.npz")
     if not (path.exists() and beside.exists()):
         folder.mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,7 @@ from ratslam.experiments.atlas.scenarios import (
     unknown_start,
 )
 from ratslam.experiments.atlas.sessions import Recipe, record
+from ratslam.experiments.tables.comparison import Record
 from robot.world.maze import CELL_SIDE
 
 
@@ -69,6 +70,19 @@ def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigu
         unchanged=len(methods.changes(made, again)),
         path=after.truth[:, :2],
     )
+
+
+def change_record(one: ChangeFigures) -> Record:
+    """The figures of a changed maze by name."""
+    return {
+        "missed": one.after.whisks > LOCALISED,
+        "sure_and_wrong": bool(one.after.wrong.any()),
+        "missed_before": one.before.whisks > LOCALISED,
+        "sure_and_wrong_before": bool(one.before.wrong.any()),
+        "not_named": not one.is_named,
+        "far_places": int((one.distance > CELL_SIDE).sum()),
+        "false_alarm": one.unchanged > 0,
+    }
 
 
 def change_lines(found: Sequence[ChangeFigures]) -> Iterator[Line]:
@@ -127,6 +141,7 @@ WALL = MapRow(
     "A wall moved",
     10,
     partial(measure_change, moved_wall),
+    change_record,
     change_lines,
     partial(draw_change, "A wall moved"),
 )
@@ -134,6 +149,7 @@ DOOR = MapRow(
     "A door closed",
     10,
     partial(measure_change, closed_door),
+    change_record,
     change_lines,
     partial(draw_change, "A door closed"),
 )

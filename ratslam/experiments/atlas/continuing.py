@@ -14,6 +14,7 @@ from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.scenarios import REENTERED, carried_sessions, kidnapped, open_world
 from ratslam.experiments.atlas.sessions import Recorded, record
+from ratslam.experiments.tables.comparison import Record
 from robot.sources.view_controls import apply_control
 
 ENERGY = 0.15
@@ -76,6 +77,28 @@ def measure_kidnaps(task: MapTask) -> KidnapFigures:
     return KidnapFigures(
         len(np.unique(arrays.piece)), arrays.em_within_pieces, arrays.em, unjoined_share(arrays.piece)
     )
+
+
+def carried_record(one: CarriedFigures) -> Record:
+    """The figures of a carried robot by name; the error in m, where it was tied on."""
+    return {
+        "not_tied": not one.known.right,
+        "wrong_tie": one.known.wrong or one.unknown.wrong,
+        "tied_unknown": int(one.unknown.joined),  # no failure where it is right
+        "error": float(one.known.error[0]) if one.known.joined else np.nan,
+        "shuffled_tied": one.shuffled.joined,
+    }
+
+
+def kidnap_record(one: KidnapFigures) -> Record:
+    """The figures of a kidnapped robot by name; Energy Metrics in m^2 + rad^2."""
+    return {
+        "above_goal": one.within > ENERGY,
+        "em_within_pieces": one.within,
+        "em": one.over_all,
+        "unjoined": one.unjoined,
+        "pieces": one.pieces,
+    }
 
 
 def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[Line]:
@@ -148,5 +171,7 @@ def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
     draw_panels(png, "Eight kidnaps in ten circuits", line, None, panel)
 
 
-CARRIED = MapRow("Continue after being carried", 20, measure_carried, carried_lines, draw_carried)
-KIDNAPS_ROW = MapRow("Eight kidnaps", 12, measure_kidnaps, kidnap_lines, draw_kidnaps)
+CARRIED = MapRow(
+    "Continue after being carried", 20, measure_carried, carried_record, carried_lines, draw_carried
+)
+KIDNAPS_ROW = MapRow("Eight kidnaps", 12, measure_kidnaps, kidnap_record, kidnap_lines, draw_kidnaps)

@@ -19,10 +19,11 @@ from evaluation.metrics.localisation import RIGHT, localisation_errors, true_pla
 from ratslam.atlas.localiser import Localiser
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
-from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, median, spread
 from ratslam.experiments.atlas.scenarios import open_world, ten_circuits
 from ratslam.experiments.atlas.sessions import Recipe
 from ratslam.experiments.atlas.stored_maps import StoredMap
+from ratslam.experiments.tables.comparison import Record
 from ratslam.pipeline.goal_planner import GoalPlanner, contact_map, felt_points
 from ratslam.pipeline.localise import localising_for_goals
 from ratslam.pipeline.saved_map import read_map
@@ -338,6 +339,27 @@ def measure_drives(task: MapTask, pairs: int, walls: int) -> GoalFigures:
     )
 
 
+def goal_record(one: GoalFigures) -> Record:
+    """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
+    drives, done = one.free + one.walled, [drive for drive in one.free if drive.said_reached]
+    lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
+    return {
+        "not_reached": sum(not drive.reached for drive in one.free),
+        "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
+        "error": median(np.array([drive.error for drive in done])),
+        "path_ratio": lengths[0] / lengths[1] if done else np.nan,
+        "clearance": min(drive.clearance for drive in drives),
+        "in_wall": sum(not drive.clear for drive in drives),
+        "seconds": one.seconds,
+        "wall_not_solved": sum(not _is_solved(drive) for drive in one.walled),
+    }
+
+
+def _is_solved(drive: Drive) -> bool:
+    """Whether a drive with a wall in its way ended at its goal by a new way, or as blocked."""
+    return drive.state is DriveState.BLOCKED or (drive.replans > 0 and drive.reached)
+
+
 def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
     """The lines of drives to goals."""
     free, walled = all_free(found), all_walled(found)
@@ -385,12 +407,10 @@ def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
 
 
 def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> Line:
-    new_way = [one.replans > 0 and one.reached for one in walled]
-    blocked = [one.state is DriveState.BLOCKED for one in walled]
     return Line(
         "wall in the way: reached by a new way, or blocked",
         f"{len(walled)} of {len(walled)}",
-        count(np.array(new_way, bool) | np.array(blocked, bool)),
+        count([_is_solved(one) for one in walled]),
         f"{sum(one.state is DriveState.BLOCKED for one in free)} of {len(free)} blocked without a wall",
     )
 
@@ -430,4 +450,4 @@ def _joined(drives: Sequence[Drive]) -> np.ndarray:
     return np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in drives)])
 
 
-GOALS = MapRow("Drive to goals on a map", 1, measure_goals, goal_lines, draw_goals)
+GOALS = MapRow("Drive to goals on a map", 1, measure_goals, goal_record, goal_lines, draw_goals)

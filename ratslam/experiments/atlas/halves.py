@@ -24,6 +24,7 @@ from ratslam.config.run_config import load_config
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask
 from ratslam.experiments.atlas.sessions import Recipe, Recorded, record
+from ratslam.experiments.tables.comparison import Record
 from ratslam.experiments.tables.recordings import metres
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
@@ -126,6 +127,22 @@ def measure_halves(task: MapTask) -> HalvesFigures:
     )
 
 
+def halves_record(one: HalvesFigures) -> Record:
+    """The figures of a recording by name: ATEs, m, and shares."""
+    return {
+        "not_joined": not one.joined,
+        "ate_merged": one.merged,
+        "ate_whole": one.whole,
+        "found": one.found,
+        "off": one.off,
+        "off_by_map": one.off_by_map,
+        "off_nearby": one.off_nearby,
+        "off_by_odometry": one.reckoned,
+        "shuffled_found": one.shuffled[0],
+        "shuffled_off": one.shuffled[1],
+    }
+
+
 def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[Line]:
     """The lines of each recording."""
     for one in found:
@@ -193,5 +210,11 @@ def _share_off_by_odometry(recorded: Recorded) -> float:
 
 
 HALVES = MapRow(
-    "Buildings in two halves", len(RECORDINGS), measure_halves, halves_lines, draw_halves, RECORDINGS
+    "Buildings in two halves",
+    len(RECORDINGS),
+    measure_halves,
+    halves_record,
+    halves_lines,
+    draw_halves,
+    RECORDINGS,
 )

@@ -19,7 +19,7 @@ from evaluation.metrics.localisation import (
 )
 from evaluation.metrics.trajectory import align
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
-from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, spread
+from ratslam.experiments.atlas.row import Line, Localised, MapRow, MapTask, count, median, spread
 from ratslam.experiments.atlas.scenarios import (
     FOREIGN,
     LOCALISED,
@@ -29,6 +29,7 @@ from ratslam.experiments.atlas.scenarios import (
     unknown_start,
 )
 from ratslam.experiments.atlas.sessions import Recorded, record
+from ratslam.experiments.tables.comparison import Record
 from robot.sources.view_controls import apply_control
 from tactile.base.se2 import compose, integrate
 
@@ -130,6 +131,31 @@ def measure_foreign(task: MapTask) -> ForeignFigures:
     )
 
 
+def start_record(one: StartFigures) -> Record:
+    """The figures of an unknown start by name; errors in m, while found."""
+    found = one.session.found
+    return {
+        "missed": one.session.whisks > LOCALISED,
+        "sure_and_wrong": bool(one.session.wrong.any()),
+        "whisks": one.session.whisks,
+        "error": median(one.session.error[found, 0]),
+        "error_aligned": median(one.session.aligned[found, 0]),
+        "odometry_error": median(one.reckoned),
+        "shuffled_found": one.shuffled.whisks <= LOCALISED,
+        "shuffled_sure_and_wrong": bool(one.shuffled.wrong.any()),
+    }
+
+
+def foreign_record(one: ForeignFigures) -> Record:
+    """The figures of a session in another maze by name."""
+    return {
+        "found_elsewhere": one.found > 0,
+        "not_said": not one.said,
+        "known_missed": one.known_found == 0,
+        "known_denied": one.known_said,
+    }
+
+
 def start_lines(found: Sequence[StartFigures]) -> Iterator[Line]:
     """The lines of unknown starts."""
     n = len(found)
@@ -217,5 +243,7 @@ def draw_foreign(found: Sequence[ForeignFigures], png: Path) -> None:
     draw_panels(png, "A maze that is not in the map", line, None, panel)
 
 
-START = MapRow("Localise from an unknown start", 20, measure_start, start_lines, draw_start)
-FOREIGN_ROW = MapRow("Localise in another maze", 20, measure_foreign, foreign_lines, draw_foreign)
+START = MapRow("Localise from an unknown start", 20, measure_start, start_record, start_lines, draw_start)
+FOREIGN_ROW = MapRow(
+    "Localise in another maze", 20, measure_foreign, foreign_record, foreign_lines, draw_foreign
+)

@@ -14,6 +14,7 @@ from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, spread
 from ratslam.experiments.atlas.scenarios import open_world, overlapping_sessions, same_maze, ten_circuits
 from ratslam.experiments.atlas.stored_maps import MapArrays, StoredMap
+from ratslam.experiments.tables.comparison import Record
 
 UNION = 1.5
 """Goal: the Energy Metric of a merged map, over that of one session over the same cells."""
@@ -105,6 +106,34 @@ def measure_ten(task: MapTask) -> TenFigures:
         separate=np.cumsum([one.arrays.frames for one in maps]),
         joined=len(np.unique(merged[-1].arrays.piece)) == 1,
     )
+
+
+def overlap_record(one: OverlapFigures) -> Record:
+    """The figures of two sessions that overlap by name; Energy Metrics in m^2 + rad^2, the error in m, where
+    they are joined."""
+    return {
+        "not_joined": not one.join.right,
+        "wrong_join": one.join.wrong,
+        "em_union": one.union if one.join.joined else np.nan,
+        "em_alone": one.alone,
+        "error": float(one.join.error[0]) if one.join.joined else np.nan,
+    }
+
+
+def different_record(one: DifferentFigures) -> Record:
+    """The figures of two mazes by name."""
+    return {"mazes_joined": one.joined, "maze_not_joined": not one.same}
+
+
+def ten_record(one: TenFigures) -> Record:
+    """The figures of ten sessions by name; the Energy Metric in m^2 + rad^2."""
+    (growth,), (frames,) = _growth([one])
+    return {
+        "not_joined": not one.joined,
+        "em_union": float(one.union[-1]),
+        "em_growth": growth,
+        "frames_growth": frames,
+    }
 
 
 def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[Line]:
@@ -209,7 +238,14 @@ def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
 
 
 OVERLAP = MapRow(
-    "Merge two sessions that share half their cells", 20, measure_overlap, overlap_lines, draw_overlap
+    "Merge two sessions that share half their cells",
+    20,
+    measure_overlap,
+    overlap_record,
+    overlap_lines,
+    draw_overlap,
 )
-DIFFERENT = MapRow("Merge sessions of two mazes", 20, measure_different, different_lines, draw_different)
-TEN = MapRow("Merge ten sessions one by one", 3, measure_ten, ten_lines, draw_ten)
+DIFFERENT = MapRow(
+    "Merge sessions of two mazes", 20, measure_different, different_record, different_lines, draw_different
+)
+TEN = MapRow("Merge ten sessions one by one", 3, measure_ten, ten_record, ten_lines, draw_ten)

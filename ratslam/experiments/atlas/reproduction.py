@@ -8,6 +8,7 @@ from pathlib import Path
 from ratslam.experiments.atlas.registry import ROWS
 from ratslam.experiments.atlas.row import MapTask, Methods
 from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.comparison import Files, SessionLog, compare_figures
 from tactile.base.atomic_write import write_text_atomically
 
 FIRST = 32000
@@ -22,30 +23,40 @@ def reproduce_maps(
     first: int = FIRST,
     sessions: int | None = None,
     workers: int = 1,
+    against: Path | None = None,
 ) -> Iterator[str]:
-    """The lines of the page, each table as soon as it is measured; writes `maps.md` and a PNG per row.
+    """The lines of the page, each table as soon as it is measured; writes `maps.md`, a PNG per row, and
+    `maps.csv`, a session as soon as it is measured.
 
     Args:
         names: keys of `ROWS`. output: folder for the page, and for the maps in `maps`, which later calls use
             again. first: seed of the first maze; each session has the next one. sessions: of each row; None:
-            the row's own number. workers: processes.
+            the row's own number. workers: processes. against: folder of an earlier run; the same sessions
+            are compared below the last table.
 
     Raises:
-        InputError: a session cannot be recorded.
+        InputError: a session cannot be recorded, or a file of the sessions cannot be used.
     """
+    seeds = {name: ROWS[name].seeds(first, sessions) for name in names}
+    labels = {name: ROWS[name].recordings or {seed: str(seed) for seed in seeds[name]} for name in names}
+    planned = [(name, labels[name][seed]) for name in names for seed in seeds[name]]
+    log = SessionLog("maps", Files(output, against), planned)
     page: list[str] = []
     output.mkdir(parents=True, exist_ok=True)
     for name in names:
         row = ROWS[name]
-        seeds = row.seeds(first, sessions)
-        tasks = [MapTask(seed, output / "maps", methods) for seed in seeds]
-        found = list(run_tasks(row.measure, tasks, workers=workers))
+        tasks = [MapTask(seed, output / "maps", methods) for seed in seeds[name]]
+        found = []
+        for task, figures in zip(tasks, run_tasks(row.measure, tasks, workers=workers), strict=True):
+            log.add(name, labels[name][task.seed], row.record(figures))
+            found.append(figures)
         picture = output / f"{name.replace(' ', '_')}.png"
         row.draw(found, picture)
-        used = [row.recordings[seed] for seed in seeds] if row.recordings else seeds
-        named = ", ".join(map(str, used if len(used) < 3 else (used[0], "...", used[-1])))
+        used = [labels[name][task.seed] for task in tasks]
+        named = ", ".join(used if len(used) < 3 else (used[0], "...", used[-1]))
         lines = [f"## {row.title}", "", f"{len(tasks)} sessions: {named}.", "", *row.table(found), ""]
         lines += [f"![{row.title}]({picture.name})", ""]
         yield from lines
         page += lines
         write_text_atomically(output / "maps.md", "\n".join(page))
+    yield from compare_figures(log, names)

@@ -11,6 +11,7 @@ import numpy as np
 from evaluation.metrics.statistics import wilson_interval
 from ratslam.experiments.atlas.sessions import Recipe, Recorded
 from ratslam.experiments.atlas.stored_maps import MapArrays, StoredMap, store_map
+from ratslam.experiments.tables.comparison import Record
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 
 COLUMNS = ("figure", "goal", "measured", "control")
@@ -75,14 +76,16 @@ class MapRow(NamedTuple):
     """A row.
 
     Attributes:
-        title: one line. sessions: their usual number. measure: the figures of one session. lines: of the
-            figures of all. draw: draws these into a new PNG file. recordings: names of the recordings that
-            are used instead of mazes.
+        title: one line. sessions: their usual number. measure: the figures of one session. record: these by
+            name, each a number, or whether the session fails in something. lines: of the figures of all.
+            draw: draws these into a new PNG file. recordings: names of the recordings that are used instead
+            of mazes.
     """
 
     title: str
     sessions: int
     measure: Callable[[MapTask], Any]
+    record: Callable[[Any], Record]
     lines: Callable[[Sequence[Any]], Iterable[Line]]
     draw: Callable[[Sequence[Any], Path], None]
     recordings: tuple[str, ...] = ()
@@ -97,6 +100,11 @@ class MapRow(NamedTuple):
     def table(self, found: Sequence[Any]) -> list[str]:
         """The lines of a Markdown table."""
         return [markdown_header(COLUMNS), *(markdown_row(line) for line in self.lines(found))]
+
+
+def median(values: np.ndarray) -> float:
+    """Median of values [n]; NaN of none."""
+    return float(np.median(values)) if len(values) else np.nan
 
 
 def count(happened: Sequence[bool] | np.ndarray) -> str:

@@ -1,4 +1,7 @@
-"""Maps of sessions on the disk, each made once: rows that need the same map share it."""
+"""Maps of sessions on the disk, each made once: rows that need the same map share it.
+
+A map is that of a recipe, which holds all settings, and of the code that made it: other code makes its own.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from evaluation.metrics.map_pieces import energy_within_pieces
 from evaluation.metrics.trajectory import ate
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.sessions import Recipe, Recorded, record
+from ratslam.experiments.studies.machine import code_digest
 from ratslam.experiments.trials.touch_trial import start_session
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.pipeline.saved_map import NAME, describe_readings, write_map
@@ -79,13 +83,18 @@ class StoredMap(NamedTuple):
     order: np.ndarray
 
 
+def map_path(recipe: Recipe, folder: Path) -> Path:
+    """Where in `folder` the map of a session by this code is."""
+    return folder / f"{recipe.digest[:16]}-{code_digest()}"
+
+
 def store_map(recipe: Recipe, folder: Path) -> StoredMap:
-    """The map of a session; made and written to `folder` unless it is there.
+    """The map of a session; made and written to `folder` unless it is there, by the same code.
 
     Raises:
         InputError: the session cannot be recorded.
     """
-    path = folder / recipe.digest[:16]
+    path = map_path(recipe, folder)
     if not path.exists():
         _write_map(record(recipe), path)
     with np.load(path / STEPS) as saved:

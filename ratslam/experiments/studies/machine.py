@@ -45,7 +45,7 @@ def machine() -> Machine:
         device="cpu" if device.platform == "cpu" else device.device_kind,
         versions={name: version(name) for name in ("jax", "jaxlib", "numpy")}
         | {"python": platform.python_version()},
-        build=_build(),
+        build=code_digest(),
     )
 
 
@@ -116,7 +116,9 @@ class _CompilationListener(events.Listener):
         pass
 
 
-def _build() -> str:
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """The first digits of the sha256 over the sources of all packages, as this process first asks for it."""
     total = hashlib.sha256()
     for name in PACKAGES:
         folder = Path(str(sys.modules[name].__file__)).parent

@@ -12,7 +12,7 @@ sequence is false if that holds for the medians over its closures.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,6 +22,7 @@ from scipy.special import expit
 from evaluation.metrics.statistics import expected_calibration_error
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.tables.recordings import Recording, metres, real_recordings
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
@@ -143,27 +144,39 @@ def choose_rows(names: Sequence[str] | None) -> dict[str, BuildingsRow]:
 
 
 def buildings_table(
-    rows: Mapping[str, BuildingsRow], copies: int = 10, workers: int = 0, folder: Path = Path()
+    rows: Mapping[str, BuildingsRow],
+    copies: int = 10,
+    workers: int = 0,
+    folder: Path = Path(),
+    files: Files = Files(),  # noqa: B008
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
 
     Args:
-        rows: those of `buildings_rows` to print. folder: of the repository, which holds `configs`.
+        rows: those of `buildings_rows` to print. folder: of the repository, which holds `configs`. files: of
+            the runs, `buildings.csv`, and of those to compare them with below the table; a session is the
+            seed of a copy, 0 the recording as it is.
+
+    Raises:
+        InputError: one of these files cannot be used.
     """
     missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing(folder))}
-    present = [row for name, row in rows.items() if name not in missing]
-    counts = [1 + copies * bool(row.copies) for row in present]
+    present = {name: row for name, row in rows.items() if name not in missing}
+    counts = {name: 1 + copies * bool(row.copies) for name, row in present.items()}
+    planned = [(name, seed) for name, count in counts.items() for seed in range(count)]
+    log = SessionLog("buildings", files, [(name, str(seed)) for name, seed in planned])
     tasks = [
-        RunTask(row.configuration(folder), row.copies, seed)
-        for row, count in zip(present, counts, strict=True)
-        for seed in range(count)
+        RunTask(present[name].configuration(folder), present[name].copies, seed) for name, seed in planned
     ]
-    results = run_tasks(measure_run, tasks, workers=workers)
+    results = zip(planned, run_tasks(measure_run, tasks, workers=workers), strict=True)
     found: dict[Section, list[RunFigures]] = {}
     notes = []
     yield markdown_header(COLUMNS)
-    for row, count in zip(present, counts, strict=True):
-        runs = [next(results) for _ in range(count)]
+    for name, row in present.items():
+        runs = []
+        for (_, seed), figures in islice(results, counts[name]):
+            log.add(name, seed, run_record(figures))
+            runs.append(figures)
         yield markdown_row([row.recording.label, *_cells(runs)])
         found.setdefault(row.section, []).extend(runs)
         notes += [_ids_note(row, runs)] if row.section == "ids" else []
@@ -171,6 +184,21 @@ def buildings_table(
     notes += [_create_note(found["create"])] if "create" in found else []
     notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
     yield from ["", *notes] if notes else []
+    yield from compare_runs(COMPARED, log, list(rows))
+
+
+def run_record(figures: RunFigures) -> dict[str, float | int]:
+    """The figures of a run by name: ATEs, m, and numbers of closures and of accepted sequences."""
+    accepted = figures.sequences[figures.sequences[:, 0].astype(bool), 1]
+    return {
+        "odometry": figures.odometry,
+        "final": figures.final,
+        "live": figures.live,
+        "closures": len(figures.closures),
+        "false_closures": int(figures.closures.sum()),
+        "sequences": len(accepted),
+        "false_sequences": int(accepted.sum()),
+    }
 
 
 def measure_run(task: RunTask) -> RunFigures:
@@ -217,6 +245,17 @@ def sequence_odds(claims: ClosureClaims) -> np.ndarray:
 def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     """Whether ATEs, m, exceed those of odometry by more than the margins."""
     return error > HARM_FACTOR * odometry + HARM_MARGIN
+
+
+COMPARED = Compared(
+    "final ATE", "final", "live", "odometry", worse=is_worse, failed=is_worse,
+    counts={
+        "false / closures": ("false_closures", "closures"),
+        "false / sequences": ("false_sequences", "sequences"),
+    },
+    medians={},
+)  # fmt: skip
+"""Of two runs of the table; a run whose final map is worse than odometry is a failure."""
 
 
 def _cells(runs: Sequence[RunFigures]) -> list[str]:

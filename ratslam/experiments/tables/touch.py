@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from evaluation.metrics.session_metrics import (
 from evaluation.metrics.statistics import wilson_interval
 from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
 from ratslam.pipeline.source import open_observations
@@ -136,6 +138,14 @@ ROWS = {
 }
 DEFAULT_ROWS = tuple(ROWS)[:-4]
 """The rows printed if none are chosen."""
+COMPARED = Compared(
+    "EM", "em", "em_live", "em_odometry",
+    worse=lambda error, odometry: error > TOLERANCE * odometry,
+    failed=lambda error, _: error >= SUCCESS,
+    counts={"false / closures": ("false_closures", "closures")},
+    medians={"revisits closed": "revisits_closed"},
+)  # fmt: skip
+"""Of two runs of the table."""
 COLUMNS = (
     "condition", "EM (worst)", "live EM", "odometry", "failures [95 %]", "worse than odometry (worst ratio)",
     "through experiences", "ARR", "ARCR strict (worst), chain-free", "revisits closed", "false / closures",
@@ -182,23 +192,41 @@ def touch_table(
     sessions: int | None = None,
     workers: int = 0,
     backend: str = "recall",
+    files: Files = Files(),  # noqa: B008
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
 
     Args:
         first: number of the first maze; each session has the next one. sessions: of each row; None: the row's
-            own number.
+            own number. files: of the sessions, `touch.csv`, and of those to compare them with below the
+            table.
+
+    Raises:
+        InputError: one of these files cannot be used.
     """
     counts = {row: sessions or ROWS[row].sessions for row in rows}
     tasks = [TouchTask(row, first + k, backend) for row in rows for k in range(counts[row])]
-    results = run_tasks(measure_session, tasks, workers=workers)
+    log = SessionLog("touch", files, [(task.row, str(task.maze)) for task in tasks], backend)
+    results = zip(tasks, run_tasks(measure_session, tasks, workers=workers), strict=True)
     notes: list[str] = []
     yield markdown_header(COLUMNS)
     for row in rows:
-        found = [next(results) for _ in range(counts[row])]
+        found = []
+        for task, figures in islice(results, counts[row]):
+            log.add(row, task.maze, session_record(figures))
+            found.append(figures)
         yield markdown_row([ROWS[row].label, *_cells(found)])
         notes += _notes(row, found)
     yield from ["", *notes] if notes else []
+    yield from compare_runs(COMPARED, log, rows)
+
+
+def session_record(figures: SessionFigures) -> dict[str, Any]:
+    """The figures of a session by name; of `recovery` the number of kidnaps and the median."""
+    record = figures.metrics._asdict() | figures._asdict()
+    whisks = record.pop("recovery")
+    del record["metrics"]
+    return record | {"kidnaps": len(whisks), "recovery": np.median(whisks) if whisks else np.nan}
 
 
 def measure_session(task: TouchTask) -> SessionFigures:

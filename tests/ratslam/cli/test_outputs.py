@@ -60,7 +60,7 @@ def programs(commands: Commands, words: Words = ()) -> Iterator[tuple[Words, Com
 
 
 PROGRAMS = dict(programs(build_parser().commands))
-READ = {"--continue", "--localise", "--recording", "--relations", "--like"}
+READ = {"--against", "--continue", "--localise", "--recording", "--relations", "--like"}
 """Options that name a file to be read; all others of a path are outputs."""
 
 

@@ -10,6 +10,7 @@ from ratslam.experiments.atlas.arenas import (
     ArenaDrive,
     ArenaFigures,
     arena_lines,
+    arena_record,
     shuffled_contacts,
 )
 from ratslam.experiments.atlas.localising import Judged
@@ -46,6 +47,16 @@ def test_right_and_wrong_sessions_are_counted() -> None:
     assert lines["found in another arena within 300 reports"] == "0 of 3"
     assert lines["found in another arena within 900 reports"] == "1 of 3"
     assert lines["says after 900 reports that this is not the map"].startswith("2 of 3")
+
+
+def test_a_session_is_recorded_with_what_it_fails_in() -> None:
+    def failed(one: ArenaFigures) -> list[str]:
+        return [name for name, value in arena_record(one).items() if value is True]
+
+    assert failed(figures(SOON - 1, 0.02, REPORTS)) == []
+    assert failed(figures(SOON, 0.03, SOON)) == ["missed_soon", "found_elsewhere", "not_said"]
+    wrong = ["missed_soon", "missed", "sure_and_wrong", "best_wrong_soon", "best_wrong"]
+    assert failed(figures(0, 0.5, REPORTS)) == wrong
 
 
 def test_shuffled_contacts_keep_odometry_and_what_was_met() -> None:

@@ -16,6 +16,7 @@ from ratslam.experiments.atlas.goals import (
     draw_goals,
     driven_map,
     goal_lines,
+    goal_record,
     shortest_driven,
     walls_of,
 )
@@ -54,6 +55,11 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
     assert lines["said to be reached at a wrong place"][0].startswith("1 of 6")
     assert lines["path over the shortest driven way, all reached"][0] == "1.11"
     assert lines["wall in the way: reached by a new way, or blocked"][0].startswith("2 of 3")
+    record = goal_record(found)
+    counts = [record[name] for name in ("not_reached", "wrongly_reached", "in_wall", "wall_not_solved")]
+    assert counts == [2, 1, 0, 1]
+    assert record["path_ratio"] == pytest.approx(0.2 / 0.18)
+    assert record["error"] == pytest.approx(0.105)
     draw_goals([found], tmp_path / "goals.png")
     assert (tmp_path / "goals.png").stat().st_size > 10_000
 

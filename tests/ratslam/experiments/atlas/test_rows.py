@@ -19,7 +19,8 @@ from ratslam.experiments.atlas.scenarios import (
     ten_circuits,
 )
 from ratslam.experiments.atlas.sessions import Recipe, record
-from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays
+from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, map_path
+from ratslam.experiments.tables.comparison import read_sessions
 from tactile.base.se2 import compose
 from tests.ratslam.experiments.atlas.stand_ins import APART, ORACLE, WRONG
 
@@ -34,7 +35,7 @@ def plant(folder: Path, *recipes: Recipe) -> Path:
         truth = record(recipe).truth
         pose = np.where(np.isfinite(truth), compose(MOTION, np.nan_to_num(truth)), 0.0)
         arrays = MapArrays(pose, truth, np.zeros(len(truth), int), len(truth) // 2)
-        path = folder / recipe.digest[:16]
+        path = map_path(recipe, folder)
         path.mkdir(parents=True)
         np.savez(path / STEPS, **arrays._asdict())
     return folder
@@ -114,6 +115,7 @@ def test_frames_of_many_sessions_are_those_of_the_merged_map(maps: Path, monkeyp
     frames, separate = found["keyframes after ten sessions, over those after one"]
     assert frames == "1.00 (1.00)"
     assert 2.9 < float(separate.split()[0]) < 3.1
+    assert failures("ten sessions", ORACLE, maps) == []
 
 
 def test_a_place_named_in_an_unchanged_maze_is_a_false_alarm(maps: Path) -> None:
@@ -135,6 +137,8 @@ def test_a_recording_is_split_into_two_halves(tmp_path: Path, monkeypatch: pytes
     assert figures.off == 0
     assert figures.shuffled[0] == 0
     assert figures.merged == pytest.approx(figures.whole, abs=1e-9)
+    named = ROWS["buildings"].record(figures)
+    assert (named["not_joined"], named["found"], named["off"]) == (False, figures.found, 0)
 
 
 def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) -> None:
@@ -148,3 +152,59 @@ def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) 
         assert picture in page
         assert (tmp_path / picture).stat().st_size > 10_000
     assert "31000" in page
+    sessions = read_sessions(tmp_path / "maps.csv")
+    assert list(sessions) == [(name, "31000") for name in names]
+    assert sessions["start", "31000"].figures["whisks"] == 11
+
+
+def failures(name: str, methods: Methods, maps: Path) -> list[str]:
+    """What a session of a row fails in."""
+    row = ROWS[name]
+    record = row.record(row.measure(MapTask(MAZE, maps, methods)))
+    assert all(isinstance(value, bool | int | float) for value in record.values())
+    return [figure for figure, value in record.items() if value is True]
+
+
+@pytest.mark.parametrize(
+    ("name", "methods", "expected"),
+    [
+        ("start", ORACLE, []),
+        ("start", WRONG, ["missed", "sure_and_wrong", "shuffled_sure_and_wrong"]),
+        ("carried", ORACLE, []),
+        ("carried", WRONG, ["not_tied", "wrong_tie", "shuffled_tied"]),
+        ("wall moved", ORACLE, ["not_named"]),
+        (
+            "wall moved",
+            WRONG,
+            ["missed", "sure_and_wrong", "missed_before", "sure_and_wrong_before", "not_named"],
+        ),
+        ("other maze", ORACLE, ["found_elsewhere", "not_said"]),
+        ("kidnaps", ORACLE, []),
+        ("merge", ORACLE, []),
+        ("merge", APART, ["not_joined"]),
+        ("merge mazes", ORACLE, ["mazes_joined"]),
+        ("merge mazes", APART, ["maze_not_joined"]),
+    ],
+)
+def test_a_session_is_recorded_with_what_it_fails_in(
+    name: str, methods: Methods, expected: list[str], maps: Path
+) -> None:
+    assert failures(name, methods, maps) == expected
+
+
+def test_two_runs_of_saved_maps_are_compared_by_figure(maps: Path, tmp_path: Path) -> None:
+    for folder in (tmp_path / "old", tmp_path / "new"):
+        folder.mkdir()
+        (folder / "maps").symlink_to(maps)
+    list(reproduce_maps(["start", "wall moved"], ORACLE, tmp_path / "old", MAZE, 1))
+    lines = list(
+        reproduce_maps(["start", "wall moved"], WRONG, tmp_path / "new", MAZE, 1, against=tmp_path / "old")
+    )
+    assert "| start | missed | 1 | 0 | 1 | - | 0, 1 (1) |" in lines
+    assert "| start | whisks | 1 | 11.000 | inf | inf [-] | - |" in lines
+    assert "| all rows | missed | 2 | 0 | 2 | - | 0, 2 (0.5) |" in lines
+    assert not any(line.startswith("| all rows | whisks") for line in lines)
+    (said,) = (line for line in lines if line.startswith("New failures"))
+    assert said.startswith("New failures: missed: start 31000; sure_and_wrong: start 31000; ")
+    assert "sure_and_wrong_before: wall moved 31000" in said
+    assert "Before, and now" not in (tmp_path / "new" / "maps.md").read_text()
