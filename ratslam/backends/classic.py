@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import activity_sums, window_levels
-from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import ClassicBackendConfig
-from ratslam.classic import places, view_templates
+from ratslam.classic import places, pose_cells, view_templates
 from ratslam.classic.experience_map import ExperienceMap
+from ratslam.classic.levels import activity_sums, window_levels
 from ratslam.classic.places import Places
+from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.classic.view_templates import Match, Templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, PositiveFloat
 
-from ratslam.attractor.config import PoseCellConfig
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import KeyframeMapConfig

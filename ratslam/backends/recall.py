@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import activity_sums, window_levels
-from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.piece_ties import PieceTies
-from ratslam.classic import view_templates
+from ratslam.classic import pose_cells, view_templates
+from ratslam.classic.levels import activity_sums, window_levels
+from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar

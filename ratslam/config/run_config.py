@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.attractor.recording_config import CellsConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
+from ratslam.classic.recording_config import CellsConfig
 from ratslam.config.includes import merge_includes
 from ratslam.config.packaged import PresetName, find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin

@@ -11,7 +11,7 @@ from evaluation.cells.head_direction import mean_vector_length
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import arena_edges, bin_activity
 from evaluation.plots.cell_plot import draw_cells, map_sums
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.rats.driven_network import DrivenNetwork
 from robot.simulation.rat.rat_odometry import RatOdometryConfig

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from evaluation.plots.style import BLUE, GREY, INK, add_axes, add_legend, name_axes, new_figure
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Odometry

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, name_axes, new_figure
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
 from tactile.base.types import Odometry
 

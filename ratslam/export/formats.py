@@ -17,7 +17,7 @@ from evaluation.cells.analysis import (
     write_scores,
 )
 from evaluation.cells.recording import NAME, CellRecording, read_recording
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.config.run_config import load_config
 from ratslam.core.precision import prepare_precision
 from ratslam.export.nwb import write_nwb

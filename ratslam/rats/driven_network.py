@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import point_activity, to_full_torus, window_levels
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import point_activity, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.rats.cell_poses import cell_poses, check_cells
 from ratslam.rats.driven_network import DrivenNetwork
 from ratslam.rats.settled_peak import settled_peak

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from tactile.base.types import Odometry
 
 SETTLING = 60

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.cell_batch import CellCourse
-from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.classic.cell_batch import CellCourse
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations

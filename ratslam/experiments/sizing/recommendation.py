@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import SETTLED, window_levels
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
 from ratslam.backends.grid import LIVE_SIDE
+from ratslam.classic.levels import SETTLED, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import open_path
 from ratslam.config.strict_yaml.dumper import Dumper

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.metrics.metric import Quantity
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate

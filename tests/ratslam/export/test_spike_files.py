@@ -12,7 +12,7 @@ import pytest
 
 from evaluation.cells.analysis import AnalysisSettings, analyse_cells
 from evaluation.cells.recording import write_recording
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.cli import main
 from ratslam.export.formats import export_run
 from ratslam.export.nwb import EPOCH, write_nwb

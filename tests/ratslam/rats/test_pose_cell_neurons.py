@@ -11,7 +11,7 @@ import pytest
 from ratinabox.Agent import Agent
 from ratinabox.Environment import Environment
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.rats.pose_cell_neurons import PoseCellNeurons, agent_pose, anchor_at_truth
 from ratslam.rats.settled_peak import settled_peak
 from tactile.base.errors import InputError

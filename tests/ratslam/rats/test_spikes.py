@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.rats.settled_peak import settled_peak
 from ratslam.rats.spikes import SpikeConfig, draw_spikes, expected_spikes, read_spikes, write_spikes
 from tactile.base.errors import InputError

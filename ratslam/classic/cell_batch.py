@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.batch import BLOCK, Network
-from ratslam.attractor.cell_probe import activity_of
-from ratslam.attractor.config import PoseCellConfig, rings
-from ratslam.attractor.levels import Level, window_levels
-from ratslam.attractor.pose_cells import PoseCells
+from ratslam.classic import pose_cells, window
+from ratslam.classic.batch import BLOCK, Network
+from ratslam.classic.cell_probe import activity_of
+from ratslam.classic.levels import Level, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings
+from ratslam.classic.pose_cells import PoseCells
 from tactile.base.types import Array, Odometry
 
 SEGMENT = 128

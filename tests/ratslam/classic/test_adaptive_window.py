@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.attractor import levels, pose_cells, window
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.level_step import StepInput, step_at
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import levels, pose_cells, window
+from ratslam.classic.level_step import StepInput, step_at
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
 from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import window_levels
+from ratslam.classic import pose_cells, window
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation, Odometry
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import window
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.window import Window
+from ratslam.classic import window
+from ratslam.classic.pose_cell_config import PoseCellConfig
+from ratslam.classic.window import Window
 from ratslam.core.types import PoseCellActivity
 from tactile.base.types import Array
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, activity_sums, to_full_torus, window_levels
+from ratslam.classic.levels import Activity, Block, activity_sums, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 
 LEVELS = window_levels(PoseCellConfig(cells_xy=45, cells_heading=72), np.dtype(np.float64))
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.batch import Network
-from ratslam.attractor.cell_batch import SEGMENT, CellCourse, CellSets, walk
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import to_full_torus, window_levels
-from ratslam.attractor.window import ring_difference
+from ratslam.classic import pose_cells
+from ratslam.classic.batch import Network
+from ratslam.classic.cell_batch import SEGMENT, CellCourse, CellSets, walk
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
+from ratslam.classic.window import ring_difference
 from ratslam.experiments.studies.machine import compilations
 from tactile.base.types import Odometry
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor.cell_probe import active_cells, activity_of, choose_cells, hold_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, to_full_torus, window_levels
+from ratslam.classic.cell_probe import active_cells, activity_of, choose_cells, hold_cells
+from ratslam.classic.levels import Activity, Block, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from tactile.base.errors import InputError
 
 CONFIG = PoseCellConfig(cells_xy=45, cells_heading=72)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.level_step import StepInput, step_at
-from ratslam.attractor.levels import from_full_torus, to_full_torus, window_levels
-from ratslam.attractor.pose_cells import Outcome
-from ratslam.attractor.window import ring_difference
+from ratslam.classic import pose_cells, window
+from ratslam.classic.level_step import StepInput, step_at
+from ratslam.classic.levels import from_full_torus, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
+from ratslam.classic.pose_cells import Outcome
+from ratslam.classic.window import ring_difference
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
 

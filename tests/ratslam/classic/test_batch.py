@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.batch import Course, Network, networks, trials
-from ratslam.attractor.config import PoseCellConfig, units
-from ratslam.attractor.levels import window_levels
-from ratslam.attractor.window import ring_difference
 from ratslam.backends.grid import GridOutcome
+from ratslam.classic import pose_cells
+from ratslam.classic.batch import Course, Network, networks, trials
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import PoseCellConfig, units
+from ratslam.classic.window import ring_difference
 from tactile.base.types import Odometry, stack
 from tests.helpers.grid_world import drive, initial, report
 from tests.ratslam.backends.grid_filters import PRINTED
