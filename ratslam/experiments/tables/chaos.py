@@ -20,7 +20,8 @@ from jax import lax
 
 from ratslam.classic import pose_cells
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
+from ratslam.classic.pose_cell_config import NetworkConfig as PoseCellConfig
+from ratslam.classic.pose_cell_config import rings, units
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.classic.window import ring_difference
 from ratslam.core.precision import prepare_precision

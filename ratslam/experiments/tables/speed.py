@@ -23,7 +23,8 @@ import numpy as np
 
 from ratslam.classic import pose_cells
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import PoseCellConfig, rings, units
+from ratslam.classic.pose_cell_config import NetworkConfig as PoseCellConfig
+from ratslam.classic.pose_cell_config import rings, units
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
