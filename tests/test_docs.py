@@ -87,7 +87,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 LONG = {
-    "docs/cells.md", "ratslam/README.md", "ratslam/attractor/README.md", "ratslam/core/README.md",
+    "docs/cells.md", "ratslam/README.md", "ratslam/classic/README.md", "ratslam/core/README.md",
     "ratslam/experiments/studies/README.md", "ratslam/experiments/trials/README.md",
     "ratslam/export/README.md", "ratslam/grid/README.md", "ratslam/pipeline/README.md",
     "ratslam/rats/README.md", "ratslam/viewer/README.md",

@@ -31,7 +31,7 @@ VIOLATIONS = {
     "rooms of evaluation": [("evaluation.metrics.trajectory", "evaluation.plots.style")],
     "rooms of ratslam": [
         ("ratslam.core.session", "ratslam.backends.recall"),
-        ("ratslam.attractor.pose_cells", "ratslam.keyframes.map"),
+        ("ratslam.classic.pose_cells", "ratslam.keyframes.map"),
         ("ratslam.recall.filter", "ratslam.pose_graph"),
         ("ratslam.pipeline.run", "ratslam.experiments"),
         ("ratslam.live.session", "ratslam.experiments"),
@@ -49,7 +49,7 @@ VIOLATIONS = {
         ("ratslam.backends.classic", "evaluation"),
     ],
     "networkx is for maps": [
-        ("ratslam.attractor.pose_cells", "networkx"),
+        ("ratslam.classic.pose_cells", "networkx"),
         ("robot.planted", "networkx.algorithms"),
     ],
     "jax is for the engine": [("robot.planted", "jax.numpy"), ("evaluation.planted", "jax")],

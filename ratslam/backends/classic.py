@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import activity_sums, window_levels
-from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import ClassicBackendConfig
-from ratslam.classic import places, view_templates
+from ratslam.classic import places, pose_cells, view_templates
 from ratslam.classic.experience_map import ExperienceMap
+from ratslam.classic.levels import activity_sums, window_levels
 from ratslam.classic.places import Places
+from ratslam.classic.pose_cell_config import network_of, rings, units
+from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.classic.view_templates import Match, Templates
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
@@ -64,15 +63,16 @@ class ClassicBackend(Backend):
         self.config = config
         self.view_shape = view_shape
         self.dtype = np.dtype(dtype)
-        self.window_levels = window_levels(config.pose_cells, self.dtype)
-        self.rings = rings(config.pose_cells, self.dtype)
-        self.units = units(config.pose_cells, self.dtype)
+        self.network = network_of(config.pose_cells, config.attractor)
+        self.window_levels = window_levels(self.network, self.dtype)
+        self.rings = rings(self.network, self.dtype)
+        self.units = units(self.network, self.dtype)
 
     def init(self, key: Array, capacity: int) -> ClassicState:
         """One packet in the middle of the torus, empty memories. `key` is not used: nothing is random."""
         del key
         return ClassicState(
-            pose_cells.start(self.config.pose_cells, self.dtype),
+            pose_cells.start(self.network, self.dtype),
             view_templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
             places.start(capacity, self.dtype),
             jnp.zeros((), self.dtype),
@@ -112,7 +112,7 @@ class ClassicBackend(Backend):
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
         cells, info = pose_cells.step(
-            config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
+            self.network, self.window_levels, state.cells, odometry, recalled, energy
         )
         canonical = (cells.pose - turned) % self.rings
         world, decision = places.decide(

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, PositiveFloat
 
-from ratslam.attractor.config import PoseCellConfig
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
+from ratslam.classic.pose_cell_config import AttractorConfig, PoseCellConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import KeyframeMapConfig
@@ -25,7 +25,9 @@ class PoseCellBackendConfig(Settings):
     """Sections common to the methods with pose cells."""
 
     pose_cells: PoseCellConfig = PoseCellConfig()
-    """The attractor network."""
+    """The pose cells: a torus over x, y and heading."""
+    attractor: AttractorConfig = AttractorConfig()
+    """The attractor network that moves their packet of activity."""
     templates: TemplateConfig = TemplateConfig()
     """View preprocessing and, for `backend: classic`, view matching."""
     experience: ExperienceConfig = ExperienceConfig()

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import rings, units
-from ratslam.attractor.levels import activity_sums, window_levels
-from ratslam.attractor.pose_cells import Outcome, PoseCells
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.piece_ties import PieceTies
-from ratslam.classic import view_templates
+from ratslam.classic import pose_cells, view_templates
+from ratslam.classic.levels import activity_sums, window_levels
+from ratslam.classic.pose_cell_config import network_of, rings, units
+from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.core.backend import Backend, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
@@ -114,7 +113,8 @@ class RecallBackend(Backend):
         self.signed = self.pixels is not None and self.recall.images == "signed"
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
-        self.window_levels = window_levels(config.pose_cells, self.dtype)
+        self.network = network_of(config.pose_cells, config.attractor)
+        self.window_levels = window_levels(self.network, self.dtype)
         self.rings = rings(config.pose_cells, self.dtype)
         self.units = units(config.pose_cells, self.dtype)
 
@@ -122,7 +122,7 @@ class RecallBackend(Backend):
         """One packet in the middle of the torus, and no keyframes. `key` is not used: nothing is random."""
         del key
         return RecallState(
-            pose_cells.start(self.config.pose_cells, self.dtype),
+            pose_cells.start(self.network, self.dtype),
             recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
             jnp.ones((), self.dtype),
         )
@@ -169,7 +169,7 @@ class RecallBackend(Backend):
         )
         recalled, energy = self._injection(memory, result)
         cells, info = pose_cells.step(
-            self.config.pose_cells, self.window_levels, state.cells, odometry, recalled, energy
+            self.network, self.window_levels, state.cells, odometry, recalled, energy
         )
         memory = lax.cond(
             is_keyframe,

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
-from ratslam.attractor import pose_cells
 from ratslam.backends import grid, localise, localise_grid
 from ratslam.backends.classic import ClassicBackend, ClassicEvidence
 from ratslam.backends.config import (
@@ -23,6 +22,7 @@ from ratslam.backends.grid import GridEvidence
 from ratslam.backends.localise import LocaliseEvidence, LocaliseOutcome
 from ratslam.backends.localise_grid import GridLocaliseEvidence, GridLocaliseOutcome
 from ratslam.backends.recall import RecallBackend, RecallEvidence
+from ratslam.classic import pose_cells
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
 from ratslam.keyframes.config import FULL, Ablation

@@ -1,1 +1,1 @@
-"""RatSLAM as published: view templates, places, experience map, relaxation."""
+"""RatSLAM as published: pose cells, view templates, places, experience map, relaxation."""

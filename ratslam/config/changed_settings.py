@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
+from ratslam.config.renamed_keys import with_moved_settings
 from ratslam.config.run_config import LoopConfig
 from ratslam.config.strict_yaml import load, validate
 
@@ -30,7 +31,7 @@ def changed_settings(path: Path) -> list[ChangedSetting]:
     Raises:
         InputErrors: the configuration has errors.
     """
-    return list(_changes(validate(load(path), LoopConfig), LoopConfig(), ""))
+    return list(_changes(validate(with_moved_settings(load(path)), LoopConfig), LoopConfig(), ""))
 
 
 def _changes(section: BaseModel, default: BaseModel | None, prefix: str) -> Iterator[ChangedSetting]:

@@ -17,8 +17,8 @@ from tactile.base.errors import InputError
 
 Value = float | int | bool | str | None
 
-IMAGE, TEMPLATES, CELLS, MAP = "recording.image", "templates", "pose_cells", "experience.solver"
-VISUAL = "recording.visual_odometry"
+IMAGE, VISUAL = "recording.image", "recording.visual_odometry"
+TEMPLATES, CELLS, NETWORK, MAP = "templates", "pose_cells", "attractor", "experience.solver"
 
 
 class Parameter(NamedTuple):
@@ -43,11 +43,11 @@ RATSLAM: dict[str, Parameter] = {
     "pc_dim_xy": Parameter(21, (f"{CELLS}.cells_xy",)),
     "pc_dim_th": Parameter(36, (f"{CELLS}.cells_heading",)),
     "pc_cell_x_size": Parameter(1.0, (f"{CELLS}.cell_size",)),
-    "pc_w_e_dim": Parameter(7, (f"{CELLS}.excite_width",)),
-    "pc_w_e_var": Parameter(1.0, (f"{CELLS}.excite_sigma",)),
-    "pc_w_i_dim": Parameter(5, (f"{CELLS}.inhibit_width",)),
-    "pc_w_i_var": Parameter(2.0, (f"{CELLS}.inhibit_sigma",)),
-    "pc_global_inhib": Parameter(2e-5, (f"{CELLS}.global_inhibition",)),
+    "pc_w_e_dim": Parameter(7, (f"{NETWORK}.excite_width",)),
+    "pc_w_e_var": Parameter(1.0, (f"{NETWORK}.excite_sigma",)),
+    "pc_w_i_dim": Parameter(5, (f"{NETWORK}.inhibit_width",)),
+    "pc_w_i_var": Parameter(2.0, (f"{NETWORK}.inhibit_sigma",)),
+    "pc_global_inhib": Parameter(2e-5, (f"{NETWORK}.global_inhibition",)),
     "vt_match_threshold": Parameter(0.03, (f"{TEMPLATES}.threshold",)),
     "vt_shift_match": Parameter(25, (f"{TEMPLATES}.shift",)),
     "vt_step_match": Parameter(5, (f"{TEMPLATES}.shift_step",)),

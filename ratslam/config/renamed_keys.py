@@ -1,6 +1,25 @@
-"""Settings that were renamed: the error for an old configuration names the new key."""
+"""Settings that were renamed: the error for an old configuration names the new key.
+
+Those that moved with their values are read from what an earlier version wrote, so that its map files and run
+folders still open.
+"""
 
 from __future__ import annotations
+
+import copy
+
+from ratslam.config.strict_yaml.document import Document
+
+MOVED: dict[str, str] = {
+    "pose_cells.excite_width": "attractor.excite_width",
+    "pose_cells.excite_sigma": "attractor.excite_sigma",
+    "pose_cells.inhibit_width": "attractor.inhibit_width",
+    "pose_cells.inhibit_sigma": "attractor.inhibit_sigma",
+    "pose_cells.global_inhibition": "attractor.global_inhibition",
+    "pose_cells.settle_steps": "attractor.settle_steps",
+    "pose_cells.engine": "attractor.engine",
+}
+"""Old dotted path of a setting to the new one, where it means the same."""
 
 RENAMED: dict[str, str] = {
     "roving": "create_simulation",
@@ -46,7 +65,29 @@ RENAMED: dict[str, str] = {
     "grid.resampling.when": "grid.resampling.schedule",
     "grid.resampling.how": "grid.resampling.scheme",
     "grid.resampling.effective": "grid.resampling.min_effective_share",
+    **MOVED,
 }
 """Old dotted path of a setting to the new one, or to a sentence with the replacement.
 
 A renamed section maps the keys in it as well; only those with new names of their own need a line."""
+
+
+def with_moved_settings(document: Document) -> Document:
+    """A configuration that the program wrote, read with the settings of `MOVED` under their new names.
+
+    The program writes every setting, so only a document with all the old names is one: the few in a user's
+    own file are reported with their new names, and so are those of `--set`. A value under the new name stays.
+    """
+    moves = [(*old.split("."), *new.split(".")) for old, new in MOVED.items()]
+    if not all((old, key) in document.places for old, key, *_ in moves):
+        return document
+    data, places = copy.deepcopy(document.data), dict(document.places)
+    for old, key, new, name in moves:
+        section = data.setdefault(new, {})
+        if places[old, key].key == "--set" or not isinstance(section, dict):
+            continue
+        section.setdefault(name, data[old].pop(key))
+        place = places.pop((old, key))
+        places.setdefault((new,), place)
+        places.setdefault((new, name), place)
+    return Document(data, places)

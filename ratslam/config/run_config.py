@@ -10,12 +10,12 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
-from ratslam.attractor.recording_config import CellsConfig
 from ratslam.backends.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
+from ratslam.classic.recording_config import CellsConfig
 from ratslam.config.includes import merge_includes
 from ratslam.config.packaged import PresetName, find_config
 from ratslam.config.plugin_settings import check_plugins, resolved_plugin
-from ratslam.config.renamed_keys import RENAMED
+from ratslam.config.renamed_keys import RENAMED, with_moved_settings
 from ratslam.config.strict_yaml import load, validate
 from ratslam.config.strict_yaml.document import Document
 from robot.live.config import LiveConfig
@@ -151,7 +151,7 @@ def load_config(
         InputErrors: all errors in it, each with file, line and column.
     """
     path, model = find_config(path), RunConfig if source_required else LoopConfig
-    document = merge_includes(load(path, assignments), path.parent)
+    document = merge_includes(with_moved_settings(load(path, assignments)), path.parent)
     _check_sources(document, assignments)
     config = validate(document, model)
     check_plugins(document, config)

@@ -11,7 +11,7 @@ from evaluation.cells.head_direction import mean_vector_length
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import arena_edges, bin_activity
 from evaluation.plots.cell_plot import draw_cells, map_sums
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.rats.driven_network import DrivenNetwork
 from robot.simulation.rat.rat_odometry import RatOdometryConfig
@@ -24,7 +24,7 @@ def main() -> None:
     prepare_precision("float64")
     errors = RatOdometryConfig(speed_white=0.1, heading_white=0.05)  # sqrt(s), rad/sqrt(s)
     rat = RatSimulation(RatSimulationConfig(seconds=300, rate_hz=10, odometry=errors))
-    network = DrivenNetwork(PoseCellConfig(cell_size=0.05), rat.truth[0])  # a torus of 21 x 0.05 = 1.05 m
+    network = DrivenNetwork(NetworkConfig(cell_size=0.05), rat.truth[0])  # a torus of 21 x 0.05 = 1.05 m
     activity = []
     for step, (motion, pose) in enumerate(zip(rat.odometry, rat.truth, strict=True)):
         energy = 0.5 if step % 10 == 0 else 0.0  # as if the rat knew the place, once a second

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, add_axes, name_axes, new_figure
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
 from tactile.base.types import Odometry
 
@@ -22,7 +22,7 @@ SHOWN = (0, 1, 3, 20)  # steps
 
 def main() -> None:
     prepare_precision("float64")
-    config = PoseCellConfig()  # 21 x 21 cells of 0.1 m, 36 headings of 10 degrees
+    config = NetworkConfig()  # 21 x 21 cells of 0.1 m, 36 headings of 10 degrees
     levels = window_levels(config, jnp.float64)
     rest, nowhere = Odometry(*jnp.zeros((4, 1))[:, 0]), jnp.zeros(3)
     step = jax.jit(lambda cells: pose_cells.step(config, levels, cells, rest, nowhere, jnp.asarray(0.0)))

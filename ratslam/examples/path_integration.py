@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from evaluation.plots.style import BLUE, GREY, INK, add_axes, add_legend, name_axes, new_figure
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Odometry
@@ -24,7 +24,7 @@ STEPS, FORWARD = 240, 0.05  # m per step
 
 def main() -> None:
     prepare_precision("float64")
-    config = PoseCellConfig()
+    config = NetworkConfig()
     levels = window_levels(config, jnp.float64)
     nowhere, none = jnp.zeros(3), jnp.asarray(0.0)
     step = jax.jit(lambda cells, moved: pose_cells.step(config, levels, cells, moved, nowhere, none))

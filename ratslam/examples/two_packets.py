@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, name_axes, new_figure
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
 from tactile.base.types import Odometry
 
@@ -23,7 +23,7 @@ PACKET, PLACE = (10.0, 10.0, 18.0), (18.0, 4.0, 18.0)  # x, y, heading, cells
 
 def main() -> None:
     prepare_precision("float64")
-    config = PoseCellConfig()
+    config = NetworkConfig()
     levels = window_levels(config, jnp.float64)
     rest, place = Odometry(*jnp.zeros((4, 1))[:, 0]), jnp.asarray(PLACE)
     step = jax.jit(lambda cells, energy: pose_cells.step(config, levels, cells, rest, place, energy))

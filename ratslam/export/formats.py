@@ -17,7 +17,7 @@ from evaluation.cells.analysis import (
     write_scores,
 )
 from evaluation.cells.recording import NAME, CellRecording, read_recording
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig, network_of
 from ratslam.config.run_config import load_config
 from ratslam.core.precision import prepare_precision
 from ratslam.export.nwb import write_nwb
@@ -211,11 +211,12 @@ def score_run_cells(directory: Path, peak_rate: float) -> CellScores:
     return analyse(recording, settings)
 
 
-def _read_cells(directory: Path) -> tuple[CellRecording, PoseCellConfig]:
+def _read_cells(directory: Path) -> tuple[CellRecording, NetworkConfig]:
     """The recorded cells of a run and its network; sets JAX to float64."""
     file = directory / NAME
     if not file.exists():
         raise InputError(str(file), "no such file", "a run with recorded pose cells", CURE)
     recording = read_recording(file)
     prepare_precision("float64")
-    return recording, load_config(directory / "config.yaml").pose_cells
+    config = load_config(directory / "config.yaml")
+    return recording, network_of(config.pose_cells, config.attractor)

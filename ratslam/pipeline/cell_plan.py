@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.cell_probe import activity_of, choose_cells, hold_cells
-from ratslam.attractor.levels import Level
-from ratslam.attractor.recording_config import CellSumsConfig
 from ratslam.backends.classic import ClassicBackend
 from ratslam.backends.recall import RecallBackend
+from ratslam.classic.cell_probe import activity_of, choose_cells, hold_cells
+from ratslam.classic.levels import Level
+from ratslam.classic.recording_config import CellSumsConfig
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import Probe

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
-from ratslam.attractor.cell_probe import active_cells
-from ratslam.attractor.levels import Level
+from ratslam.classic.cell_probe import active_cells
+from ratslam.classic.levels import Level
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import CHUNK, Step

@@ -15,6 +15,7 @@ import numpy as np
 
 from ratslam.backends.registry import BACKENDS, LOCALISING
 from ratslam.config.other_files import MAP, kind_of
+from ratslam.config.renamed_keys import with_moved_settings
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
 from ratslam.core.checkpoint import fill_odometry, with_prefix
@@ -206,7 +207,7 @@ def describe_readings(source: Source) -> SourceDescription:
 
 
 def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
-    config = validate(parse(texts["config"], f"{file}: config"), LoopConfig)
+    config = _config_of(file, texts["config"])
     BACKENDS.get(config.backend, f"{file}: backend")
     with malformed(file, EXPECTED, found="{}", spoilt=SPOILT):
         source = SourceDescription.from_json(texts["source"])
@@ -225,11 +226,16 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
     )  # fmt: skip
 
 
+def _config_of(file: Path, text: str) -> RunConfig:
+    """The configuration in a map file, of this or an earlier version."""
+    return validate(with_moved_settings(parse(text, f"{file}: config")), LoopConfig)
+
+
 def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], None] | None) -> SavedMap:
     """The map in a file written before there was a format: by `Slam.save`, which kept its configuration, or
     in a run directory, where it stands beside it."""
     if "source" in arrays:
-        config: RunConfig = validate(parse(text_of(file, arrays, "config"), f"{file}: config"), LoopConfig)
+        config = _config_of(file, text_of(file, arrays, "config"))
         with malformed(file, EXPECTED, found="{}"):
             readings = SourceDescription.from_json(text_of(file, arrays, "source"))
         source = describe_readings(open_touch_source(readings, config.touch))

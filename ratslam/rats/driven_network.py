@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import point_activity, to_full_torus, window_levels
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import point_activity, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 
 
 class DrivenNetwork:
-    """A network and its state. Steps are compiled once for each `PoseCellConfig` in a process, in the
+    """A network and its state. Steps are compiled once for each `NetworkConfig` in a process, in the
     precision that JAX has by default.
 
     The axes of the torus are those of the world: a pose is at the cell of its position divided by the cell
@@ -31,7 +31,7 @@ class DrivenNetwork:
         activity: [K * N * N] of all cells; it sums to 1. packet: [3] decoded over x, y, heading, cells.
     """
 
-    def __init__(self, config: PoseCellConfig, pose: np.ndarray) -> None:
+    def __init__(self, config: NetworkConfig, pose: np.ndarray) -> None:
         self.config = config
         self._dtype = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self._unit, self._rings = units(config, self._dtype), rings(config, self._dtype)
@@ -77,7 +77,7 @@ class DrivenNetwork:
 
 
 @lru_cache(maxsize=16)
-def _compiled(config: PoseCellConfig, dtype: np.dtype) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _compiled(config: NetworkConfig, dtype: np.dtype) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The start of the network at a position [3] in cells, and its step with the numbers [8] of motion,
     anchor in cells, and energy."""
     levels = window_levels(config, dtype)

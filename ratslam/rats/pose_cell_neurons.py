@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.rats.cell_poses import cell_poses, check_cells
 from ratslam.rats.driven_network import DrivenNetwork
 from ratslam.rats.settled_peak import settled_peak
@@ -39,7 +39,7 @@ class PoseCellNeurons(Neurons):
     waits.
 
     `params` beside those of `Neurons` (`min_fr` has no effect, `n` follows from `cell`):
-        pose_cells: a `PoseCellConfig`, the network. cell: [C] indices in the flattened network [K, N, N];
+        pose_cells: a `NetworkConfig`, the network. cell: [C] indices in the flattened network [K, N, N];
         None: all. max_fr: Hz. speed_noise: white error of the speed as a share of it over one second,
         sqrt(s). heading_noise: white error of the turn, rad/sqrt(s). seed: of these errors. anchor: an
         `Anchor`, or None.
@@ -55,7 +55,7 @@ class PoseCellNeurons(Neurons):
 
     default_params: dict[str, Any] = {  # noqa: RUF012 (the form that RatInABox reads)
         "name": "PoseCellNeurons",
-        "pose_cells": PoseCellConfig(),
+        "pose_cells": NetworkConfig(),
         "cell": None,
         "max_fr": 20.0,
         "speed_noise": 0.0,
@@ -68,7 +68,7 @@ class PoseCellNeurons(Neurons):
         if Agent.Environment.dimensionality != "2D":
             raise InputError("Agent", "an environment of one dimension", "one of two dimensions")
         given = {**self.default_params, **(params or {})}
-        config: PoseCellConfig = given["pose_cells"]
+        config: NetworkConfig = given["pose_cells"]
         shape = (config.cells_heading, config.cells_xy, config.cells_xy)
         cell = np.arange(np.prod(shape)) if given["cell"] is None else np.asarray(given["cell"])
         check_cells(shape, cell)

@@ -8,16 +8,16 @@ import jax
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from tactile.base.types import Odometry
 
 SETTLING = 60
 """Steps without motion; after 40 the peak of the default network changes by less than 1e-12 a step."""
 
 
-def settled_peak(config: PoseCellConfig) -> float:
+def settled_peak(config: NetworkConfig) -> float:
     """The largest activity of a packet at rest on a cell, in the precision that JAX has by default.
 
     It depends on the network alone, so rates scaled by it can be compared between cells and recordings. A
@@ -27,7 +27,7 @@ def settled_peak(config: PoseCellConfig) -> float:
 
 
 @lru_cache(maxsize=32)
-def _settled_peak(config: PoseCellConfig, dtype: np.dtype) -> float:
+def _settled_peak(config: NetworkConfig, dtype: np.dtype) -> float:
     levels = window_levels(config, dtype)
     zero = np.zeros((), dtype)
     still, nowhere = Odometry(zero, zero, zero, zero), np.zeros(3, dtype)

@@ -26,7 +26,7 @@ BOUND_STEPS = 1000  # rounding grows along a stream; beyond this many steps the 
 def settings(config: ClassicBackendConfig) -> Settings:
     """The engine's defaults for settings that a reference stream does not have."""
     templates = config.templates
-    return Settings(templates.recent, config.pose_cells.settle_steps, templates.column_angle)
+    return Settings(templates.recent, config.attractor.settle_steps, templates.column_angle)
 
 
 def observed(observation: Observation) -> Input:

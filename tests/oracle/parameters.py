@@ -19,6 +19,8 @@ def settings_of(params: dict[str, Any], labels: bool) -> ClassicBackendConfig:
             "pc_dim_xy": "cells_xy",
             "pc_dim_th": "cells_heading",
             "pc_cell_x_size": "cell_size",
+        },
+        "attractor": {
             "pc_w_e_dim": "excite_width",
             "pc_w_e_var": "excite_sigma",
             "pc_w_i_dim": "inhibit_width",

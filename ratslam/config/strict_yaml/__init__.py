@@ -88,7 +88,7 @@ def override(document: Document, assignments: Sequence[str]) -> Document:
         name, equals, text = assignment.partition("=")
         where = f"--set {name}"
         if not equals or not all(name.split(".")):
-            raise InputError(where, "not an assignment", "key=value such as pose_cells.excite_sigma=1e-3")
+            raise InputError(where, "not an assignment", "key=value such as pose_cells.cell_size=5e-2")
         section, path = open_path(data, name, where)
         reader = Reader(text, lambda line, column: "--set", path)
         section[path[-1]] = reader.read()

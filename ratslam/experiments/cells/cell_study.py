@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 from scipy.stats import qmc
 
-from ratslam.attractor.batch import Network
-from ratslam.attractor.cell_batch import CellSets
+from ratslam.classic.batch import Network
+from ratslam.classic.cell_batch import CellSets
 from ratslam.config.run_config import load_config
 from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.config.strict_yaml.document import Place

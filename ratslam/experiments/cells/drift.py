@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.plots import style
-from ratslam.attractor.batch import Network
-from ratslam.attractor.cell_batch import CellSets, walk
-from ratslam.attractor.config import rings, units
+from ratslam.classic.batch import Network
+from ratslam.classic.cell_batch import CellSets, walk
+from ratslam.classic.pose_cell_config import rings, units
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.cells.figure import CellFigure, CellTask
 from ratslam.experiments.cells.packet_error import error_size

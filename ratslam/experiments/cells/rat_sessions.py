@@ -7,8 +7,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from ratslam.attractor.cell_probe import active_cells
-from ratslam.attractor.levels import Level
+from ratslam.classic.cell_probe import active_cells
+from ratslam.classic.levels import Level
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.session import Session, Step
 from ratslam.pipeline.build_session import build_session

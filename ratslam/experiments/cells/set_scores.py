@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.cell_batch import SEGMENT, CellSets, CellTrack, walk
-from ratslam.attractor.config import rings, units
-from ratslam.attractor.pose_cells import Outcome
+from ratslam.classic.cell_batch import SEGMENT, CellSets, CellTrack, walk
+from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cells import Outcome
 from ratslam.experiments.cells.study_course import StudyCourse
 
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.attractor.cell_batch import CellCourse
-from ratslam.attractor.config import PoseCellConfig, rings, units
+from ratslam.classic.cell_batch import CellCourse
+from ratslam.classic.pose_cell_config import NetworkConfig, PoseCellConfig, network_of, rings, units
 from ratslam.config.run_config import RunConfig
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
@@ -37,7 +37,7 @@ class StudyCourse(NamedTuple):
     """
 
     name: str
-    config: PoseCellConfig
+    config: NetworkConfig
     course: CellCourse
     expected: np.ndarray
     bin: np.ndarray
@@ -79,7 +79,7 @@ def read_course(
     with open_observations(config) as (config, source):
         session = _watch(config, source, steps) if views else _drive(source, steps)
         name = source.name
-    network = config.pose_cells
+    network = network_of(config.pose_cells, config.attractor)
     _check(name, network, session, views)
     expected = expected_poses(network, session.truth)
     unit = stream(seed, "cells.noise").standard_normal((len(expected), 2))

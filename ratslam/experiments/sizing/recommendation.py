@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import SETTLED, window_levels
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
 from ratslam.backends.grid import LIVE_SIDE
+from ratslam.classic.levels import SETTLED, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, network_of
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import open_path
 from ratslam.config.strict_yaml.dumper import Dumper
@@ -92,7 +92,7 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     yield (size := _cell_size(config, scene))
     yield (across := _cells_xy(config, scene, size.value))
     fitting = {"cell_size": size.value, "cells_xy": across.value, "engine": "window"}
-    yield _engine(config, cells.model_copy(update=fitting))
+    yield _engine(config, network_of(cells, config.attractor).model_copy(update=fitting))
     step = 2 * np.pi / cells.cells_heading
     turns = f"a turn of {scene.turn:.2g} rad takes {_parts(scene.turn / step)} sub-steps"
     yield _of(
@@ -130,16 +130,16 @@ def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Recommendation:
     return _of(config, "pose_cells.cells_xy", value, spanned + free)
 
 
-def _engine(config: RunConfig, proposed: PoseCellConfig) -> Recommendation:
+def _engine(config: RunConfig, proposed: NetworkConfig) -> Recommendation:
     levels = window_levels(proposed, np.dtype(float))
     shapes = ["x".join(map(str, level.window.shape[::-1])) for level in levels]
     if len(levels) == 1:
-        return _of(config, "pose_cells.engine", "dense", f"{shapes[0]} cells are too few for a window")
+        return _of(config, "attractor.engine", "dense", f"{shapes[0]} cells are too few for a window")
     share = np.prod(levels[0].window.shape) / np.prod(levels[-1].window.shape)
     several = [f"{level.windows} of " * (level.windows > 1) for level in levels]
     then = ", ".join(map("".join, zip(several[1:-1], shapes[1:-1], strict=True)))
     why = f"{shapes[0]} of {shapes[-1]} cells ({share:.0%}); where not exact, {then}{', ' if then else ''}all"
-    return _of(config, "pose_cells.engine", "window", why)
+    return _of(config, "attractor.engine", "window", why)
 
 
 def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:

@@ -38,7 +38,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "as configured": {},
     "11 cells": {"backend": "recall", "pose_cells.cells_xy": 11},
     "41 cells": {"backend": "recall", "pose_cells.cells_xy": 41},
-    "dense": {"backend": "recall", "pose_cells.engine": "dense"},
+    "dense": {"backend": "recall", "attractor.engine": "dense"},
     "float32": {"session.precision": "float32"},
     "classic": CLASSIC,
 }

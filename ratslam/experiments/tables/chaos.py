@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import window_levels
-from ratslam.attractor.pose_cells import PoseCells
-from ratslam.attractor.window import ring_difference
+from ratslam.classic import pose_cells
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig as PoseCellConfig
+from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cells import PoseCells
+from ratslam.classic.window import ring_difference
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from tactile.base.random_streams import stream

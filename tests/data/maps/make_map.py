@@ -22,7 +22,7 @@ from robot.sources.description import describe
 
 FOLDER = Path(__file__).parent
 RECORDING = FOLDER.parents[1] / "golden" / "touch_circuits.mcap"
-SETTINGS = "pose_cells: {cells_xy: 11, cells_heading: 12, engine: dense}\n"
+SETTINGS = "pose_cells: {cells_xy: 11, cells_heading: 12}\nattractor: {engine: dense}\n"
 SAVED, MORE = 360, 160
 
 

@@ -22,7 +22,7 @@ from ratslam.examples import dead_reckoning
 def pose_cells(method, source, **more):
     """Both engines of the pose cells."""
     engine = "window" if method == "classic" else "dense"
-    parts = {"pose_cells": {"cells_xy": 11, "engine": engine}, "templates": {"source": source}}
+    parts = {"pose_cells": {"cells_xy": 11}, "attractor": {"engine": engine}, "templates": {"source": source}}
     return method, parts | more
 
 

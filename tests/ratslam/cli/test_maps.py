@@ -163,7 +163,9 @@ def test_a_sequence_that_cannot_be_undone_has_another_cure(
 @pytest.mark.parametrize("backend", ["classic", pytest.param("grid", marks=pytest.mark.soak)])
 def test_maps_without_keyframes(backend: str, capsys, tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
-    settings = "pose_cells: {cells_xy: 11, cells_heading: 12, engine: dense}\ngrid: {particles: 20}\n"
+    settings = (
+        "pose_cells: {cells_xy: 11, cells_heading: 12}\nattractor: {engine: dense}\ngrid: {particles: 20}\n"
+    )
     config.write_text(f"recording: {{file: {READINGS}}}\nbackend: {backend}\n{settings}")
     slam = ratslam.Slam(config)
     with open_recording(RecordingConfig(file=READINGS)) as recording:

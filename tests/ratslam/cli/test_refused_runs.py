@@ -18,11 +18,11 @@ from tests.ratslam.cli.run_cases import ROOT, SQUARE, refuses
     [
         ("", ["config.yaml"]),
         (
-            "recording: {file: a.npz}\npose_cells: {excite_sigm: 1}\n",
+            "recording: {file: a.npz}\nattractor: {excite_sigm: 1}\n",
             ["did you mean 'excite_sigma'", "config.yaml:2:"],
         ),
-        ("recording: {file: a.npz}\npose_cells: {excite_sigma: -1}\n", ["pose_cells.excite_sigma"]),
-        ("recording: {file: a.npz}\npose_cells: {excite_width: 6}\n", ["odd"]),
+        ("recording: {file: a.npz}\nattractor: {excite_sigma: -1}\n", ["attractor.excite_sigma"]),
+        ("recording: {file: a.npz}\nattractor: {excite_width: 6}\n", ["odd"]),
         ("recording: {file: a.npz}\ntemplates: {threshold: high}\n", ["templates.threshold"]),
         ("recording: {file: a.npz}\nrecording: {file: b.npz}\n", ["recording"]),
         ("recording: {file: missing.npz}\n", ["missing.npz"]),

@@ -93,7 +93,8 @@ def test_the_irat_becomes_a_configuration(write, tmp_path: Path, capsys) -> None
     assert settings["places"] == {"radius": 2.0, "radius_heading": 2.0}
     assert settings["experience"] == {"solver": {"name": "relaxation", "loops": 20, "correction": 0.5}}
     cells = settings["pose_cells"]
-    assert (cells["cells_xy"], cells["cells_heading"], cells["cell_size"]) == (11, 36, 0.015)
+    assert cells == {"cells_xy": 11, "cells_heading": 36, "cell_size": 0.015}
+    assert settings["attractor"]["excite_sigma"] == 1.0
 
 
 def test_a_video_and_visual_odometry_load(write, tmp_path: Path, capsys) -> None:
@@ -112,7 +113,7 @@ def test_a_video_and_visual_odometry_load(write, tmp_path: Path, capsys) -> None
     assert (visual.translation.x_max, visual.rotation.y_max, visual.rotation.x_max) == (475, 240, None)
     assert config.templates.normalise_mean == 0.4
     assert config.templates.recovery == 0.04
-    assert config.pose_cells.global_inhibition == 2e-5  # missing keys keep the default of OpenRatSLAM
+    assert config.attractor.global_inhibition == 2e-5  # missing keys keep the default of OpenRatSLAM
     assert config.places.radius == 2.0
 
 

@@ -26,7 +26,7 @@ def test_override() -> None:
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("steps", "steps: not an assignment; expected key=value such as pose_cells.excite_sigma=1e-3"),
+        ("steps", "steps: not an assignment; expected key=value such as pose_cells.cell_size=5e-2"),
         ("=1", ": not an assignment"),
         ("a..b=1", "a..b: not an assignment"),
         ("steps=", "steps: empty; expected a value"),

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, ClassVar, get_args, get_origin
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from ratslam.config.renamed_keys import RENAMED
-from ratslam.config.run_config import RunConfig
+from ratslam.config.changed_settings import changed_settings
+from ratslam.config.renamed_keys import MOVED, RENAMED
+from ratslam.config.run_config import RunConfig, load_config
 from ratslam.config.strict_yaml import override, parse, validate
 from tactile.base.config import Settings
 from tactile.base.errors import InputError
 
+WRITTEN = Path(__file__).parents[2] / "data" / "maps" / "ratslam-map-1.npz"
+"""A map file, whose configuration was written when the settings of `MOVED` had their old names."""
 PATHS = {old: new for old, new in RENAMED.items() if " " not in new}
 
 
@@ -100,3 +105,42 @@ def test_every_new_key_exists_and_no_old_one(old: str) -> None:
 def test_every_old_key_is_refused_with_the_new_one(old: str) -> None:
     document = override(parse("recording: {file: a.npz}\n", "c.yaml"), [f"{old}=1"])
     assert any(f"--set {old}: " in line and RENAMED[old] in line for line in errors_of(document, RunConfig))
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    """The configuration of an earlier version as the file of a run folder."""
+    path = tmp_path / "config.yaml"
+    with np.load(WRITTEN) as arrays:
+        path.write_text(str(arrays["config"]))
+    return path
+
+
+def test_a_configuration_that_an_earlier_version_wrote_is_read_with_moved_settings(written: Path) -> None:
+    old = parse(written.read_text(), "c.yaml").data["pose_cells"]
+    config = load_config(written, source_required=False)
+    now = {**dict(config.pose_cells), **dict(config.attractor)}
+    assert now == old
+    assert old["engine"] == "dense"
+    assert {f"pose_cells.{name}" for name in config.attractor.model_fields_set} == set(MOVED)
+    assert "attractor.engine" in [setting.path for setting in changed_settings(written)]
+
+
+def test_options_for_it_have_the_new_names(written: Path) -> None:
+    options = ["attractor.engine=window", "attractor.settle_steps=7"]
+    network = load_config(written, options, source_required=False).attractor
+    assert (network.engine, network.settle_steps, network.excite_sigma) == ("window", 7, 1.0)
+    with pytest.raises(InputError, match=r"--set pose_cells\.engine: `.*` is now `attractor\.engine`"):
+        load_config(written, ["pose_cells.engine=window"], source_required=False)
+
+
+def test_wrong_values_in_it_are_reported_where_they_stand(written: Path) -> None:
+    written.write_text(written.read_text().replace("excite_width: 7", "excite_width: 6"))
+    line = 1 + written.read_text().splitlines().index("  excite_width: 6")
+    with pytest.raises(InputError, match=rf"config.yaml:{line}:17: attractor.excite_width: 6: must be odd"):
+        load_config(written, source_required=False)
+
+
+def test_a_users_old_keys_are_not_moved() -> None:
+    text = "pose_cells: {engine: dense, excite_sigma: 1.0}\nrecording: {file: a.npz}\n"
+    assert len(errors_of(parse(text, "c.yaml"), RunConfig)) == 2

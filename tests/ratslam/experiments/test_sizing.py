@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluation.metrics.metric import Quantity
-from ratslam.attractor.pose_cells import LARGEST_SUBSTEP
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
@@ -201,12 +201,14 @@ def stubbed(monkeypatch):
 
 def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed):
     path = tmp_path / "maze.yaml"
-    path.write_text("simulation: {fidelity: dynamic}\npose_cells: {cell_size: 0.005, engine: dense}\n")
+    path.write_text(
+        "simulation: {fidelity: dynamic}\npose_cells: {cell_size: 0.005}\nattractor: {engine: dense}\n"
+    )
     assert main(["size", str(path), "--cycles", "400"]) == 0
     output = capsys.readouterr().out
     first, second, *others = stubbed
     assert first.pose_cells.cell_size > 0.005
-    assert (second.pose_cells.cell_size, second.pose_cells.engine) == (0.005, "dense")
+    assert (second.pose_cells.cell_size, second.attractor.engine) == (0.005, "dense")
     assert second.simulation.fidelity == "dynamic"
     assert {config.simulation.path.circuits for config in stubbed} == {first.simulation.path.circuits}
     assert len(first.simulation.path.circuits) < 10

@@ -12,7 +12,7 @@ import pytest
 
 from evaluation.cells.analysis import AnalysisSettings, analyse_cells
 from evaluation.cells.recording import write_recording
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.cli import main
 from ratslam.export.formats import export_run
 from ratslam.export.nwb import EPOCH, write_nwb
@@ -54,7 +54,7 @@ def run(recording, tmp_path):
 def test_the_validator_accepts_the_file_and_it_holds_all(run, recording, tmp_path, pynwb):
     assert main(["export", str(run), "-o", str(tmp_path / "run.nwb"), "--peak-rate", "30"]) == 0
     assert pynwb.validate(path=str(tmp_path / "run.nwb")) == []
-    network = PoseCellConfig(cells_xy=7, cells_heading=8)
+    network = NetworkConfig(cells_xy=7, cells_heading=8)
     spikes = draw_spikes(recording, settled_peak(network), SpikeConfig(peak_rate=30))
     assert sum(map(len, spikes.times)) > 100
     with pynwb.NWBHDF5IO(tmp_path / "run.nwb", "r") as source:
@@ -102,7 +102,7 @@ def test_numpy_spikes_are_those_of_the_settings(run, recording, tmp_path):
     options = ["--peak-rate", "5", "--spike-seed", "3"]
     assert main(["export", str(run), "-o", str(tmp_path / "spikes.npz"), *options]) == 0
     spikes = read_spikes(tmp_path / "spikes.npz")
-    network = PoseCellConfig(cells_xy=7, cells_heading=8)
+    network = NetworkConfig(cells_xy=7, cells_heading=8)
     again = draw_spikes(recording, settled_peak(network), SpikeConfig(peak_rate=5, seed=3))
     for one, other in zip(spikes.times, again.times, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -160,7 +160,7 @@ def test_scores_are_a_line_for_each_cell_in_hz(run, recording, tmp_path):
     write_recording(run / "cells.npz", recording)
     assert main(["export", str(run), "-o", str(tmp_path / "cells.csv"), "--peak-rate", "30"]) == 0
     table = np.genfromtxt(tmp_path / "cells.csv", delimiter=",", names=True)
-    network = PoseCellConfig(cells_xy=7, cells_heading=8)
+    network = NetworkConfig(cells_xy=7, cells_heading=8)
     gain = 30 / settled_peak(network)
     scores = analyse_cells(recording, AnalysisSettings(gain=gain))
     np.testing.assert_array_equal(table["cell"], CELLS)

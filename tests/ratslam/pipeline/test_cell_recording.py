@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import ratslam
-from ratslam.attractor.cell_probe import active_cells
-from ratslam.attractor.levels import to_full_torus
 from ratslam.backends.registry import Sensors
+from ratslam.classic.cell_probe import active_cells
+from ratslam.classic.levels import to_full_torus
 from ratslam.config.run_config import LoopConfig
 from ratslam.examples import dead_reckoning
 from ratslam.pipeline.build_session import build_session

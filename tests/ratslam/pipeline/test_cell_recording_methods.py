@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from ratslam.attractor.levels import to_full_torus
+from ratslam.classic.levels import to_full_torus
 from ratslam.config.run_config import LoopConfig
 from ratslam.core.session import Session, Step
 from ratslam.pipeline.build_session import build_session

@@ -28,7 +28,10 @@ from robot.sources.source import Sample
 from tactile.base.errors import InputError
 
 TRACE = Path(__file__).parents[2] / "golden" / "a_square3.npz"
-METHOD = {"pose_cells": {"cells_xy": 11, "cells_heading": 12, "cell_size": 0.1, "engine": "dense"}}
+METHOD = {
+    "pose_cells": {"cells_xy": 11, "cells_heading": 12, "cell_size": 0.1},
+    "attractor": {"engine": "dense"},
+}
 FIRST, SECOND = 60, 100
 """Samples of the two recordings; the first ends amid a chunk of the session."""
 

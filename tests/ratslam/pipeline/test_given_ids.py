@@ -25,7 +25,8 @@ UNCERTAIN = 0.9
 """Largest standard deviation of the position of a robot that is found, m."""
 SETTINGS = """
 templates: {source: labels}
-pose_cells: {cells_xy: 11, cell_size: 0.5, engine: dense}
+pose_cells: {cells_xy: 11, cell_size: 0.5}
+attractor: {engine: dense}
 session: {reserve: 128}
 """
 

@@ -22,6 +22,11 @@ def test_the_present_format_is_among_them() -> None:
     assert max(file.stat().st_size for file in FILES) < LARGEST
 
 
+def test_moved_settings_of_an_earlier_map_are_read() -> None:
+    config = read_map(FILES[0]).config
+    assert (config.pose_cells.cells_xy, config.attractor.engine) == (11, "dense")
+
+
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_map_of_any_format_goes_on(file: Path) -> None:
     expected = np.loadtxt(file.with_suffix(".csv"), delimiter=",")

@@ -24,7 +24,8 @@ SESSION = """
 SHORT = """
     maze: {columns: 3, rows: 3, loop: 8}
     path: {circuits: CCC}
-pose_cells: {cells_xy: 11, engine: dense}
+pose_cells: {cells_xy: 11}
+attractor: {engine: dense}
 """
 HEAD = """
 touch:

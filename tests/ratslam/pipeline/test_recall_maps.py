@@ -30,8 +30,8 @@ def session_of(
     view_shape: tuple[int, ...], cell_size: float | None, precision: str, **keyframes: bool
 ) -> Session:
     """A session with one setting for all, on pose cells small enough for a test, compiled once."""
-    cells = {"cells_xy": 11, "cell_size": cell_size, "engine": "dense"}
-    config = RecallBackendConfig.model_validate({"pose_cells": cells, "keyframes": keyframes})
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": cell_size}, "attractor": {"engine": "dense"}}
+    config = RecallBackendConfig.model_validate({**cells, "keyframes": keyframes})
     return Session(RecallBackend(config, view_shape, np.dtype(precision)), reserve=512, precision=precision)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ratslam
+from ratslam.config.strict_yaml import dump, dump_data, parse
 from ratslam.core.session import Session
 from ratslam.pipeline.map_archive import FORMAT, digest_of
 from ratslam.pipeline.saved_map import read_map, write_map
@@ -16,7 +17,8 @@ from ratslam.pipeline.sensor import check_same_sensor
 from tactile.base.errors import InputError
 
 CONFIG = """
-pose_cells: {cells_xy: 15, cells_heading: 12, cell_size: 0.1, engine: dense}
+pose_cells: {cells_xy: 15, cells_heading: 12, cell_size: 0.1}
+attractor: {engine: dense}
 recording: {file: %s}
 """
 ROOT = Path(__file__).parents[3]
@@ -96,6 +98,21 @@ def test_files_of_earlier_versions_are_converted(run: ratslam.Result, tmp_path: 
     assert (found.digest, found.recording) == (expected.digest, expected.recording)
     kept = rewritten(run.directory / "map.npz", tmp_path / "kept.npz", drop=new[:1] + new[3:])
     assert read_map(kept).sensor == expected.sensor
+
+
+@pytest.mark.parametrize("drop", [(), ("format", "recording", "sha256", "earlier")])
+def test_a_map_whose_settings_have_moved_since_is_opened(
+    run: ratslam.Result, tmp_path: Path, drop: tuple[str, ...]
+) -> None:
+    new = read_map(run.directory)
+    settings = parse(dump(new.config), "config").data
+    settings["pose_cells"] |= settings.pop("attractor")
+    old = rewritten(run.directory / "map.npz", tmp_path / "map.npz", drop=drop, config=dump_data(settings))
+    saved = read_map(old)
+    assert saved.config == new.config
+    restored = saved.open_session().arrays()
+    for name, array in new.arrays.items():
+        np.testing.assert_array_equal(restored[name], array)
 
 
 @pytest.mark.parametrize(

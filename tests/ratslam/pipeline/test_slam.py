@@ -20,16 +20,18 @@ ROOT = Path(__file__).parents[3]
 SESSIONS = {
     "a recording": f"""
 recording: {{file: {ROOT}/tests/golden/j_reverse_stop.npz}}
-pose_cells: {{cells_xy: 15, cells_heading: 12, cell_size: 0.1, engine: dense}}
+pose_cells: {{cells_xy: 15, cells_heading: 12, cell_size: 0.1}}
+attractor: {{engine: dense}}
 """,
     "a Create": """
 create_simulation: {reports: 60}
 backend: classic
-pose_cells: {cells_xy: 15, cells_heading: 12, engine: dense}
+pose_cells: {cells_xy: 15, cells_heading: 12}
+attractor: {engine: dense}
 touch: {reports: {fold_back: true, walls: geometric}}
 """,
 }
-NO_SOURCE = "backend: classic\npose_cells: {cells_xy: 15, cells_heading: 12, engine: dense}\n"
+NO_SOURCE = "backend: classic\npose_cells: {cells_xy: 15, cells_heading: 12}\nattractor: {engine: dense}\n"
 FORWARD = ratslam.Odometry(0.1, 0.0, 0.0, 1.0)
 
 

@@ -28,8 +28,8 @@ def symmetric(log: InMemorySource) -> InMemorySource:
 
 @pytest.fixture(scope="module")
 def session():
-    cells = {"cells_xy": 11, "cell_size": scenes.CELL, "engine": "dense"}
-    config = RecallBackendConfig.model_validate({"pose_cells": cells})
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": scenes.CELL}, "attractor": {"engine": "dense"}}
+    config = RecallBackendConfig.model_validate(cells)
     return Session(RecallBackend(config, (3, 6, 1), np.dtype("float64")), reserve=512)
 
 

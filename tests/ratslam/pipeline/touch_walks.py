@@ -27,7 +27,7 @@ REACH = 0.1
 """Distance within which a closure is true, m: two pose cells."""
 
 
-CELLS = {"cells_xy": 11, "engine": "dense"}
+CELLS = {"pose_cells": {"cells_xy": 11}, "attractor": {"engine": "dense"}}
 """Few pose cells, on the whole torus: they compile in half of the time."""
 
 
@@ -50,7 +50,7 @@ class MappedWalk(NamedTuple):
 def config_of(**parts: Any) -> RunConfig:
     """A small session: few pose cells, and room for all of it from the start, so that it compiles once."""
     session = {"reserve": 512} | parts.pop("session", {})
-    return RunConfig.model_validate({"pose_cells": CELLS, "session": session, **parts})
+    return RunConfig.model_validate({**CELLS, "session": session, **parts})
 
 
 @cache

@@ -11,12 +11,12 @@ import pytest
 from ratinabox.Agent import Agent
 from ratinabox.Environment import Environment
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.rats.pose_cell_neurons import PoseCellNeurons, agent_pose, anchor_at_truth
 from ratslam.rats.settled_peak import settled_peak
 from tactile.base.errors import InputError
 
-CONFIG = PoseCellConfig(cell_size=0.05)  # a torus of 1.05 m
+CONFIG = NetworkConfig(cell_size=0.05)  # a torus of 1.05 m
 SIDE = np.array([1.05, 1.05, 2 * np.pi])
 CELLS = list(range(0, 15876, 250))
 

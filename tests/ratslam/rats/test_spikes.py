@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.rats.settled_peak import settled_peak
 from ratslam.rats.spikes import SpikeConfig, draw_spikes, expected_spikes, read_spikes, write_spikes
 from tactile.base.errors import InputError
@@ -132,4 +132,4 @@ def test_bad_input_gets_one_clear_error(change, reference, message):
 
 
 def test_the_reference_is_the_peak_of_a_packet_at_rest():
-    assert settled_peak(PoseCellConfig()) == pytest.approx(0.042770, abs=1e-6)
+    assert settled_peak(NetworkConfig()) == pytest.approx(0.042770, abs=1e-6)

@@ -137,9 +137,9 @@ def test_the_control_looks_for_the_mirror_image_and_nowhere_near_the_map():
 def backend_of(kind):
     fov = 1.2 if kind == "ordered sectors" else "none"
     recall = {"guard": COUNT - 1, "local": 0.0, "sector_fov": fov}
-    cells = {"cells_xy": 11, "cell_size": CELL, "engine": "dense"}
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": CELL}, "attractor": {"engine": "dense"}}
     shape = WIDE_SHAPE if kind == "columns" else SHAPE
-    return RecallBackend(RecallBackendConfig.model_validate({"pose_cells": cells, "recall": recall}), shape)
+    return RecallBackend(RecallBackendConfig.model_validate({**cells, "recall": recall}), shape)
 
 
 @cache

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 import pytest
 
-from ratslam.attractor.batch import Network
-from ratslam.attractor.cell_batch import CellSets, walk
+from ratslam.classic.batch import Network
+from ratslam.classic.cell_batch import CellSets, walk
 from ratslam.cli import main
 from ratslam.config.run_config import load_config
 from ratslam.experiments.cells.cell_study import (

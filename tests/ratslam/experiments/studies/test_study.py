@@ -311,7 +311,7 @@ def test_the_pareto_study_covers_every_axis():
     configs = [job.config for job in study.jobs if job.seed == 0]
     for axis in (
         lambda config: config.backend,
-        lambda config: config.pose_cells.engine,
+        lambda config: config.attractor.engine,
         lambda config: config.pose_cells.cells_xy,
         lambda config: config.grid.particles,
         lambda config: config.session.precision,

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import window
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.window import Window
+from ratslam.classic import window
+from ratslam.classic.pose_cell_config import NetworkConfig
+from ratslam.classic.window import Window
 from ratslam.core.types import PoseCellActivity
 from tactile.base.types import Array
 
@@ -53,7 +53,7 @@ class Activity(NamedTuple):
     level: Array
 
 
-def window_levels(config: PoseCellConfig, dtype: np.dtype) -> tuple[Level, ...]:
+def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
     """The levels from the smallest to the whole torus."""
     torus = Level(window.make_window(config, None, dtype), 1)
     if config.engine == "dense":

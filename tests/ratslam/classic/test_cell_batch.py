@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.batch import Network
-from ratslam.attractor.cell_batch import SEGMENT, CellCourse, CellSets, walk
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.levels import to_full_torus, window_levels
-from ratslam.attractor.window import ring_difference
+from ratslam.classic import pose_cells
+from ratslam.classic.batch import Network
+from ratslam.classic.cell_batch import SEGMENT, CellCourse, CellSets, walk
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.window import ring_difference
 from ratslam.experiments.studies.machine import compilations
 from tactile.base.types import Odometry
 
-CONFIG = PoseCellConfig(cells_xy=21)
+CONFIG = NetworkConfig(cells_xy=21)
 STEPS = SEGMENT + 70
 SETS = [(0.9, 2.3, 1e-5, 1.0, 0.2, 0.1), (1.1, 1.8, 3e-5, 2.0, 0.1, 0.0), (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
 CHOSEN = [18 * 441 + 10 * 21 + 10, 17 * 441 + 11 * 21 + 9, 0]

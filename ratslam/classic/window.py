@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor.config import PoseCellConfig
+from ratslam.classic.pose_cell_config import NetworkConfig
 from tactile.base.types import Array
 
 TIE = 1e-9
@@ -73,7 +73,7 @@ class Window(NamedTuple):
         return all(axis.wraps for axis in self.axes)
 
 
-def make_window(config: PoseCellConfig, inner: int | None, dtype: np.dtype) -> Window:
+def make_window(config: NetworkConfig, inner: int | None, dtype: np.dtype) -> Window:
     """A window that is exact for activity within `inner` cells along each axis; None: the whole torus."""
     margin = config.excite_width // 2
     gap = 2 * margin + config.inhibit_width // 2

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, activity_sums, to_full_torus, window_levels
+from ratslam.classic.levels import Activity, Block, activity_sums, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 
-LEVELS = window_levels(PoseCellConfig(cells_xy=45, cells_heading=72), np.dtype(np.float64))
+LEVELS = window_levels(NetworkConfig(cells_xy=45, cells_heading=72), np.dtype(np.float64))
 
 
 def test_sums_are_those_of_the_whole_torus_at_every_level():

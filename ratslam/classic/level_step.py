@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ratslam.attractor import window
-from ratslam.attractor.levels import Block, Level, extent
-from ratslam.attractor.window import Window
+from ratslam.classic import window
+from ratslam.classic.levels import Block, Level, extent
+from ratslam.classic.window import Window
 from tactile.base.types import Array
 
 SUM_TOLERANCE = 64

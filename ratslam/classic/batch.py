@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import window_levels
+from ratslam.classic import pose_cells, window
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.types import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
@@ -59,7 +59,7 @@ class Track(NamedTuple):
     level: Array
 
 
-def networks(config: PoseCellConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
+def networks(config: NetworkConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
     """The pose cells with every parameter set over one course, in the precision of the course.
 
     All sets are computed at the smallest window level first; those that needed a larger one are computed
@@ -77,7 +77,7 @@ def networks(config: PoseCellConfig, sets: Network, course: Course, block: int =
 
 
 @partial(jax.jit, static_argnames=("config", "levels", "block"))
-def _networks(config: PoseCellConfig, levels: int | None, sets: Network, course: Course, block: int) -> Track:
+def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: Course, block: int) -> Track:
     dtype = np.dtype(course.motion.dtype)
     used = window_levels(config, dtype)[:levels]
 

@@ -1,4 +1,4 @@
-"""Settings of the pose cells."""
+"""Settings of the pose cells and of the attractor network that computes them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Width = Annotated[int, Field(ge=3, le=15), AfterValidator(_odd)]
 
 
 class PoseCellConfig(Settings):
-    """Settings of the pose-cell network."""
+    """Settings of the pose cells: a torus over x, y and heading."""
 
     cells_xy: Annotated[int, Field(ge=7, le=1001)] = 21
     """Cells along x and along y."""
@@ -28,6 +28,11 @@ class PoseCellConfig(Settings):
     """Cells around the heading ring."""
     cell_size: PositiveFloat = 0.1
     """Cell side length, m."""
+
+
+class AttractorConfig(Settings):
+    """Settings of the attractor network."""
+
     excite_width: Width = 7
     """Cells across the excitation kernel, odd."""
     excite_sigma: PositiveFloat = 1.0
@@ -43,6 +48,15 @@ class PoseCellConfig(Settings):
     engine: Literal["window", "dense"] = "window"
     """`window`: compute the smallest window of cells that is exact; `dense`: always the whole torus. The
     results are equal."""
+
+
+class NetworkConfig(AttractorConfig, PoseCellConfig):
+    """A pose-cell network as published: its cells and their dynamics."""
+
+
+def network_of(pose_cells: PoseCellConfig, attractor: AttractorConfig) -> NetworkConfig:
+    """The network of two sections of a configuration."""
+    return NetworkConfig(**dict(pose_cells), **dict(attractor))
 
 
 def rings(config: PoseCellConfig, dtype: np.dtype) -> np.ndarray:

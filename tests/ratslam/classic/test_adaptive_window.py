@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.attractor import levels, pose_cells, window
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.level_step import StepInput, step_at
-from ratslam.attractor.levels import to_full_torus, window_levels
+from ratslam.classic import levels, pose_cells, window
+from ratslam.classic.level_step import StepInput, step_at
+from ratslam.classic.levels import to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}
@@ -49,7 +49,7 @@ def compare(n, motion, recall, energy):
     more = max(600 - count, 0)
     motion, recall = (np.pad(rows, ((0, more), (0, 0))) for rows in (motion, recall))
     energy = np.pad(energy, (0, more))
-    moving = PoseCellConfig(cells_xy=n)
+    moving = NetworkConfig(cells_xy=n)
     dense = moving.model_copy(update={"engine": "dense"})
     (one, pose, spread, outcome, level), (all_, whole_pose, whole_spread, whole_outcome, whole_level) = (
         steps_of(config, pose_cells.start(config, np.dtype(float)), motion, recall, energy, np.int32(count))
@@ -118,7 +118,7 @@ def test_activity_too_large_for_a_level_moves_up(n):
     recall[20], recall[100:103] = [1, n // 2, 3], [[1, 1, 1], [n // 2, 1, 30], [1, n // 2, 10]]
     level = compare(n, np.zeros((600, 3)), recall, energy)
     top = CELLS[n] - 1
-    assert len(window_levels(PoseCellConfig(cells_xy=n), np.dtype(float))) == CELLS[n]
+    assert len(window_levels(NetworkConfig(cells_xy=n), np.dtype(float))) == CELLS[n]
     assert not np.any(level[:20])
     assert level[20] == (1 if top > 1 else top)
     assert level[102] == top
@@ -128,7 +128,7 @@ def test_activity_too_large_for_a_level_moves_up(n):
 @pytest.mark.parametrize(("away", "exact"), [(2.0, True), (4.5, False), (9.0, False)])
 def test_a_small_window_refuses_a_deposit_near_its_face(away, exact):
     """The cells excited by a deposit near the face would be lost."""
-    config = PoseCellConfig()
+    config = NetworkConfig()
     sizes = window_levels(config, np.dtype(float))
     pose = jnp.asarray([10.0, 10.0, 18.0])
     activity = levels.point_activity(sizes, pose)
@@ -141,7 +141,7 @@ def test_a_small_window_refuses_a_deposit_near_its_face(away, exact):
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (20.7, 0.2, 35.9), (10.0, 20.5, 17.0)])
 def test_activity_is_the_same_at_any_level(where):
-    config = PoseCellConfig(cells_xy=41)
+    config = NetworkConfig(cells_xy=41)
     sizes = window_levels(config, np.dtype(float))
     small = levels.point_activity(sizes, jnp.asarray(where))
     whole = levels.to_full_torus(sizes, small)
@@ -157,7 +157,7 @@ def test_activity_is_the_same_at_any_level(where):
 
 
 def test_wide_kernels_have_wide_margins():
-    config = PoseCellConfig(cells_xy=61, excite_width=11, inhibit_width=9)
+    config = NetworkConfig(cells_xy=61, excite_width=11, inhibit_width=9)
     small = window_levels(config, np.dtype(float))[0].window
     assert (small.margin, small.gap, small.shape) == (5, 14, (20, 20, 20))
 

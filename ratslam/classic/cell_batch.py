@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.batch import BLOCK, Network
-from ratslam.attractor.cell_probe import activity_of
-from ratslam.attractor.config import PoseCellConfig, rings
-from ratslam.attractor.levels import Level, window_levels
-from ratslam.attractor.pose_cells import PoseCells
+from ratslam.classic import pose_cells, window
+from ratslam.classic.batch import BLOCK, Network
+from ratslam.classic.cell_probe import activity_of
+from ratslam.classic.levels import Level, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings
+from ratslam.classic.pose_cells import PoseCells
 from tactile.base.types import Array, Odometry
 
 SEGMENT = 128
@@ -92,9 +92,7 @@ class _Fleet:
         sets, course, chosen: as in `walk`.
     """
 
-    def __init__(
-        self, config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray
-    ) -> None:
+    def __init__(self, config: NetworkConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray) -> None:
         self._config, self._chosen = config, tuple(map(int, chosen))
         dtype = np.dtype(course.motion.dtype)
         self._sets = jax.tree.map(lambda column: np.asarray(column, dtype), sets)
@@ -145,7 +143,7 @@ class _Fleet:
 
 
 def walk(
-    config: PoseCellConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray, block: int = BLOCK
+    config: NetworkConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray, block: int = BLOCK
 ) -> Iterator[CellTrack]:
     """Simulates B networks over a course; yields its segments, of `SEGMENT` steps except for the last.
 
@@ -163,7 +161,7 @@ def walk(
 
 
 @partial(jax.jit, static_argnames=("config", "dtype", "templates"))
-def _start(config: PoseCellConfig, dtype: np.dtype, templates: int) -> _Walker:
+def _start(config: NetworkConfig, dtype: np.dtype, templates: int) -> _Walker:
     return _Walker(pose_cells.start(config, dtype), jnp.zeros((templates, 3), dtype))
 
 
@@ -183,7 +181,7 @@ def _with_larger_levels(walker: _Walker, whole: _Walker) -> _Walker:
 
 @partial(jax.jit, static_argnames=("config", "chosen"))
 def _walk_together(
-    config: PoseCellConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: tuple[int, ...]
+    config: NetworkConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: tuple[int, ...]
 ) -> tuple[_Walker, CellTrack]:
     """Networks over a segment, at the smallest level alone."""
     levels = window_levels(config, np.dtype(rows.motion.dtype))[:1]
@@ -192,7 +190,7 @@ def _walk_together(
 
 @partial(jax.jit, static_argnames=("config", "chosen"))
 def _walk_alone(
-    config: PoseCellConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: tuple[int, ...]
+    config: NetworkConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: tuple[int, ...]
 ) -> tuple[_Walker, CellTrack]:
     """One network over a segment, with all levels."""
     levels = window_levels(config, np.dtype(rows.motion.dtype))
@@ -200,7 +198,7 @@ def _walk_alone(
 
 
 def _walk(
-    config: PoseCellConfig,
+    config: NetworkConfig,
     levels: tuple[Level, ...],
     own: CellSets,
     walker: _Walker,

@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.attractor import pose_cells, window
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.level_step import StepInput, step_at
-from ratslam.attractor.levels import from_full_torus, to_full_torus, window_levels
-from ratslam.attractor.pose_cells import Outcome
-from ratslam.attractor.window import ring_difference
+from ratslam.classic import pose_cells, window
+from ratslam.classic.level_step import StepInput, step_at
+from ratslam.classic.levels import from_full_torus, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.pose_cells import Outcome
+from ratslam.classic.window import ring_difference
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
 
-CONFIG = PoseCellConfig()
+CONFIG = NetworkConfig()
 UNITS = units(CONFIG, np.dtype(float))
 RINGS = rings(CONFIG, np.dtype(float))
 
@@ -202,7 +202,7 @@ def test_the_torus_has_no_edge(shift):
 @pytest.mark.parametrize("n", [11, 17, 18, 21, 22, 23, 41])
 def test_excitation_and_inhibition_are_the_same_everywhere(n):
     """Rings are computed in different ways by size, and none may show where it begins."""
-    torus = window.make_window(PoseCellConfig(cells_xy=n), None, np.dtype(float))
+    torus = window.make_window(NetworkConfig(cells_xy=n), None, np.dtype(float))
     activity = np.random.default_rng(n).random((36, n, n)) ** 8
     compute = jax.jit(partial(window.excite_and_inhibit, torus))
     here = compute(activity)

@@ -7,17 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor import pose_cells
-from ratslam.attractor.batch import Course, Network, networks, trials
-from ratslam.attractor.config import PoseCellConfig, units
-from ratslam.attractor.levels import window_levels
-from ratslam.attractor.window import ring_difference
 from ratslam.backends.grid import GridOutcome
+from ratslam.classic import pose_cells
+from ratslam.classic.batch import Course, Network, networks, trials
+from ratslam.classic.levels import window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, units
+from ratslam.classic.window import ring_difference
 from tactile.base.types import Odometry, stack
 from tests.helpers.grid_world import drive, initial, report
 from tests.ratslam.backends.grid_filters import PRINTED
 
-CONFIG = PoseCellConfig(cells_xy=21)
+CONFIG = NetworkConfig(cells_xy=21)
 STEPS = 60
 
 
@@ -28,7 +28,7 @@ def course(seed: int) -> Course:
     return Course(motion, recall, energy)
 
 
-def alone(config: PoseCellConfig, given: Course, factor: float) -> np.ndarray:
+def alone(config: NetworkConfig, given: Course, factor: float) -> np.ndarray:
     levels = window_levels(config, np.dtype(float))
 
     def step(cells, row):

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.attractor import window
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, Level
+from ratslam.classic import window
+from ratslam.classic.levels import Activity, Block, Level
+from ratslam.classic.pose_cell_config import PoseCellConfig
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Array

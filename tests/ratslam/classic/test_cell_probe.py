@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.attractor.cell_probe import active_cells, activity_of, choose_cells, hold_cells
-from ratslam.attractor.config import PoseCellConfig
-from ratslam.attractor.levels import Activity, Block, to_full_torus, window_levels
+from ratslam.classic.cell_probe import active_cells, activity_of, choose_cells, hold_cells
+from ratslam.classic.levels import Activity, Block, to_full_torus, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig
 from tactile.base.errors import InputError
 
-CONFIG = PoseCellConfig(cells_xy=45, cells_heading=72)
+CONFIG = NetworkConfig(cells_xy=45, cells_heading=72)
 LEVELS = window_levels(CONFIG, np.dtype(np.float64))
 DENSE = window_levels(CONFIG.model_copy(update={"engine": "dense"}), np.dtype(np.float64))
 
@@ -56,7 +56,7 @@ def test_cells_are_drawn_by_the_seed_without_repetition():
     assert (one != other).any()
     assert len(np.unique(one)) == 64
     assert one.dtype == np.int32
-    small = PoseCellConfig(cells_xy=7, cells_heading=8)
+    small = NetworkConfig(cells_xy=7, cells_heading=8)
     np.testing.assert_array_equal(choose_cells(7 * 7 * 8, small, 0), np.arange(7 * 7 * 8))
 
 

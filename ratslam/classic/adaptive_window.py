@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ratslam.attractor import window
-from ratslam.attractor.level_step import StepInput, StepResult, equal_sums, step_at
-from ratslam.attractor.levels import Activity, Block, Level, block_at, extent, total, transfer
+from ratslam.classic import window
+from ratslam.classic.level_step import StepInput, StepResult, equal_sums, step_at
+from ratslam.classic.levels import Activity, Block, Level, block_at, extent, total, transfer
 from tactile.base.types import Array
 
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.attractor.adaptive_window import step_at_smallest_level
-from ratslam.attractor.config import PoseCellConfig, rings, units
-from ratslam.attractor.level_step import StepInput
-from ratslam.attractor.levels import Activity, Level, point_activity, window_levels
-from ratslam.attractor.window import TIE, deposit_gain, ring_difference, rotate
+from ratslam.classic.adaptive_window import step_at_smallest_level
+from ratslam.classic.level_step import StepInput
+from ratslam.classic.levels import Activity, Level, point_activity, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.window import TIE, deposit_gain, ring_difference, rotate
 from tactile.base.types import Array, Odometry
 
 LARGEST_SUBSTEP = 0.75
@@ -69,7 +69,7 @@ class StepInfo(NamedTuple):
     level: Array
 
 
-def start(config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
+def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
     """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
     activity = point_activity(levels or window_levels(config, dtype), pose)
@@ -77,7 +77,7 @@ def start(config: PoseCellConfig, dtype: np.dtype, levels: tuple[Level, ...] | N
 
 
 def step(
-    config: PoseCellConfig,
+    config: NetworkConfig,
     levels: tuple[Level, ...],
     cells: PoseCells,
     odometry: Odometry,

@@ -1,1 +1,0 @@
-"""The pose-cell continuous attractor network and its adaptive window."""
