@@ -3,7 +3,9 @@
 The cost of a selection of closures has many local minima: a wrong sequence accepted early bends the map so
 far that the true ones after it look wrong. So a few maps are kept side by side. Each takes every new
 sequence as it fits, and once more with the sequence forced to fit, which then has to pay for itself; the
-cheapest maps are kept. Source: a beam search over the hypotheses of multiple hypothesis tracking (Reid
+cheapest maps are kept, and beside them a few that refuse what all cheaper ones accept: weak sequences, which
+can be taken or left, make many cheap maps, and these would push out the only one that a strong false sequence
+has not bent. Source: a beam search over the hypotheses of multiple hypothesis tracking (Reid
 1979); that its nodes are robust maps is ours."""
 
 from __future__ import annotations
@@ -16,8 +18,10 @@ from ratslam.keyframes.merging import Merge
 from ratslam.keyframes.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import integrate, wrap
 
-KEPT = 5
-"""Number of maps."""
+KEPT = 4
+"""Number of cheapest maps."""
+DOUBTS = 3
+"""Number of further maps, each of which refuses a sequence that all cheaper ones accept."""
 FITS = 0.5
 """Robust weight below which a new sequence is also forced to fit."""
 FORCED = 1e3
@@ -105,11 +109,22 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
     costs = [system.robust_cost(fit) for fit in maps]
     different: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
-        if not any(_is_alike(maps[k], maps[other], part.closures) for other in different):
+        if not any(_apart(maps[k], maps[other], part.closures) < ALIKE for other in different):
             different.append(k)
     if len(different) > 1:  # the views, dearer to ask, only where there is a choice
         different.sort(key=lambda k: costs[k] + case.views_cost(maps[k].poses))
-    return [maps[k] for k in different[:KEPT]]
+    return with_doubts([maps[k] for k in different])
+
+
+def with_doubts(maps: list[MapFit]) -> list[MapFit]:
+    """The `KEPT` cheapest of the maps, cheapest first, and up to `DOUBTS` that refuse what those before
+    accept."""
+    kept = maps[:KEPT]
+    for map in maps[KEPT:]:
+        shared = np.all([fit.weights >= FITS for fit in kept], axis=0)
+        if len(kept) < KEPT + DOUBTS and (shared & (map.weights < FITS)).any():
+            kept.append(map)
+    return kept
 
 
 def _force(closures: LoopClosures, sequence: int) -> LoopClosures:
@@ -121,8 +136,8 @@ def _force(closures: LoopClosures, sequence: int) -> LoopClosures:
     return closures._replace(scale=scale, cost_limit=limit)
 
 
-def _is_alike(one: MapFit, other: MapFit, closures: LoopClosures) -> bool:
-    """Whether no keyframe differs by more than `ALIKE` standard deviations of a closure."""
+def _apart(one: MapFit, other: MapFit, closures: LoopClosures) -> float:
+    """The largest difference of a keyframe, standard deviations of a closure."""
     apart = one.poses - other.poses
     apart[:, 2] = wrap(apart[:, 2])
-    return bool((apart**2 / closures.variance).sum(axis=1).max() < ALIKE**2)
+    return float(np.sqrt((apart**2 / closures.variance).sum(axis=1).max()))

@@ -81,12 +81,22 @@ def test_sequences_that_all_fit_make_one_map():
 @pytest.mark.parametrize("kept", [1, 2, KEPT])
 def test_no_more_maps_are_kept_than_wanted(kept, monkeypatch):
     monkeypatch.setattr(map_hypotheses, "KEPT", kept)
+    monkeypatch.setattr(map_hypotheses, "DOUBTS", 0)
     made = trap(1, -8, LAP + 12)
     hypotheses, most = MapHypotheses(), 0
     for known in numbers(made.case):
         fits = hypotheses.follow(part(made.case, numbers(made.case) <= known), np.arange(known + 1))
         most = max(most, len(fits))
     assert most == kept
+
+
+def test_a_dear_map_is_kept_if_it_refuses_what_all_cheaper_ones_accept():
+    """Weak sequences, taken or left, fill the places of the cheapest; the last map alone refuses the first
+    sequence."""
+    taken = [[1, a, b, c] for a in (1, 0) for b in (1, 0) for c in (1, 0)] + [[0, 1, 1, 1]]
+    maps = [MapFit(np.full((1, 3), float(k)), 0.0, np.array(row, float)) for k, row in enumerate(taken)]
+    kept = map_hypotheses.with_doubts(maps)
+    assert [fit.poses[0, 0] for fit in kept] == [0, 1, 2, 3, 4, 8]  # 4 refuses the second sequence
 
 
 @pytest.mark.parametrize("at", MANY)
