@@ -19,11 +19,11 @@ from scipy import fft
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
 from evaluation.plots import style
-from ratslam.classic.pose_cell_config import PoseCellConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.cells.figure import CellFigure, CellTask
 from ratslam.experiments.cells.rat_sessions import RatSessions, rat_config, rat_source
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
+from ratslam.network.config import PoseCellConfig
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 

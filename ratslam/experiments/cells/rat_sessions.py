@@ -7,12 +7,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from ratslam.classic.cell_probe import active_cells
-from ratslam.classic.levels import Level
 from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.session import Session, Step
 from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_plan import RecordingPlan, levels_of, plan_recording
+from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
 from ratslam.pipeline.cell_recorder import CellSums
 from ratslam.pipeline.source import open_observations, read_observations
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
@@ -63,7 +61,7 @@ class RatSessions:
         observations = [observation for _, observation in rows]
         steps = list(self._session.replay(observations))
         motion = np.array([each.odometry[:4] for each in observations], float)
-        return RatRun(_recording(plan, levels_of(self._session.backend), samples, steps), motion)
+        return RatRun(_recording(plan, samples, steps), motion)
 
 
 def rat_config(*assignments: str) -> RunConfig:
@@ -87,32 +85,28 @@ def slice_start(seed: int, seconds: float, whole: float = 600.0) -> float:
     return float(stream(seed, "cells.slice").uniform(0.0, whole - seconds - 1.0))
 
 
-def _recording(
-    plan: RecordingPlan, levels: tuple[Level, ...], samples: list[Sample], steps: list[Step]
-) -> CellRecording:
+def _recording(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellRecording:
     unknown = np.full(3, np.nan)
     return CellRecording(
-        shape=plan.shape,
-        cell_size=plan.cell_size,
+        shape=plan.cells.shape,
+        cell_size=plan.cells.cell_size,
         time=np.array([sample.time for sample in samples]),
         truth=np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
-        packet=np.array([step.evidence.packet for step in steps]),
-        energy=np.array([step.evidence.energy for step in steps]),
+        packet=np.array([plan.cells.packet(step.evidence) for step in steps]),
+        energy=np.array([plan.cells.energy(step.evidence) for step in steps]),
         place=np.array([step.estimate.place for step in steps], np.int32),
         cell=plan.cell,
         activity=np.array([step.probed for step in steps], np.float32),
-        sums=None if plan.sums is None else _sums(plan, levels, samples, steps).result(),
+        sums=None if plan.sums is None else _sums(plan, samples, steps).result(),
     )
 
 
-def _sums(
-    plan: RecordingPlan, levels: tuple[Level, ...], samples: list[Sample], steps: list[Step]
-) -> CellSums:
+def _sums(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellSums:
     assert plan.sums is not None
-    sums = CellSums(plan.sums, int(np.prod(plan.shape)), samples[0].time)
+    sums = CellSums(plan.sums, int(np.prod(plan.cells.shape)), samples[0].time)
     for sample, step in zip(samples, steps, strict=True):
         if step.seldom is not None:
-            sums.add(sample.time, sample.truth, *active_cells(levels, step.seldom))
+            sums.add(sample.time, sample.truth, *plan.cells.active(step.seldom))
     return sums
 
 

@@ -20,13 +20,30 @@ NAMES: tuple[str, ...] = (
     "agreement",
     "shuffles",
     "networks",
+    "posterior",
+    "alike_rooms",
+    "kidnap",
+    "cue_conflict",
+    "lesions",
+    "scale",
 )
-"""The figures and tables: names of modules of this room."""
+"""The figures and tables. The first ten are modules of this room and on `backend: classic`, the others on
+`backend: recall`."""
+MODULES = {
+    "posterior": "belief_rows",
+    "alike_rooms": "belief_rows",
+    "kidnap": "belief_rows",
+    "cue_conflict": "belief_rows",
+    "lesions": "belief_lesions",
+    "scale": "belief_lesions",
+}
+"""The modules that offer several figures, by name in their `FIGURES`."""
 
 
 def find_figure(name: str) -> CellFigure:
     """The figure of a name in `NAMES`."""
-    return import_module(f"ratslam.experiments.cells.{name}").FIGURE
+    module = import_module(f"ratslam.experiments.cells.{MODULES.get(name, name)}")
+    return module.FIGURES[name] if name in MODULES else module.FIGURE
 
 
 def reproduce_cells(names: Sequence[str], task: CellTask, output: Path) -> Iterator[str]:

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.classic.cell_batch import CellCourse
-from ratslam.classic.pose_cell_config import NetworkConfig, PoseCellConfig, network_of, rings, units
+from ratslam.classic.pose_cell_config import NetworkConfig, network_of, rings, units
 from ratslam.config.run_config import RunConfig
+from ratslam.network.config import PoseCellConfig
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
 from robot.sources.odometry import from_poses
