@@ -40,10 +40,10 @@ class CellRecording(NamedTuple):
     Attributes:
         shape: (K, N, N) cells of the network over heading, y, x. cell_size: side of a cell, m.
         time: [T] s. truth: [T, 3] true pose, m, m, rad, NaN where unknown. packet: [T, 3] decoded pose over
-            x, y, heading, cells. energy: [T] injected by views. place: [T] int32 id of the place or view
-            template, -1 for none.
+            x, y, heading, cells. energy: [T] injected by views; of a belief its total. place: [T] int32 id of
+            the place or view template, -1 for none.
         cell: [C] int32 indices of the chosen cells in the flattened network. activity: [T, C] float32 of the
-            chosen cells; the activity of all cells sums to 1.
+            chosen cells; the activity of all cells sums to 1, or to the certainty of a belief.
         sums: of all cells, None if they were not summed.
     """
 

@@ -175,6 +175,11 @@ class Localiser(Checkpointed, Map):
             place=np.int32(-1),
         )
 
+    @property
+    def compared(self) -> int:
+        """Number of views compared with the map."""
+        return len(self._frame.rows)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole state, with the poses of the finished map."""
         return super().arrays() | {"ground": self.place.ground.poses.copy()}

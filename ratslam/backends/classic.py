@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -9,13 +10,14 @@ import numpy as np
 
 from ratslam.backends.config import ClassicBackendConfig
 from ratslam.classic import places, pose_cells, view_templates
+from ratslam.classic.cell_probe import active_cells, activity_of, hold_cells
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.classic.levels import activity_sums, window_levels
 from ratslam.classic.places import Places
 from ratslam.classic.pose_cell_config import network_of, rings, units
 from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.classic.view_templates import Match, Templates
-from ratslam.core.backend import Backend, enlarge
+from ratslam.core.backend import Backend, PoseCellProbe, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Estimate, PoseCellActivity, Scalar
 from tactile.base.se2 import wrap
@@ -134,6 +136,18 @@ class ClassicBackend(Backend):
             memory.current, match.error, relative, energy, cells.pose, info.level, outcome
         )
         return ClassicState(cells, memory, world, relative), estimate, evidence
+
+    def probe(self) -> PoseCellProbe:
+        cells, levels = self.config.pose_cells, self.window_levels
+        return PoseCellProbe(
+            (cells.cells_heading, cells.cells_xy, cells.cells_xy),
+            cells.cell_size,
+            lambda state, chosen: activity_of(levels, state.cells.activity, chosen).astype(np.float32),
+            lambda state: hold_cells(levels, state.cells.activity),
+            partial(active_cells, levels),
+            lambda evidence: evidence.packet,
+            lambda evidence: evidence.energy,
+        )
 
     def activity(self, state: ClassicState) -> PoseCellActivity:
         return activity_sums(self.window_levels, state.cells.activity)

@@ -9,10 +9,11 @@ from pydantic import Field, PositiveFloat
 
 from ratslam.classic.experience_map import ExperienceConfig
 from ratslam.classic.places import PlaceConfig
-from ratslam.classic.pose_cell_config import AttractorConfig, PoseCellConfig
+from ratslam.classic.pose_cell_config import AttractorConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.network.config import PoseCellConfig
 from ratslam.recall.config import RecallConfig
 from tactile.base.config import Settings
 
@@ -26,8 +27,6 @@ class PoseCellBackendConfig(Settings):
 
     pose_cells: PoseCellConfig = PoseCellConfig()
     """The pose cells: a torus over x, y and heading."""
-    attractor: AttractorConfig = AttractorConfig()
-    """The attractor network that moves their packet of activity."""
     templates: TemplateConfig = TemplateConfig()
     """View preprocessing and, for `backend: classic`, view matching."""
     experience: ExperienceConfig = ExperienceConfig()
@@ -37,6 +36,8 @@ class PoseCellBackendConfig(Settings):
 class ClassicBackendConfig(PoseCellBackendConfig):
     """Sections of `backend: classic`."""
 
+    attractor: AttractorConfig = AttractorConfig()
+    """The attractor network that moves the packet of activity."""
     places: PlaceConfig = PlaceConfig()
     """When a place is created, reached or kept."""
 
@@ -45,7 +46,7 @@ class RecallBackendConfig(PoseCellBackendConfig):
     """Sections of `backend: recall`."""
 
     recall: RecallConfig = RecallConfig()
-    """The Bayes filter over remembered frames."""
+    """View cells, and what they tell the pose cells."""
     keyframes: KeyframeMapConfig = KeyframeMapConfig()
     """The keyframe map."""
     min_fit_share: Annotated[float, Field(ge=0, le=1)] = 0.25

@@ -17,10 +17,11 @@ from ratslam.backends.config import LocaliseBackendConfig
 from ratslam.backends.finished_map import map_file, restore_map
 from ratslam.backends.map_views import MapViews
 from ratslam.backends.recall import RecallBackend
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, Map
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.keyframes.map import KeyframeMap
+from ratslam.network.pose_cells import Belief
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
@@ -63,10 +64,11 @@ class LocaliseEvidence(NamedTuple):
 
 class LocaliseState(NamedTuple):
     """Attributes:
-    memory: the keyframes of the map and the posterior over them. seen: number of views compared so far.
+    memory: the keyframes of the map. belief: of the pose cells. seen: number of views compared so far.
     """
 
     memory: Memory
+    belief: Belief
     seen: Array
 
 
@@ -77,6 +79,8 @@ class LocaliseBackend(Backend):
         recall: the backend that made the map. map: the finished map. log_odds: see `LocaliseConfig`.
         here: whether the robot is supposed to stand where the map ended.
     """
+
+    SINGLE = ("belief",)
 
     def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float, here: bool = False) -> None:
         self._recall, self._log_odds = recall, log_odds
@@ -92,7 +96,13 @@ class LocaliseBackend(Backend):
     def init(self, key: Array, capacity: int) -> LocaliseState:
         """The map, and no idea where in it. `key` and `capacity` are not used."""
         del key, capacity
-        return LocaliseState(jax.tree.map(jnp.array, self._memory), jnp.int32(0))
+        memory = jax.tree.map(jnp.array, self._memory)
+        return LocaliseState(memory, self._views.no_belief(memory), jnp.int32(0))
+
+    def state_of(self, map: Map, capacity: int) -> LocaliseState:
+        """The map, and no idea where in it, after the views compared so far."""
+        assert isinstance(map, Localiser)
+        return self.init(None, capacity)._replace(seen=jnp.int32(map.compared))
 
     def kernel(
         self, state: LocaliseState, observation: Observation
@@ -108,10 +118,10 @@ class LocaliseBackend(Backend):
         is_keyframe = seen & due
         features = recall.features(view, observation)
 
-        memory, (result, gain, shows) = lax.cond(
+        memory, belief, (result, gain, shows) = lax.cond(
             is_keyframe,
-            lambda: self._views.look(memory, features, observation.label),
-            lambda: (memory, self._views.no_look(memory)),
+            lambda: self._views.look(memory, state.belief, features, observation.label),
+            lambda: (memory, state.belief, self._views.no_look(memory)),
         )
         shifts = jnp.asarray(self._views.shifts)
         place = jnp.int32(-1)
@@ -130,7 +140,7 @@ class LocaliseBackend(Backend):
             gain=gain,
             outcome=jnp.where(clean, LocaliseOutcome.OK, LocaliseOutcome.NOT_FINITE).astype(jnp.int32),
         )
-        return LocaliseState(memory, state.seen + is_keyframe.astype(jnp.int32)), estimate, evidence
+        return LocaliseState(memory, belief, state.seen + is_keyframe.astype(jnp.int32)), estimate, evidence
 
     def new_map(self) -> Localiser:
         """A session of which nothing is known but perhaps its start."""

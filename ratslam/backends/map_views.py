@@ -15,11 +15,11 @@ from ratslam.alignment.ground import Ground, ground_of
 from ratslam.alignment.self_comparison import compare_with_itself
 from ratslam.core.session import capacity_at
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.network.pose_cells import Belief
 from ratslam.recall import filter
 from ratslam.recall.config import sector_shifts
-from ratslam.recall.memory import MapFeedback, Memory, first_keyframes, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory, corrected_motion, first_keyframes, frozen_memory
 from ratslam.recall.observation_model import ObservationLikelihood
-from tactile.base.se2 import between, compose
 from tactile.base.types import Array
 
 if TYPE_CHECKING:
@@ -58,16 +58,11 @@ class MapViews:
         self._gains = jax.jit(self._gains_of_many)
 
     def remember(self, state: RecallState) -> RecallState:
-        """A state of the recall backend, with room for them, with all keyframes that are not merged; its
-        posterior is empty. Where each packet was follows from the poses and the packet of the state,
-        which is that of the newest."""
-        graph, recall = self.graph, self.recall
+        """A state of the recall backend, with room for them, with all keyframes that are not merged; all of
+        its belief is novelty."""
+        graph = self.graph
         frozen = self.freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
-        ahead = between(graph.pose.rows[-1], graph.pose.rows)
-        packet = compose(np.asarray(state.cells.pose) * recall.units, ahead) / recall.units % recall.rings
-        rows = np.zeros(frozen.packet.shape, frozen.packet.dtype)
-        rows[: len(packet)] = packet
-        return state._replace(memory=frozen._replace(packet=jnp.asarray(rows)))
+        return self.recall.begin_piece(state)._replace(memory=frozen, health=state.health)
 
     def freeze(self, frames: np.ndarray, poses: np.ndarray, capacity: int = 0) -> Memory:
         """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3].
@@ -126,6 +121,7 @@ class MapViews:
         count, parts = int(memory.count), []
         dtype, memory = memory.view.dtype, memory._replace(bias=jnp.zeros_like(memory.bias))
         memory = memory._replace(turn_error=jnp.zeros_like(memory.turn_error))
+        belief = self.no_belief(memory)
         for begin in range(0, len(frames), TOGETHER):
             rows = slice(begin, begin + TOGETHER)
             size = len(labels[rows])
@@ -136,7 +132,7 @@ class MapViews:
                     motion[rows].astype(memory.x.dtype), np.ones(size, bool),
                 )
             ]  # fmt: skip
-            memory, looks = self._compare(memory, *filled)
+            (memory, belief), looks = self._compare(memory, belief, *filled)
             parts.append(jax.tree.map(lambda values, size=size: np.asarray(values)[:size], looks))
         match = np.concatenate([part.result.match for part in parts])
         shift = np.concatenate([part.result.shift for part in parts])
@@ -148,14 +144,21 @@ class MapViews:
             posterior=np.concatenate([part.result.posterior for part in parts]),
         )
 
-    def look(self, memory: Memory, view: Array, label: Array) -> tuple[Memory, Look]:
+    def no_belief(self, memory: Memory) -> Belief:
+        """The pose cells of a robot that may be anywhere among the keyframes of a memory."""
+        return self.recall.no_belief(memory.label.shape[0])
+
+    def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
         """Recalls one view in its stored form, and compares it with all keyframes."""
         memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
-        memory, result = filter.recognise(self.config, self.recall.cell, memory, likelihood, 0.0)
+        motion = corrected_motion(memory)
+        belief, result = filter.recognise(
+            self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
+        )
         zero = jnp.zeros_like(memory.length)
         memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
         shows = likelihood.certain & likelihood.informative
-        return memory, Look(result, self._gain(memory, likelihood), shows)
+        return memory, belief, Look(result, self._gain(memory, likelihood), shows)
 
     def no_look(self, memory: Memory) -> Look:
         """The result of a step without a comparison."""
@@ -169,20 +172,23 @@ class MapViews:
         return jnp.broadcast_to(gain, (len(self.shifts), memory.label.shape[0]))
 
     def _look_at_many(
-        self, memory: Memory, views: Array, labels: Array, motions: Array, real: Array
-    ) -> tuple[Memory, Look]:
+        self, memory: Memory, belief: Belief, views: Array, labels: Array, motions: Array, real: Array
+    ) -> tuple[tuple[Memory, Belief], Look]:
         """Looks at views [n, D] in turn; those that are not `real` [n] are left out."""
 
-        def look(memory: Memory, one: tuple[Array, ...]) -> tuple[Memory, Look]:
-            view, label, motion, real = one
+        def look(state: tuple[Memory, Belief], one: tuple[Array, ...]) -> tuple[tuple[Memory, Belief], Look]:
+            (memory, belief), (view, label, motion, real) = state, one
             moved = memory._replace(
                 motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
             )
-            return lax.cond(
-                real, lambda: self.look(moved, view, label), lambda: (memory, self.no_look(memory))
+            memory, belief, found = lax.cond(
+                real,
+                lambda: self.look(moved, belief, view, label),
+                lambda: (memory, belief, self.no_look(memory)),
             )
+            return (memory, belief), found
 
-        return lax.scan(look, memory, (views, labels, motions, real))
+        return lax.scan(look, (memory, belief), (views, labels, motions, real))
 
     def _gains_of_many(self, memory: Memory, views: Array, labels: Array) -> Array:
         """[n, S, C] gains of stored views [D, n]; NaN of those that cannot be compared."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,26 +13,27 @@ import numpy as np
 from jax import lax
 
 from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.map_views import MapViews
 from ratslam.backends.piece_ties import PieceTies
-from ratslam.classic import pose_cells, view_templates
-from ratslam.classic.levels import activity_sums, window_levels
-from ratslam.classic.pose_cell_config import network_of, rings, units
-from ratslam.classic.pose_cells import Outcome, PoseCells
-from ratslam.core.backend import Backend, enlarge
+from ratslam.classic import view_templates
+from ratslam.core.backend import Backend, Map, PoseCellProbe, enlarge
 from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.keyframes.acceptance import Acceptance, AcceptByEvidence
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import FULL, Ablation
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.keyframe_graph import KeyframeGraph, piece_start
 from ratslam.keyframes.map import KeyframeMap
 from ratslam.keyframes.signed_appearance import SignedAppearance
+from ratslam.network import pose_cells
+from ratslam.network.config import Network
+from ratslam.network.pose_cells import Belief
 from ratslam.recall import filter, mirror
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, Modes, crop_rows
+from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, crop_rows
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -40,21 +43,36 @@ from ratslam.recall.observation_model import (
 )
 from ratslam.recall.signed_likelihood import stored_image
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
+from tactile.base.se2 import compose, correct_heading
 from tactile.base.types import Array, Observation
 
 HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""
 
 
+class RecallOutcome(IntEnum):
+    """Outcome of a step."""
+
+    OK = 0
+    NOT_FINITE = 1
+    """Odometry or view was NaN or infinite and was taken as no motion and no view."""
+    FULL = 2
+    """A view exceeded the capacity and was not stored."""
+
+
 class RecallState(NamedTuple):
     """State of the kernel.
 
     Attributes:
+        belief: of the pose cells. control: that of the control (`ratslam.recall.mirror`); None where no rule
+            reads it. memory: of the view cells. packet: [3] the place of the heaviest packet, m, m, rad.
         health: running share of revisits (keyframes near older ones on the map) whose view fits.
     """
 
-    cells: PoseCells
+    belief: Belief
+    control: Belief | None
     memory: Memory
+    packet: Array
     health: Array
 
 
@@ -63,8 +81,8 @@ class RecallEvidence(NamedTuple):
 
     Attributes:
         keyframe to background: see `RecallResult`. mirror_match to mirror_log_ratio: the same of the control
-            (`ratslam.recall.mirror`); with whiskers those of no match. energy: injected into the pose cells.
-            packet: [3] decoded, cells. health: see `RecallState`. outcome: an `Outcome`, int32.
+            (`ratslam.recall.mirror`); with whiskers those of no match. certainty: activity of all pose cells.
+            packet, health: see `RecallState`. outcome: a `RecallOutcome`, int32.
     """
 
     keyframe: Scalar
@@ -74,16 +92,15 @@ class RecallEvidence(NamedTuple):
     log_ratio: Scalar
     novelty: Scalar
     entropy: Scalar
-    second_mode: Scalar
+    rivals: Scalar
     view_fits: Scalar
     background: Array
     mirror_match: Scalar
     mirror_shift: Scalar
     mirror_posterior: Scalar
     mirror_log_ratio: Scalar
-    energy: Scalar
+    certainty: Scalar
     packet: Array
-    window_level: Scalar
     health: Scalar
     outcome: Scalar
 
@@ -92,8 +109,10 @@ class RecallBackend(Backend):
     """Bayesian recall with verified loop closures, for views of one shape.
 
     Args:
-        view_shape: (R, C, K) of the observations' views. dtype: of all floating state.
+        view_shape: (R, C, K) of the observations' views. dtype: of all floating state but the belief.
     """
+
+    SINGLE = ("belief", "control")
 
     def __init__(
         self,
@@ -113,17 +132,18 @@ class RecallBackend(Backend):
         self.signed = self.pixels is not None and self.recall.images == "signed"
         self.dtype = np.dtype(dtype)
         self.cell = config.pose_cells.cell_size
-        self.network = network_of(config.pose_cells, config.attractor)
-        self.window_levels = window_levels(self.network, self.dtype)
-        self.rings = rings(config.pose_cells, self.dtype)
-        self.units = units(config.pose_cells, self.dtype)
+        noise = self.recall.excite, self.recall.excite_heading
+        self.network = Network(config.pose_cells, *noise, self.recall.miss, self.recall.leak)
+        self._anchor = jax.jit(self._anchored)
 
     def init(self, key: Array, capacity: int) -> RecallState:
-        """One packet in the middle of the torus, and no keyframes. `key` is not used: nothing is random."""
+        """All is novelty, and no keyframes. `key` is not used: nothing is random."""
         del key
         return RecallState(
-            pose_cells.start(self.network, self.dtype),
+            self.no_belief(capacity),
+            self.no_belief(capacity) if self._reads_control else None,
             recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
+            jnp.zeros(3, self.dtype),
             jnp.ones((), self.dtype),
         )
 
@@ -133,23 +153,71 @@ class RecallBackend(Backend):
 
     def grow(self, state: RecallState, capacity: int) -> RecallState:
         """The same memory in larger arrays."""
-        return state._replace(memory=enlarge(state.memory, self.init(None, capacity).memory))
+        empty = self.init(None, capacity)
+        grown = state._replace(memory=enlarge(state.memory, empty.memory))
+        return self._each(grown, lambda one: one._replace(mass=enlarge(one.mass, empty.belief.mass)))
+
+    def sides(self, feedback: MapFeedback) -> tuple[int, ...]:
+        """Cells of the network along x and y. Pieces of a map need no cells for the ground between them."""
+        poses, apart = feedback.poses.copy(), piece_start(1, self.cell)[0]
+        poses[:, 0] -= apart * np.round(poses[:, 0] / apart)
+        return pose_cells.sides_for(self.network, poses)
+
+    def cover(self, state: RecallState, sides: tuple[int, ...]) -> RecallState:
+        """The state with more pose cells, silent until they are driven at the map's feedback."""
+        return self._each(state, lambda one: pose_cells.cover(self.network, one, sides))
 
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
-        """The filter takes over the poses, bias and scales of the map."""
-        return state._replace(memory=recall_memory.apply_map_feedback(state.memory, feedback))
+        """View cells take over the poses, bias and scales of the map, and pose cells follow them: what the
+        last view said of each keyframe is driven again at its new pose."""
+        memory = recall_memory.apply_map_feedback(state.memory, feedback)
+        return self._each(state._replace(memory=memory), partial(self._anchor, memory))
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
-        """The memory of the keyframes that remain."""
-        return state._replace(memory=recall_memory.merge_rows(state.memory, merged))
+        """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
+        memory = recall_memory.merge_rows(state.memory, merged)
+        return self._each(state._replace(memory=memory), lambda one: pose_cells.merge_rows(one, merged))
 
     def begin_piece(self, state: RecallState) -> RecallState:
-        """The filter knows no place; its health is that of the start."""
-        return state._replace(memory=recall_memory.begin_piece(state.memory), health=jnp.ones((), self.dtype))
+        """All is novelty; the health is that of the start."""
+        memory, health = recall_memory.begin_piece(state.memory), jnp.ones((), self.dtype)
+        return self._each(
+            state._replace(memory=memory, health=health), lambda one: jax.tree.map(jnp.zeros_like, one)
+        )
 
     def crop_rows(self, state: RecallState, cropped: CroppedRows) -> RecallState:
-        """The memory of a cropped map."""
-        return state._replace(memory=crop_rows(state.memory, cropped))
+        """The memory of a cropped map; mass of keyframes that are gone becomes novelty."""
+        memory = crop_rows(state.memory, cropped)
+
+        def crop(belief: Belief) -> Belief:
+            belief = pose_cells.lose_rows(belief, cropped.left)
+            # Anchored at once, because the next feedback may be steps away.
+            return self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows))
+
+        return self._each(state._replace(memory=memory), crop)
+
+    def state_of(self, map: Map, capacity: int) -> RecallState:
+        """The keyframes of a map and the motion since the newest; all of the belief is novelty."""
+        assert isinstance(map, KeyframeMap)
+        state = self.init(None, capacity)
+        if not map.kept_keyframes().count:
+            return state
+        state = MapViews(self, map.kept_keyframes()).remember(state)
+        motion, length, turn = (jnp.array(value, self.dtype) for value in map.travel)
+        return state._replace(memory=state.memory._replace(motion=motion, length=length, turn=turn))
+
+    def no_belief(self, capacity: int) -> Belief:
+        """All is novelty, with view cells for so many keyframes."""
+        return pose_cells.start(self.network, (len(sector_shifts(self.recall)), capacity))
+
+    def _anchored(self, memory: Memory, belief: Belief) -> Belief:
+        cells = filter.view_cells(self.recall, memory)
+        return pose_cells.anchor(self.network, belief, cells, belief.mass)
+
+    def _each(self, state: RecallState, change: Callable[[Belief], Belief]) -> RecallState:
+        """The state with a changed belief and a changed control."""
+        control = state.control and change(state.control)
+        return state._replace(belief=change(state.belief), control=control)
 
     def kernel(
         self, state: RecallState, observation: Observation
@@ -162,24 +230,25 @@ class RecallBackend(Backend):
         is_keyframe = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
         features = self.features(view, observation)
 
-        memory, result, control = lax.cond(
+        travelled = jnp.hypot(odometry.dx, odometry.dy)
+        onwards = compose(state.packet, correct_heading(moved, travelled, memory.bias, memory.turn_error))
+        state = state._replace(memory=memory)
+        state, result, control = lax.cond(
             is_keyframe,
-            lambda: self._recall(memory, features, observation.label),
-            lambda: (memory, filter.empty_result(memory), _candidate(filter.empty_result(memory))),
+            lambda: self._recall(state, features, observation.label),
+            lambda: (state, filter.empty_result(memory), _candidate(filter.empty_result(memory))),
         )
-        recalled, energy = self._injection(memory, result)
-        cells, info = pose_cells.step(
-            self.network, self.window_levels, state.cells, odometry, recalled, energy
-        )
+        memory = state.memory
+        packet = jnp.where(result.match >= 0, filter.place_of(memory, result), onwards)
         memory = lax.cond(
             is_keyframe,
-            lambda: recall_memory.store_keyframe(memory, features, observation.label, cells.pose),
+            lambda: recall_memory.store_keyframe(memory, features, observation.label),
             lambda: memory,
         )
         health = self._health(state.health, result.view_fits)
         has_room = memory.count < memory.label.shape[0]
-        outcome = jnp.where(has_room | ~seen, info.outcome, Outcome.FULL)
-        outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
+        outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
+        outcome = jnp.where(clean, outcome, RecallOutcome.NOT_FINITE).astype(jnp.int32)
         sd, sd_heading = recall_memory.pose_spread(self.recall, self.cell, memory)
         place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
         estimate = Estimate(
@@ -188,21 +257,46 @@ class RecallBackend(Backend):
             place=place,
             previous=place,
             action=jnp.int32(Action.NONE),
-            lost=(health < self.config.min_fit_share) | (outcome == Outcome.TOO_FAST),
+            lost=health < self.config.min_fit_share,
         )
         evidence = RecallEvidence(
-            **result._asdict(), **control._asdict(), energy=energy, packet=cells.pose,
-            window_level=info.level, health=health, outcome=outcome,
+            **result._asdict(), **control._asdict(), certainty=jnp.sum(state.belief.activity), packet=packet,
+            health=health, outcome=outcome,
         )  # fmt: skip
-        return RecallState(cells, memory, health), estimate, evidence
+        return state._replace(memory=memory, packet=packet, health=health), estimate, evidence
 
     def _health(self, health: Array, view_fits: Array) -> Array:
         """The running share of revisits whose view fits, after one more revisit."""
         updated = health + HEALTH_RATE * (view_fits.astype(self.dtype) - health)
         return jnp.where(view_fits >= 0, updated, health)
 
+    def probe(self) -> PoseCellProbe:
+        """The cells that the network begins with, read where their preferred poses have moved to."""
+        cells = self.config.pose_cells
+        shape = cells.cells_heading, cells.cells_xy, cells.cells_xy
+        units = 2 * np.pi / shape[0], cells.cell_size, cells.cell_size
+
+        def each(state: RecallState, chosen: Array) -> Array:
+            motion = recall_memory.corrected_motion(state.memory)
+            return pose_cells.activity_at(self.network, state.belief, motion, chosen)
+
+        def active(held: Any) -> tuple[np.ndarray, np.ndarray]:
+            at = np.flatnonzero(held)
+            return at, np.asarray(held)[at]
+
+        return PoseCellProbe(
+            shape,
+            cells.cell_size,
+            each,
+            lambda state: each(state, np.arange(np.prod(shape))),
+            active,
+            lambda evidence: (evidence.packet / units[::-1]) % shape[::-1],
+            lambda evidence: evidence.certainty,
+        )
+
     def activity(self, state: RecallState) -> PoseCellActivity:
-        return activity_sums(self.window_levels, state.cells.activity)
+        cells = np.asarray(state.belief.activity)
+        return PoseCellActivity(cells.sum(axis=0), cells.sum(axis=(1, 2)))
 
     def new_map(self) -> KeyframeMap:
         """An empty keyframe map; keyframes of views and given ids are not merged, because their sequences are
@@ -217,8 +311,12 @@ class RecallBackend(Backend):
 
     def _acceptance(self) -> Callable[[KeyframeGraph], Acceptance]:
         """By odds for views and given ids; with whiskers, sequences are selected against each other."""
-        by_evidence = self.pixels is not None or not self.ablation.verify
-        return (lambda graph: AcceptByEvidence()) if by_evidence else AcceptByOdds
+        return AcceptByOdds if self._reads_control else lambda graph: AcceptByEvidence()
+
+    @property
+    def _reads_control(self) -> bool:
+        """Whether the rule of acceptance reads the control."""
+        return self.pixels is None and self.ablation.verify
 
     def _appearance(self) -> Appearance:
         if self.labels:
@@ -263,26 +361,28 @@ class RecallBackend(Backend):
         return pixel_levels(flat, alive.astype(self.dtype)).astype(jnp.int32)
 
     def _recall(
-        self, memory: Memory, view: Array, label: Array
-    ) -> tuple[Memory, RecallResult, mirror.Candidate]:
+        self, state: RecallState, view: Array, label: Array
+    ) -> tuple[RecallState, RecallResult, mirror.Candidate]:
         """Recognises the view, and its mirror image where the rule of acceptance reads the control."""
-        if self.pixels is not None:
-            memory, likelihood = self.likelihood(self.recall, memory, view, label)
-            memory, result = filter.recognise(self.recall, self.cell, memory, likelihood, self.recall.local)
-            return memory, result, _candidate(filter.empty_result(memory))
-        first = mirror.first_look(memory, view, label, self.recall.local)
+        memory, motion = state.memory, recall_memory.corrected_motion(state.memory)
 
-        def look(_: None, one: mirror.Look) -> tuple[None, tuple[Modes, RecallResult]]:
-            seen = memory._replace(**one.modes._asdict(), motion=one.motion, bias=one.bias)
-            seen, likelihood = self.likelihood(self.recall, seen, one.view, one.label)
-            after, result = filter.recognise(self.recall, self.cell, seen, likelihood, one.local)
-            return None, (mirror.modes_of(after), result)
+        def recognise(memory: Memory, look: mirror.Look) -> tuple[Memory, Belief, RecallResult]:
+            memory, likelihood = self.likelihood(self.recall, memory, look.view, look.label)
+            belief, result = filter.recognise(
+                self.recall, self.network, memory, look.belief, look.motion, likelihood, look.local
+            )
+            return memory, belief, result
 
-        both = mirror.both_looks(memory, first, self._mirrored(view, memory.angle))
-        _, (modes, results) = lax.scan(look, None, both)
-        own, control = (jax.tree.map(lambda x, k=k: x[k], modes) for k in (0, 1))
+        look = mirror.Look(state.belief, motion, view, label, jnp.asarray(self.recall.local, self.dtype))
+        if state.control is None:
+            memory, belief, result = recognise(memory, look)
+            state = state._replace(belief=belief, memory=memory)
+            return state, result, _candidate(filter.empty_result(memory))
+        both = mirror.both_looks(memory, look, state.control, self._mirrored(view, memory.angle))
+        _, (beliefs, results) = lax.scan(lambda _, one: (None, recognise(memory, one)[1:]), None, both)
+        own, control = (jax.tree.map(lambda x, k=k: x[k], beliefs) for k in (0, 1))
         result, false = (jax.tree.map(lambda x, k=k: x[k], results) for k in (0, 1))
-        return memory._replace(**own._asdict(), control=control), result, _candidate(false)
+        return state._replace(belief=own, control=control), result, _candidate(false)
 
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
@@ -299,15 +399,6 @@ class RecallBackend(Backend):
 
     def _mirrored(self, view: Array, angle: Array) -> Array:
         return mirror.mirror_view(view, self.view_shape, angle) if len(view) else view
-
-    def _injection(self, memory: Memory, result: RecallResult) -> tuple[Array, Array]:
-        """The packet of a candidate turned by its sector shift, and energy proportional to its posterior."""
-        known = (result.keyframe >= 0) & (result.posterior > self.config.keyframes.candidate_posterior)
-        turned = -result.shift.astype(self.dtype) * memory.angle / self.units[2]
-        packet = memory.packet[jnp.maximum(result.match, 0)]
-        packet = packet + jnp.stack([jnp.zeros_like(turned), jnp.zeros_like(turned), turned])
-        energy = jnp.where(known, self.recall.energy * result.posterior, 0.0)
-        return packet % self.rings, energy
 
 
 def _candidate(result: RecallResult) -> mirror.Candidate:

@@ -21,7 +21,7 @@ from ratslam.backends.config import (
 from ratslam.backends.grid import GridEvidence
 from ratslam.backends.localise import LocaliseEvidence, LocaliseOutcome
 from ratslam.backends.localise_grid import GridLocaliseEvidence, GridLocaliseOutcome
-from ratslam.backends.recall import RecallBackend, RecallEvidence
+from ratslam.backends.recall import RecallBackend, RecallEvidence, RecallOutcome
 from ratslam.classic import pose_cells
 from ratslam.core.backend import Backend
 from ratslam.core.types import Scalar
@@ -75,7 +75,7 @@ BACKENDS = Registry(
         "recall": BackendEntry(
             RecallBackendConfig,
             RecallEvidence,
-            pose_cells.Outcome,
+            RecallOutcome,
             lambda config, sensors, dtype: RecallBackend(config, sensors.view_shape, dtype),
         ),
         "classic": BackendEntry(

@@ -12,7 +12,6 @@ from jax import lax
 
 from ratslam.classic import window
 from ratslam.classic.levels import Activity, Block, Level
-from ratslam.classic.pose_cell_config import PoseCellConfig
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Array
@@ -34,18 +33,18 @@ class HeldCells(NamedTuple):
 
 
 def choose_cells(
-    chosen: int | tuple[tuple[int, int, int], ...], config: PoseCellConfig, seed: int
+    chosen: int | tuple[tuple[int, int, int], ...], shape: tuple[int, int, int], seed: int
 ) -> np.ndarray:
     """[C] int32 indices of cells in the flattened network.
 
     Args:
         chosen: their number, drawn without repetition from the whole network, in the order of the indices;
-            or x, y, heading of each, in this order.
+            or x, y, heading of each, in this order. shape: cells over heading, y, x.
 
     Raises:
         InputError: the network has fewer cells, or not these.
     """
-    rings = np.array([config.cells_xy, config.cells_xy, config.cells_heading])
+    rings = np.array(shape[::-1])
     if isinstance(chosen, int):
         if chosen > np.prod(rings):
             raise InputError(

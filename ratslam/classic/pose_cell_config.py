@@ -1,4 +1,4 @@
-"""Settings of the pose cells and of the attractor network that computes them."""
+"""Settings of the attractor network of RatSLAM as published."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
 
+from ratslam.network.config import PoseCellConfig
 from tactile.base.config import Settings
 
 
@@ -17,17 +18,6 @@ def _odd(width: int) -> int:
 
 
 Width = Annotated[int, Field(ge=3, le=15), AfterValidator(_odd)]
-
-
-class PoseCellConfig(Settings):
-    """Settings of the pose cells: a torus over x, y and heading."""
-
-    cells_xy: Annotated[int, Field(ge=7, le=1001)] = 21
-    """Cells along x and along y."""
-    cells_heading: Annotated[int, Field(ge=7, le=720)] = 36
-    """Cells around the heading ring."""
-    cell_size: PositiveFloat = 0.1
-    """Cell side length, m."""
 
 
 class AttractorConfig(Settings):

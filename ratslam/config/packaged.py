@@ -72,9 +72,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
         "recall": {
             "sector_fov": "whiskers",
-            "mode_decay": 0.003,
-            "miss_weight": 0.01,
-            "modes": 4,
             "enter": 0.2,
         },
         "keyframes": {

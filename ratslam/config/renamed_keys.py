@@ -21,14 +21,16 @@ MOVED: dict[str, str] = {
 }
 """Old dotted path of a setting to the new one, where it means the same."""
 
+DROPPED = ("mode_decay", "miss_weight", "reach", "reach_heading", "modes", "energy")
+"""Settings in the section `recall` of an earlier filter, whose values mean nothing to the pose cells."""
 RENAMED: dict[str, str] = {
     "roving": "create_simulation",
     "matcher": "write backend: recall or backend: classic",
     "lost": "min_fit_share",
     "frames": "keyframes",
     "recall.fan": "recall.sector_fov",
-    "recall.leave": "recall.mode_decay",
-    "recall.nothing": "recall.miss_weight",
+    "recall.leave": "recall.leak",
+    "recall.nothing": "recall.miss",
     "keyframes.length": "keyframes.min_length",
     "keyframes.score": "keyframes.min_score",
     "keyframes.distance": "keyframes.max_distance",
@@ -66,6 +68,12 @@ RENAMED: dict[str, str] = {
     "grid.resampling.how": "grid.resampling.scheme",
     "grid.resampling.effective": "grid.resampling.min_effective_share",
     **MOVED,
+    "recall.mode_decay": "recall.leak",
+    "recall.miss_weight": "recall.miss",
+    "recall.reach": "recall.excite",
+    "recall.reach_heading": "recall.excite_heading",
+    "recall.modes": "the pose cells hold any number of packets",
+    "recall.energy": "views multiply activity, they add none",
 }
 """Old dotted path of a setting to the new one, or to a sentence with the replacement.
 
@@ -79,9 +87,12 @@ def with_moved_settings(document: Document) -> Document:
     own file are reported with their new names, and so are those of `--set`. A value under the new name stays.
     """
     moves = [(*old.split("."), *new.split(".")) for old, new in MOVED.items()]
-    if not all((old, key) in document.places for old, key, *_ in moves):
-        return document
     data, places = copy.deepcopy(document.data), dict(document.places)
+    if all(("recall", key) in places for key in DROPPED):
+        for key in DROPPED:
+            del data["recall"][key], places["recall", key]
+    if not all((old, key) in document.places for old, key, *_ in moves):
+        return Document(data, places)
     for old, key, new, name in moves:
         section = data.setdefault(new, {})
         if places[old, key].key == "--set" or not isinstance(section, dict):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -30,6 +30,29 @@ NO_CLOSURE = "no loop closure was accepted, the map is the odometry"
 """Why a map of a method that closes loops is not judged."""
 Feedback = Any
 """A record of host arrays that the map gives to the kernel, or None."""
+
+
+class PoseCellProbe(NamedTuple):
+    """What can be recorded of the pose cells of a method.
+
+    Attributes:
+        shape: (K, N, N) cells over heading, y, x; of a network that grows, those that it begins with.
+            cell_size: side of a cell, m.
+        each: pure function of the state and of the indices [C] of cells in the flattened network to their
+            activity [C], float32. hold: pure function of the state to what `active` needs.
+        active: indices [n] of the active cells and their activity [n], float32, of what was held; on the
+            host.
+        packet: [3] decoded pose over x, y, heading, cells, and energy: activity that views have injected, or
+            where activity is a posterior its total; both of a step's evidence.
+    """
+
+    shape: tuple[int, int, int]
+    cell_size: float
+    each: Callable[[State, np.ndarray], Array]
+    hold: Callable[[State], Any]
+    active: Callable[[Any], tuple[np.ndarray, np.ndarray]]
+    packet: Callable[[Evidence], np.ndarray]
+    energy: Callable[[Evidence], Array]
 
 
 class MergedRows(Protocol):
@@ -134,7 +157,12 @@ class Backend(Protocol):
     """A SLAM method.
 
     Methods with a body are defaults for a method whose state does not grow and that uses no map feedback.
+
+    Attributes:
+        SINGLE: fields of the state in single precision, whatever that of the session is.
     """
+
+    SINGLE: ClassVar[tuple[str, ...]] = ()
 
     def init(self, key: Array, capacity: int) -> State:
         """The state before the first step, with `capacity` rows in the arrays that grow."""
@@ -145,6 +173,15 @@ class Backend(Protocol):
 
     def grow(self, state: State, capacity: int) -> State:
         """The same state with a larger capacity."""
+        return state
+
+    def sides(self, feedback: Feedback) -> tuple[int, ...]:
+        """Sizes of the arrays that cover the ground of the map, of a method that has some; (): none."""
+        return ()
+
+    def cover(self, state: State, sides: tuple[int, ...]) -> State:
+        """The state with arrays of these sizes, never smaller than before, that cover the ground. The map's
+        feedback is applied to it at once."""
         return state
 
     def apply_map_feedback(self, state: State, feedback: Feedback) -> State:
@@ -161,11 +198,24 @@ class Backend(Protocol):
         map's feedback is applied to it at once."""
         return state
 
+    def state_of(self, map: Map, capacity: int) -> State:
+        """The state of a session whose map was saved by an earlier version, as far as it follows from the
+        map; of a method whose state has changed since.
+
+        Raises:
+            ValueError: the method's has not.
+        """
+        raise ValueError("the checkpoint has no state")
+
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
         """One step; pure, so that it can be jitted, scanned and vmapped."""
 
     def activity(self, state: State) -> PoseCellActivity | None:
         """The activity of the pose cells, of a method that has them; must compile nothing."""
+        return None
+
+    def probe(self) -> PoseCellProbe | None:
+        """What can be recorded of the pose cells, of a method that has them."""
         return None
 
     def new_map(self) -> Map:

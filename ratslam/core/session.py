@@ -117,6 +117,7 @@ class Session:
         """Goes back to the start with an empty map; the compiled functions are kept."""
         self.steps = self.earlier = 0
         self._capacity = capacity_at(0, self.reserve)
+        self._sides: tuple[int, ...] = ()
         self.map: Map = self.backend.new_map()
         self.state = self._init(jax.random.key(seed), self._capacity)
 
@@ -173,26 +174,35 @@ class Session:
                 "earlier": np.array(self.earlier),
                 "reserve": np.array(self.reserve),
                 "capacity": np.array(self._capacity),
+                "sides": np.array(self._sides, np.int64),
             }
         )
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Continues from a checkpoint made by `arrays`.
+        """Continues from a checkpoint made by `arrays`; of one without a state, which an earlier version
+        wrote, with what the backend makes of the map (`Backend.state_of`).
 
         Raises:
             ValueError: the checkpoint has another backend or other shapes.
         """
         steps, reserve = int(arrays["steps"]), int(arrays["reserve"])
-        capacity = int(arrays["capacity"])
-        like = jax.eval_shape(lambda: self.backend.init(jax.random.key(0), capacity))
+        capacity, sides = int(arrays["capacity"]), tuple(arrays["sides"].tolist())
+
+        def start() -> State:
+            state = self.backend.init(jax.random.key(0), capacity)
+            return self.backend.cover(state, sides) if sides else state
+
+        like = jax.eval_shape(start)
+        self.map.restore(with_prefix(arrays, "map/"))
         leaves = jax.tree.leaves(like)
         saved = [arrays.get(f"state/{k}") for k in range(len(leaves))]
+        if not any(name.startswith("state/") for name in arrays):
+            saved = jax.tree.leaves(self.backend.state_of(self.map, capacity))
         for leaf, value in zip(leaves, saved, strict=True):
             if value is None or value.shape != leaf.shape or value.dtype != leaf.dtype:
                 raise ValueError("the checkpoint was made with another configuration or view shape")
         self.state = jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(value) for value in saved])
-        self.map.restore(with_prefix(arrays, "map/"))
-        self.steps, self.reserve, self._capacity = steps, reserve, capacity
+        self.steps, self.reserve, self._capacity, self._sides = steps, reserve, capacity, sides
         self.earlier = int(arrays["earlier"])
 
     def change_rows(self, rows: int, steps: int, change: Callable[[State], State]) -> None:
@@ -216,13 +226,21 @@ class Session:
         if capacity > self._capacity:
             self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
 
+    def _cover(self, feedback: Any) -> None:
+        """Grows what covers the ground to that of the map."""
+        sides = self.backend.sides(feedback)
+        sides = tuple(map(max, sides, self._sides)) if self._sides else sides
+        if sides != self._sides:
+            self.state, self._sides = self.backend.cover(self.state, sides), sides
+
     def _advance(self, observations: list[Observation]) -> list[Step]:
         if self.steps % CHUNK == 0:
-            merged = self.map.merge()
+            merged, feedback = self.map.merge(), self.map.feedback()
             self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
+            self._cover(feedback)
             if merged is not None:
                 self.state = self.backend.merge_rows(self.state, merged)
-            self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
+            self.state = self.backend.apply_map_feedback(self.state, feedback)
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])
         chunk = allocate(self._layout, CHUNK)

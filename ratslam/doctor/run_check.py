@@ -104,7 +104,7 @@ CAUSES = {
     "not_finite": "odometry or a view is NaN or infinite",
     "full": "a capacity was exceeded",
     "reseeded": "the pose cells lost their packet: the odometry jumps, or global_inhibition is too large",
-    "lost": "the filter lost the pose: views that match nothing, or odometry that does not fit them",
+    "lost": "the pose was lost: views that match nothing, or odometry that does not fit them",
 }
 """Causes of outcomes."""
 

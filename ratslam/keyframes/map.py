@@ -38,7 +38,7 @@ from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord, leading_to
-from ratslam.keyframes.travel import HALT
+from ratslam.keyframes.travel import HALT, Travel
 from ratslam.keyframes.verification import continues_sequence, has_same_heading
 from ratslam.pose_graph import Edges
 from ratslam.recall.memory import MapFeedback, MergedRows
@@ -101,7 +101,7 @@ class KeyframeMap(Checkpointed, Map):
         self._doubt = np.nan  # of the map some keyframes ago
 
     def feedback(self) -> MapFeedback:
-        """The poses, heading bias and view metric for the recall filter."""
+        """The poses, heading bias and view metric for the view cells."""
         graph, metric = self._graph, self.appearance.metric()
         start = graph.next_start() if self._begins else None
         return MapFeedback(graph.pose.rows, graph.bias, graph.turn_error, self._since, *metric, start)
@@ -218,6 +218,11 @@ class KeyframeMap(Checkpointed, Map):
     def keyframe_steps(self) -> np.ndarray:
         """[N] the step at which each keyframe was taken."""
         return self._steps.first_steps(self._graph.ever)
+
+    @property
+    def travel(self) -> Travel:
+        """The motion since the newest keyframe."""
+        return self._travel
 
     def begin_piece(self) -> None:
         """The next keyframe begins a piece; steps until then lead to it."""

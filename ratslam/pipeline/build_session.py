@@ -39,5 +39,5 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
         seed=config.session.seed,
         reserve=config.session.reserve or rows,
         precision=config.session.precision,
-        probe=None if plan is None else probe_of(backend, plan),
+        probe=None if plan is None else probe_of(plan),
     )

@@ -6,13 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.backends.classic import ClassicBackend
-from ratslam.backends.recall import RecallBackend
-from ratslam.classic.cell_probe import activity_of, choose_cells, hold_cells
-from ratslam.classic.levels import Level
+from ratslam.classic.cell_probe import choose_cells
 from ratslam.classic.recording_config import CellSumsConfig
 from ratslam.config.run_config import RunConfig
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, PoseCellProbe
 from ratslam.core.session import Probe
 from robot.sources.in_memory import InMemorySource
 from robot.sources.simulated import SimulatedSource
@@ -35,11 +32,10 @@ class SumsPlan(NamedTuple):
 
 
 class RecordingPlan(NamedTuple):
-    """shape: (K, N, N) cells of the network over heading, y, x. cell_size: m. cell: [C] int32 chosen cells in
-    the flattened network. sums: None without sums."""
+    """cells: of the method. cell: [C] int32 chosen cells in the flattened network. sums: None without
+    sums."""
 
-    shape: tuple[int, int, int]
-    cell_size: float
+    cells: PoseCellProbe
     cell: np.ndarray
     sums: SumsPlan | None
 
@@ -53,40 +49,30 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
     """
     if config.cells is None:
         return None
-    if not isinstance(backend, ClassicBackend | RecallBackend):
+    cells = backend.probe()
+    if cells is None:
         found = f"`backend: {config.backend}`, a method without pose cells"
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")
-    network, sums = config.pose_cells, config.cells.sums
-    shape = (network.cells_heading, network.cells_xy, network.cells_xy)
-    cell = choose_cells(config.cells.chosen, network, config.session.seed)
-    plan = RecordingPlan(shape, network.cell_size, cell, None)
-    return plan if sums is None else plan._replace(sums=_plan_sums(sums, plan, source))
+    sums = config.cells.sums
+    plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed), None)
+    return plan if sums is None else plan._replace(sums=_plan_sums(sums, cells, source))
 
 
-def probe_of(backend: Backend, plan: RecordingPlan) -> Probe:
-    """The probe of a session of this method: its steps have the activity of the chosen cells [C], float32,
-    and where all cells are summed `HeldCells`."""
-    levels = levels_of(backend)
-    each = lambda state: activity_of(levels, state.cells.activity, plan.cell).astype(np.float32)  # noqa: E731
-    if plan.sums is None:
-        return Probe(each)
-    return Probe(each, lambda state: hold_cells(levels, state.cells.activity), plan.sums.interval)
+def probe_of(plan: RecordingPlan) -> Probe:
+    """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
+    cells are summed what was held of them."""
+    each = lambda state: plan.cells.each(state, plan.cell)  # noqa: E731
+    return Probe(each) if plan.sums is None else Probe(each, plan.cells.hold, plan.sums.interval)
 
 
-def levels_of(backend: Backend) -> tuple[Level, ...]:
-    """The window levels of a method with pose cells."""
-    assert isinstance(backend, ClassicBackend | RecallBackend)
-    return backend.window_levels
-
-
-def _plan_sums(sums: CellSumsConfig, plan: RecordingPlan, source: Source) -> SumsPlan:
-    size = 8 * int(np.prod(plan.shape)) * (sums.bins**2 + sums.heading_bins)
+def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> SumsPlan:
+    size = 8 * int(np.prod(cells.shape)) * (sums.bins**2 + sums.heading_bins)
     if size > LARGEST_SUMS:
-        found = f"sums of {np.prod(plan.shape)} cells, which need {size / 2**30:.1f} GiB"
+        found = f"sums of {np.prod(cells.shape)} cells, which need {size / 2**30:.1f} GiB"
         raise InputError(
             "cells.sums", found, f"at most {LARGEST_SUMS >> 30} GiB", "choose fewer bins or a smaller network"
         )
-    extent = _true_extent(source, plan.cell_size) if sums.extent is None else sums.extent
+    extent = _true_extent(source, cells.cell_size) if sums.extent is None else sums.extent
     if extent is None:
         found = f"missing, and {source.name} does not tell its true path before the run"
         raise InputError("cells.sums.extent", found, "[x0, y0, x1, y1] of the binned rectangle, m")

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
-from ratslam.classic.cell_probe import active_cells
-from ratslam.classic.levels import Level
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import CHUNK, Step
-from ratslam.pipeline.cell_plan import RecordingPlan, SumsPlan, levels_of, plan_recording
+from ratslam.pipeline.cell_plan import RecordingPlan, SumsPlan, plan_recording
 from robot.sources.source import Sample, Source
 
 ROWS = "cells.rows"
@@ -37,16 +35,16 @@ def row_type(chosen: int) -> np.dtype:
 
 
 class CellRecorder:
-    """Records the steps of a session whose probe is `probe_of(backend, plan)`.
+    """Records the steps of a session whose probe is `probe_of(plan)`.
 
     Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
 
     Args:
-        directory: of the run, where `cells.rows` and `cells.npz` are written. levels: of the network.
+        directory: of the run, where `cells.rows` and `cells.npz` are written.
     """
 
-    def __init__(self, directory: Path, plan: RecordingPlan, levels: tuple[Level, ...]) -> None:
-        self._directory, self._plan, self._levels = directory, plan, levels
+    def __init__(self, directory: Path, plan: RecordingPlan) -> None:
+        self._directory, self._plan = directory, plan
         self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
         self._filled = 0
         self._sums: CellSums | None = None
@@ -60,8 +58,8 @@ class CellRecorder:
         unknown = np.full(3, np.nan)
         rows["time"] = [sample.time for sample in samples]
         rows["truth"] = [unknown if sample.truth is None else sample.truth for sample in samples]
-        rows["packet"] = [step.evidence.packet for step in steps]
-        rows["energy"] = [step.evidence.energy for step in steps]
+        rows["packet"] = [self._plan.cells.packet(step.evidence) for step in steps]
+        rows["energy"] = [self._plan.cells.energy(step.evidence) for step in steps]
         rows["place"] = [step.estimate.place for step in steps]
         rows["activity"] = [step.probed for step in steps]
         self._filled += len(steps)
@@ -80,17 +78,19 @@ class CellRecorder:
         rows = np.memmap(path, kind, mode="r") if path.stat().st_size else np.zeros(0, kind)
         sums = None if self._sums is None else self._sums.result()
         columns = {name: rows[name] for name in kind.names or ()}
-        recording = CellRecording(plan.shape, plan.cell_size, **columns, cell=plan.cell, sums=sums)
+        recording = CellRecording(
+            plan.cells.shape, plan.cells.cell_size, **columns, cell=plan.cell, sums=sums
+        )
         write_recording(self._directory / NAME, recording)
         path.unlink()
 
     def _add_sums(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
         assert self._plan.sums is not None
         if self._sums is None:
-            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.shape)), samples[0].time)
+            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
         for sample, step in zip(samples, steps, strict=True):
             if step.seldom is not None:
-                self._sums.add(sample.time, sample.truth, *active_cells(self._levels, step.seldom))
+                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
 
     def _write(self) -> None:
         with (self._directory / ROWS).open("ab") as file:
@@ -107,7 +107,7 @@ def open_cell_recorder(
         InputError: see `plan_recording`.
     """
     plan = plan_recording(config, source, backend)
-    return None if plan is None else CellRecorder(directory, plan, levels_of(backend))
+    return None if plan is None else CellRecorder(directory, plan)
 
 
 class CellSums:

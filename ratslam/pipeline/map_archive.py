@@ -17,10 +17,11 @@ from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT
 
-FORMAT = "ratslam-map-2"
+FORMAT = "ratslam-map-3"
 """Name and version of the format; a later version reads it."""
-FORMATS = ("ratslam-map-1", FORMAT)
-"""The formats that are read; the first does not tell `Session.earlier`."""
+FORMATS = ("ratslam-map-1", "ratslam-map-2", FORMAT)
+"""The formats that are read. The first does not tell `Session.earlier`; the first two have no belief of pose
+cells."""
 EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
 ARCHIVE = b"PK"
 """Beginning of every map file, by which a damaged one is told from another file."""

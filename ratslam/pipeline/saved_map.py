@@ -23,7 +23,15 @@ from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
 from ratslam.pipeline.folder_change import unfinished_change
-from ratslam.pipeline.map_archive import EXPECTED, FORMAT, digest_of, read_arrays, text_of, write_arrays
+from ratslam.pipeline.map_archive import (
+    EXPECTED,
+    FORMAT,
+    FORMATS,
+    digest_of,
+    read_arrays,
+    text_of,
+    write_arrays,
+)
 from ratslam.pipeline.map_settings import check_same_settings
 from ratslam.pipeline.sensor import Sensor, sensor_of
 from ratslam.pipeline.source import open_observations
@@ -40,7 +48,9 @@ NAME = "map.npz"
 TEXTS = ("format", "config", "source", "recording", "sha256")
 """Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
 of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
-ESTIMATE, FRONTEND = "estimate/", "frontend/"
+ESTIMATE, FRONTEND, STATE = "estimate/", "frontend/", "state/"
+CHANGED = ("recall", "localise")
+"""Methods whose maps of earlier versions have another state: one without the belief of the pose cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +170,7 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     if digest_of(arrays) != texts["sha256"]:
         found = "damaged: the content does not match its sha256"
         raise InputError(str(file), found, "the file as it was written", "restore it from a copy")
-    if texts["format"] != FORMAT:
+    if texts["format"] == FORMATS[0]:
         arrays["earlier"] = _earlier_steps(arrays)
     return _saved_map(file, arrays, texts)
 
@@ -220,6 +230,8 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
     fill_odometry(session)
+    if texts["format"] != FORMAT:
+        _drop_former_state(session, config.backend)
     return SavedMap(
         file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
         with_prefix(arrays, FRONTEND),
@@ -248,12 +260,12 @@ def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], 
         with open_observations(load_config(beside)) as (config, observed):
             source = describe_readings(observed)
     recording = str(arrays.pop("digest", ""))
-    texts = {"format": FORMAT, "config": dump(config), "source": source.to_json(), "recording": recording}
+    texts = {"format": FORMATS[1], "config": dump(config), "source": source.to_json(), "recording": recording}
     arrays["earlier"] = _earlier_steps(arrays)
     arrays |= {name: np.array(value) for name, value in texts.items()}
     digest = digest_of(arrays)
     if report is not None:
-        report(f"{file}: of an earlier version; read as {FORMAT}")
+        report(f"{file}: of an earlier version; read as {FORMATS[1]}")
     return _saved_map(file, arrays, texts | {"sha256": digest})
 
 
@@ -265,8 +277,20 @@ def _earlier_steps(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.array(UNKNOWN if begun else 0)
 
 
+def _drop_former_state(arrays: dict[str, np.ndarray], backend: str) -> None:
+    """Fits the arrays of an earlier version: they have no sides, and the state of a method that has another
+    one now goes."""
+    arrays["sides"] = np.zeros(0, np.int64)
+    if backend in CHANGED:
+        for name in [name for name in arrays if name.startswith(STATE)]:
+            del arrays[name]
+
+
 def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:
-    """How saved arrays differ from those of the session restored from them, or ''."""
+    """How saved arrays differ from those of the session restored from them, or ''; a state that was not saved
+    does not count."""
+    if not any(name.startswith(STATE) for name in saved):
+        restored = {name: value for name, value in restored.items() if not name.startswith(STATE)}
     for name in sorted(set(saved) | set(restored)):
         if name not in restored:
             return f"the unknown array {name}"

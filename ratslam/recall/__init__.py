@@ -1,1 +1,1 @@
-"""The Bayes filter over keyframes and its observation models."""
+"""View cells: remembered keyframes, and how likely a view is at each."""

@@ -13,7 +13,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class RecallConfig(Settings):
-    """Settings of the recall filter. Lengths are in pose cells, so that one setting serves every robot.
+    """Settings of recall. Lengths are in pose cells, so that one setting serves every robot.
 
     A *scale* is the error below which views of different places seldom come (`MapFeedback.scale`).
     """
@@ -44,16 +44,17 @@ class RecallConfig(Settings):
     places share carries no evidence."""
     fresh: NonNegativeFloat = 0.3
     """Weight of a view at `floor` in the likelihood of novelty."""
-    reach: PositiveFloat = 0.85
-    """Standard deviation of a keyframe's position relative to odometry, cells."""
-    reach_heading: PositiveFloat = 0.25
-    """Standard deviation of a keyframe's heading relative to odometry, rad."""
-    miss_weight: PositiveFloat = 0.02
+    excite: PositiveFloat = 0.5
+    """Standard deviation of local excitation in the network, cells: of a keyframe's position relative to
+    odometry since the view before."""
+    excite_heading: PositiveFloat = 0.21
+    """The same of its heading, rad."""
+    miss: PositiveFloat = 0.002
     """Weight of the case that no keyframe lies where odometry leads, relative to a keyframe exactly there."""
-    mode_decay: Share = 0.01
-    """Share of a mode's mass that is lost at every keyframe."""
+    leak: Share = 0.003
+    """Share of the belief that is lost at every keyframe and becomes novelty."""
     enter: Share = 0.05
-    """Share of novelty that becomes new modes at every keyframe."""
+    """Share of novelty that enters the belief anew at every keyframe."""
     local: Share = 0.3
     """Share of `enter` placed around the map's pose; the rest is spread over all keyframes."""
     local_sd: PositiveFloat = 1.0
@@ -69,11 +70,6 @@ class RecallConfig(Settings):
     familiar: Share = 0.8
     """Whiskers: weight, in the likelihood of novelty, of the successors of keyframes similar to the
     previous image, relative to `floor`."""
-    energy: PositiveFloat = 3.0
-    """Activity injected into the pose cells for a candidate of posterior 1; the packet's activity is 1. With
-    less, two packets compete for longer, which takes time and gains nothing."""
-    modes: Annotated[int, Field(ge=1, le=4096)] = 8
-    """Number of modes kept between keyframes; the mass of the others goes to novelty."""
 
 
 def sector_shifts(config: RecallConfig) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The memory of recall: all keyframes, the modes of the posterior, and the map's feedback."""
+"""The memory of recall: all keyframes, and the map's feedback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NO_LIKENESS = np.zeros((0, 0, 0))
 
 
 class MapFeedback(NamedTuple):
-    """Values of the map that the filter takes over.
+    """Values of the map that the view cells take over.
 
     Attributes:
         poses: [N, 3] of all keyframes, m, m, rad. bias: heading bias, rad/m. turn_error: correction of turns,
@@ -60,46 +60,28 @@ class MergedRows(NamedTuple):
         return len(self.source)
 
 
-class Modes(NamedTuple):
-    """A posterior over keyframes, see `Memory`."""
-
-    anchor: Array
-    offset: Array
-    mass: Array
-    before: Array
-    rest: Array
-
-
 class Memory(NamedTuple):
-    """All keyframes, rows in order of time, and the posterior over them.
+    """All keyframes, rows in order of time.
 
     Attributes:
-        view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32. packet: [C, 3]
-            pose-cell packet when the keyframe was taken, cells.
-        x, y, cosine, sine: [C] poses in the map. count, distinct: number of keyframes and of known labels,
-            int32.
-        anchor: [K] int32 keyframes of the modes, offset: [K, 3] pose of each mode in its keyframe's frame
-            (m, m, rad), mass: [K]. The missing mass to 1 is novelty.
+        view: [D, C]; whiskers: levels, int32, or signed images as stored. label: [C] int32.
+        x, y, heading: [C] poses in the map, m, m, rad; cosine, sine: [C] of the heading, because computing
+            them at every step takes longer than what they are for. count, distinct: number of keyframes and
+            of known labels, int32.
         pose: [3] of the newest keyframe. motion, length, turn: odometry since then: [3], m, rad.
         bias, turn_error, since, angle, scale, likeness: see `MapFeedback`.
-        before: [S, C] likelihoods of the previous image, rest: [S, C] posterior outside the modes; both for
-            whiskers only, else of size 0.
-        control: the posterior of the control (`ratslam.recall.mirror`); of size 0 for whiskers, where no rule
-            reads it.
+        before: [S, C] likelihoods of the previous image, for whiskers only, else of size 0.
     """
 
     view: Array
     label: Array
-    packet: Array
     x: Array
     y: Array
+    heading: Array
     cosine: Array
     sine: Array
     count: Array
     distinct: Array
-    anchor: Array
-    offset: Array
-    mass: Array
     pose: Array
     motion: Array
     length: Array
@@ -111,8 +93,6 @@ class Memory(NamedTuple):
     scale: Array
     likeness: Array
     before: Array
-    rest: Array
-    control: Modes
 
 
 def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
@@ -129,14 +109,12 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
     touch = config.sector_fov == "whiskers"
     levels = touch and config.images == "heights"
     learned = (groups, LEVELS, LEVELS) if levels else packed_shape(size) if touch else (0, 0, 0)
-    shape = len(sector_shifts(config)), capacity if touch else 0
-
     return Memory(
         view=jnp.zeros((size, capacity), jnp.int32) if levels else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
-        packet=zeros(capacity, 3),
         x=zeros(capacity),
         y=zeros(capacity),
+        heading=zeros(capacity),
         cosine=zeros(capacity),
         sine=zeros(capacity),
         count=jnp.int32(0),
@@ -151,51 +129,42 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         angle=zeros(),
         scale=zeros(),
         likeness=zeros(*learned),
-        **_no_modes(config.modes, shape, dtype)._asdict(),
-        control=_no_modes(0 if touch else config.modes, (shape[0], 0), dtype),
+        before=zeros(len(sector_shifts(config)), capacity if touch else 0),
     )
 
 
-def _no_modes(count: int, shape: tuple[int, int], dtype: np.dtype) -> Modes:
-    """A posterior all of which is novelty; in buffers of its own, because the session donates them."""
-    anchor, offset, mass = jnp.zeros(count, jnp.int32), jnp.zeros((count, 3), dtype), jnp.zeros(count, dtype)
-    return Modes(anchor, offset, mass, jnp.zeros(shape, dtype), jnp.zeros(shape, dtype))
-
-
 def begin_piece(memory: Memory) -> Memory:
-    """The memory of a robot that may be anywhere: the posterior is novelty, no odometry leads to the next
-    keyframe, and the next view seen becomes one."""
-    count, shape, dtype = len(memory.mass), memory.rest.shape, memory.x.dtype
-    zero, due = jnp.zeros((), dtype), jnp.asarray(np.inf, dtype)
+    """The memory of a robot that may be anywhere: no odometry leads to the next keyframe, and the next view
+    seen becomes one."""
+    zero, due = jnp.zeros((), memory.x.dtype), jnp.asarray(np.inf, memory.x.dtype)
     return memory._replace(
-        **_no_modes(count, shape, dtype)._asdict(),
-        control=_no_modes(len(memory.control.mass), memory.control.rest.shape, dtype),
-        motion=jnp.zeros(3, dtype), length=zero, turn=due,
-    )  # fmt: skip
+        motion=jnp.zeros_like(memory.motion), length=zero, turn=due, before=jnp.zeros_like(memory.before)
+    )
 
 
 def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
-    """The memory with the map's current poses and view metric."""
+    """The memory with the map's current poses and view metric; copies, because the map changes its arrays in
+    place."""
     dtype, count = memory.x.dtype, len(feedback.poses)
     if not count:
         return memory
     newest = feedback.poses[-1] if feedback.start is None else feedback.start
-    full = np.zeros((4, memory.x.shape[0]))
+    full = np.zeros((5, memory.x.shape[0]))
     x, y, heading = feedback.poses.T
-    full[:, :count] = x, y, np.cos(heading), np.sin(heading)
-    x, y, cosine, sine = (jnp.asarray(row, dtype) for row in full)
+    full[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
+    x, y, heading, cosine, sine = (jnp.asarray(row, dtype) for row in full)
     values = (feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale)
     bias, turn_error, since, angle, scale = (jnp.asarray(value, dtype) for value in values)
     if feedback.likeness.size:
-        memory = memory._replace(likeness=jnp.asarray(feedback.likeness, dtype))
+        memory = memory._replace(likeness=jnp.array(feedback.likeness, dtype))
     return memory._replace(
-        x=x, y=y, cosine=cosine, sine=sine, pose=jnp.asarray(newest, dtype),
+        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=jnp.array(newest, dtype),
         bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale,
     )  # fmt: skip
 
 
 def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
-    """The memory with these rows; the posterior of merged keyframes goes to those they are merged with.
+    """The memory with these rows.
 
     Raises:
         ValueError: there are more rows than the memory holds.
@@ -214,40 +183,14 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
         former = np.asarray(rows)
         return put(former[..., source], rows) if former.size else jnp.array(former)
 
-    def move(old: Modes) -> Modes:
-        anchor = np.minimum(old.anchor, len(merged.onto) - 1)
-        offset = compose(merged.offset[anchor], np.asarray(old.offset)).astype(old.offset.dtype)
-        return Modes(
-            jnp.array(merged.onto[anchor], jnp.int32), jnp.array(offset), jnp.array(old.mass),
-            take(old.before), jnp.array(_moved_mass(np.asarray(old.rest), merged)),
-        )  # fmt: skip
-
-    own = move(Modes(*(getattr(memory, name) for name in Modes._fields)))
     return memory._replace(
-        **own._asdict(),
-        control=move(memory.control),
         view=put(merged.view.T, memory.view),
         label=put(merged.label, memory.label, -1),
-        packet=jnp.array(put(np.asarray(memory.packet)[source].T, memory.packet.T).T),
-        x=take(memory.x), y=take(memory.y), cosine=take(memory.cosine), sine=take(memory.sine),
+        x=take(memory.x), y=take(memory.y), heading=take(memory.heading),
+        cosine=take(memory.cosine), sine=take(memory.sine),
+        before=take(memory.before),
         count=jnp.array(count, jnp.int32),
     )  # fmt: skip
-
-
-def _moved_mass(mass: np.ndarray, merged: MergedRows) -> np.ndarray:
-    """[S, C] mass by shift and row after a merge; shifts of keyframes that face opposite to the one they are
-    merged with change sides. Empty where only modes have mass."""
-    if not mass.size:
-        return mass
-    moved = np.zeros_like(mass)
-    turned = (np.cos(merged.offset[:, 2]) < 0) & (len(mass) > 1)
-    for shift in range(len(mass)):
-        for rows, target in (
-            (np.flatnonzero(~turned), shift),
-            (np.flatnonzero(turned), len(mass) - 1 - shift),
-        ):
-            np.add.at(moved[target], merged.onto[rows], mass[shift, rows])
-    return moved
 
 
 def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
@@ -289,7 +232,7 @@ def pose_spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Arra
     )
 
 
-def store_keyframe(memory: Memory, view: Array, label: Array, packet: Array) -> Memory:
+def store_keyframe(memory: Memory, view: Array, label: Array) -> Memory:
     """Stores the newest view as a keyframe at the robot's current pose."""
     row, pose = memory.count, current_pose(memory)
     zero = jnp.zeros_like(memory.length)
@@ -297,9 +240,9 @@ def store_keyframe(memory: Memory, view: Array, label: Array, packet: Array) -> 
     return memory._replace(
         view=memory.view.at[:, row].set(view[: memory.view.shape[0]]),
         label=memory.label.at[row].set(label),
-        packet=memory.packet.at[row].set(packet),
         x=memory.x.at[row].set(pose[0]),
         y=memory.y.at[row].set(pose[1]),
+        heading=memory.heading.at[row].set(pose[2]),
         cosine=memory.cosine.at[row].set(jnp.cos(pose[2])),
         sine=memory.sine.at[row].set(jnp.sin(pose[2])),
         count=memory.count + 1,
@@ -341,18 +284,9 @@ class CroppedRows(NamedTuple):
 
 
 def crop_rows(memory: Memory, cropped: CroppedRows) -> Memory:
-    """The memory reduced to rows; the posterior of the others becomes novelty."""
-    left = np.zeros(memory.label.shape[0], bool)
-    left[: len(cropped.left)] = cropped.left
+    """The memory reduced to rows."""
     dtype = memory.x.dtype
-
-    def lose(modes: Modes) -> Modes:
-        mass = np.where(left[np.asarray(modes.anchor)], modes.mass, 0)
-        rest = np.where(left, modes.rest, 0) if modes.rest.size else modes.rest
-        return modes._replace(mass=jnp.asarray(mass, dtype), rest=jnp.asarray(rest, dtype))
-
-    own = lose(Modes(*(getattr(memory, name) for name in Modes._fields)))
-    memory = merge_rows(memory._replace(**own._asdict(), control=lose(memory.control)), cropped.rows)
+    memory = merge_rows(memory, cropped.rows)
     labels = np.asarray(memory.label)[: cropped.rows.rows]
     return memory._replace(
         distinct=jnp.asarray(len(np.unique(labels[labels >= 0])), jnp.int32),
@@ -371,7 +305,7 @@ def frozen_memory(
     dtype: np.dtype,
     groups: int,
 ) -> Memory:
-    """A memory of N keyframes with an empty posterior.
+    """A memory of N keyframes.
 
     Args:
         feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores them.

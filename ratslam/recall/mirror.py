@@ -1,9 +1,9 @@
-"""The control of recall: a second filter that looks for the mirror image of every view.
+"""The control of recall: a second belief that looks for the mirror image of every view.
 
-It moves by mirrored motion and searches the same memory. No robot has seen the world mirrored, so every place
-that it recognises is false, except where the world itself is symmetric. The closure sequences of the control
-show how often and how strongly different places of this world are mistaken for each other. The method is
-ours; the idea is that of decoys in proteomics (Elias & Gygi 2007).
+It moves by mirrored motion and searches the same memory by the same functions. No robot has seen the world
+mirrored, so every place that it recognises is false, except where the world itself is symmetric. The closure
+sequences of the control show how often and how strongly different places of this world are mistaken for each
+other. The method is ours; the idea is that of decoys in proteomics (Elias & Gygi 2007).
 
 Given ids have no mirror image; the control looks for permuted ids instead.
 """
@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.recall.memory import Memory, Modes
+from ratslam.network.pose_cells import Belief
+from ratslam.recall.memory import Memory
 from tactile.base.types import Array
 
 MIRROR = np.array([1.0, -1.0, -1.0])
@@ -38,45 +39,32 @@ class Candidate(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What distinguishes the filter from its control: the posterior, the motion (m, m, rad) and heading bias
-    (rad/m) by which it moves, the view and id that it looks for, and the share of new modes around the map's
-    pose (none for the control, because no mirrored robot is there)."""
+    """What distinguishes recall from its control: the belief, the motion [3] (m, m, rad) by which it moves,
+    the view and id that it looks for, and the share of what enters anew around the map's pose (none for the
+    control, because no mirrored robot is there)."""
 
-    modes: Modes
+    belief: Belief
     motion: Array
-    bias: Array
     view: Array
     label: Array
     local: Array
 
 
-def both_looks(memory: Memory, look: Look, mirrored: Array) -> Look:
-    """The look of the filter and that of the control, stacked along a first axis; one loop over both compiles
-    the filter once.
+def both_looks(memory: Memory, look: Look, control: Belief, mirrored: Array) -> Look:
+    """The look of recall and that of its control, stacked along a first axis; one loop over both compiles
+    recall once.
 
     Args:
         mirrored: the mirror image of the view.
     """
-    control = Look(
-        memory.control,
+    other = Look(
+        control,
         look.motion * jnp.asarray(MIRROR, look.motion.dtype),
-        -look.bias,
         mirrored,
         permuted_label(memory, look.label),
         jnp.zeros_like(look.local),
     )
-    return jax.tree.map(lambda *pair: jnp.stack(pair), look, control)
-
-
-def first_look(memory: Memory, view: Array, label: Array, local: float) -> Look:
-    """The look of the filter itself."""
-    share = jnp.asarray(local, memory.bias.dtype)
-    return Look(modes_of(memory), memory.motion, memory.bias, view, label, share)
-
-
-def modes_of(memory: Memory) -> Modes:
-    """The posterior of the filter."""
-    return Modes(*(getattr(memory, name) for name in Modes._fields))
+    return jax.tree.map(lambda *pair: jnp.stack(pair), look, other)
 
 
 def mirror_view(view: Array, shape: tuple[int, int, int], angle: Array) -> Array:

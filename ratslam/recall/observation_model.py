@@ -29,7 +29,7 @@ class ObservationLikelihood(NamedTuple):
 
     Attributes:
         likelihood: [S or 1, C] at each shift and keyframe. novelty: likelihood at a new place.
-        background: see `RecallResult`. certain: whether the filter can decide yet. informative: whether the
+        background: see `RecallResult`. certain: whether recall can decide yet. informative: whether the
             observation is evidence about the current place (a label never given before is not).
     """
 

@@ -29,16 +29,15 @@ PARTS: dict[str, dict[str, Any]] = {
     "without heading bias from views": {"keyframes.bias_from_views": False},
     "without both heading biases": {"keyframes.bias_from_views": False, "ablation": {"heading_bias": False}},
     "as a robot that may be carried": {"keyframes.may_be_carried": True},
-    "without injection into the pose cells": {"recall.energy": 1.0e-12},
     "without loop closures": {"experience.closures": False},
 }
 """Parts that `ablate` turns off, by setting; and cuts of the odometry, which are off unless configured."""
 CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}  # the classic backend for whiskers
 CHOICES: dict[str, dict[str, Any]] = {
     "as configured": {},
-    "11 cells": {"backend": "recall", "pose_cells.cells_xy": 11},
+    "9 headings": {"backend": "recall", "pose_cells.cells_heading": 9},
+    "18 headings": {"backend": "recall", "pose_cells.cells_heading": 18},
     "41 cells": {"backend": "recall", "pose_cells.cells_xy": 41},
-    "dense": {"backend": "recall", "attractor.engine": "dense"},
     "float32": {"session.precision": "float32"},
     "classic": CLASSIC,
 }

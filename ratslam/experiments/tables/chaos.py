@@ -20,8 +20,7 @@ from jax import lax
 
 from ratslam.classic import pose_cells
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig as PoseCellConfig
-from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.classic.window import ring_difference
 from ratslam.core.precision import prepare_precision
@@ -64,12 +63,12 @@ def separation(one: Variant, other: Variant, motion: np.ndarray) -> np.ndarray:
         motion: [T, 3] cells per step.
     """
     apart = decoded_poses(one, motion) - decoded_poses(other, motion)
-    return np.abs(ring_difference(apart, rings(PoseCellConfig(), np.dtype(float)))).max(axis=1)
+    return np.abs(ring_difference(apart, rings(NetworkConfig(), np.dtype(float)))).max(axis=1)
 
 
 def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
     """[T, 3] poses decoded after each step of motion [T, 3], all in cells."""
-    config = PoseCellConfig.model_validate({"engine": kind.engine})
+    config = NetworkConfig.model_validate({"engine": kind.engine})
     if not kind.fed_back:  # the lag is measured after settling, so never
         config = config.model_copy(update={"settle_steps": 2**31 - 1})
     dtype = np.dtype(kind.dtype)
@@ -87,7 +86,7 @@ def decoded_poses(kind: Variant, motion: np.ndarray) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _walk(config: PoseCellConfig, cells: PoseCells, motion: Any) -> tuple[PoseCells, Any]:
+def _walk(config: NetworkConfig, cells: PoseCells, motion: Any) -> tuple[PoseCells, Any]:
     dtype = np.dtype(motion.dtype)
     levels, unit = window_levels(config, dtype), units(config, dtype)
     no_recall, no_energy = jnp.zeros(3, dtype), jnp.zeros((), dtype)

@@ -43,7 +43,7 @@ BACKENDS: dict[str, dict[str, Any]] = {
         "experience": {"solver": {"name": "relaxation"}},
     },
 }
-"""The recall filter, and RatSLAM as published (as in `ratslam.experiments.salman2016`)."""
+"""Recall, and RatSLAM as published (as in `ratslam.experiments.salman2016`)."""
 SESSION: dict[str, Any] = {
     "path": {"circuits": "CCAAC"},
     "motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}},

@@ -23,8 +23,7 @@ import numpy as np
 
 from ratslam.classic import pose_cells
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig as PoseCellConfig
-from ratslam.classic.pose_cell_config import rings, units
+from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
@@ -70,7 +69,7 @@ def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], An
 
 def network_step(n: int, engine: str, dtype: Any = float) -> tuple[Callable[..., Any], PoseCells]:
     """A step of an engine as a function of cells, recall and energy, and the cells at the start."""
-    config, dtype = PoseCellConfig.model_validate({"cells_xy": n, "engine": engine}), np.dtype(dtype)
+    config, dtype = NetworkConfig.model_validate({"cells_xy": n, "engine": engine}), np.dtype(dtype)
     levels, unit = window_levels(config, dtype), units(config, dtype)
     moved = Odometry(*(jnp.asarray(v, dtype) for v in (MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2], 1.0)))
 
@@ -92,7 +91,7 @@ def replay_network(
         a function of the cells to the cells after the replay and the number of steps with two packets.
     """
     step, start = network_step(n, engine, dtype)
-    ring = rings(PoseCellConfig(cells_xy=n), np.dtype(dtype))
+    ring = rings(NetworkConfig(cells_xy=n), np.dtype(dtype))
 
     @jax.jit
     def replay(cells: PoseCells) -> Any:

@@ -7,7 +7,7 @@ Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from evaluation.metrics.experience_metric import ExmConfig
 from evaluation.metrics.map_pieces import energy_within_pieces, unjoined_share
 from evaluation.metrics.session_metrics import (
     FALSE_CLOSURE_DISTANCE,
+    SessionResult,
     TouchMetrics,
     closure_errors,
     experience_metric_if_defined,
@@ -26,13 +27,14 @@ from evaluation.metrics.session_metrics import (
 )
 from evaluation.metrics.statistics import wilson_interval
 from ratslam.config.run_config import RunConfig
+from ratslam.core.session import Session
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
 from ratslam.pipeline.source import open_observations
 from robot.simulation.head.baseline import HALL_BASELINE
-from robot.sources.in_memory import load_into_memory
+from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.odometry import OdometryConfig
 
 FIRST_MAZE = 31100
@@ -231,6 +233,17 @@ def session_record(figures: SessionFigures) -> dict[str, Any]:
 
 def measure_session(task: TouchTask) -> SessionFigures:
     """Runs and measures one session."""
+    return run_and_measure(task)[1]
+
+
+def run_and_measure(
+    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] | None = None
+) -> tuple[SessionResult, SessionFigures]:
+    """Runs one session, and measures it.
+
+    Args:
+        start: makes the session, see `run_session`.
+    """
     with open_observations(task_config(task)) as (config, source):
         kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
         log = load_into_memory(source)
@@ -239,7 +252,7 @@ def measure_session(task: TouchTask) -> SessionFigures:
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":
         log = replace(log, views=np.zeros_like(log.views))
-    result = run_session(config, log)
+    result = run_session(config, log, start)
     truth = result.truth
     true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
     returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
@@ -250,7 +263,7 @@ def measure_session(task: TouchTask) -> SessionFigures:
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
     later, earlier = true_closures.T
     recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
-    return SessionFigures(
+    return result, SessionFigures(
         metrics._replace(
             em_experiences=energy_all_pairs(snapped, truth).total,
             arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),

@@ -6,6 +6,7 @@ each of them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from evaluation.metrics.session_metrics import SessionResult
 from ratslam.backends.registry import Sensors, backend_settings, build
 from ratslam.config.run_config import RunConfig
+from ratslam.core.backend import Backend
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
 from ratslam.pipeline.source import open_observations
@@ -36,9 +38,17 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     return config, log
 
 
-def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
-    """Runs a session from memory, with a configuration completed by its source."""
-    session = start_session(config, log)
+def run_session(
+    config: RunConfig,
+    log: InMemorySource,
+    start: Callable[[RunConfig, InMemorySource], Session] | None = None,
+) -> SessionResult:
+    """Runs a session from memory, with a configuration completed by its source.
+
+    Args:
+        start: makes the session; None: `start_session`.
+    """
+    session = (start or start_session)(config, log)
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
     nodes = session.map.graph().nodes
@@ -58,9 +68,20 @@ def run_session(config: RunConfig, log: InMemorySource) -> SessionResult:
 
 def start_session(config: RunConfig, log: InMemorySource) -> Session:
     """A session at its start, for a configuration completed by its source; the next call takes it back."""
-    method = backend_settings(config.backend, config)
-    reserve = max(capacity_for(log.length), config.session.reserve)
-    session = _compiled(config.backend, method, config.session.precision, log.view_shape, reserve)
+    session = _compiled(*_kind(config, log))
+    session.restart(config.session.seed)
+    return session
+
+
+def new_session(
+    config: RunConfig, log: InMemorySource, change: Callable[[Backend], None] | None = None
+) -> Session:
+    """The same, compiled anew and for the caller alone.
+
+    Args:
+        change: is done to the backend before.
+    """
+    session = _build(*_kind(config, log), change)
     session.restart(config.session.seed)
     return session
 
@@ -70,10 +91,28 @@ def capacity_for(steps: int) -> int:
     return capacity_at(max(steps, 1) - 1)
 
 
-@lru_cache(maxsize=2)
-def _compiled(
-    name: str, method: Settings, precision: Precision, shape: tuple[int, int, int], reserve: int
+def _kind(
+    config: RunConfig, log: InMemorySource
+) -> tuple[str, Settings, Precision, tuple[int, int, int], int]:
+    method = backend_settings(config.backend, config)
+    reserve = max(capacity_for(log.length), config.session.reserve)
+    return config.backend, method, config.session.precision, log.view_shape, reserve
+
+
+def _build(
+    name: str,
+    method: Settings,
+    precision: Precision,
+    shape: tuple[int, int, int],
+    reserve: int,
+    change: Callable[[Backend], None] | None = None,
 ) -> Session:
-    """A session of any state; a recently compiled one is used again."""
     prepare_precision(precision)
-    return Session(build(name, method, Sensors(shape), precision), reserve=reserve, precision=precision)
+    backend = build(name, method, Sensors(shape), precision)
+    if change is not None:
+        change(backend)
+    return Session(backend, reserve=reserve, precision=precision)
+
+
+_compiled = lru_cache(maxsize=2)(_build)
+"""A session of any state; a recently compiled one is used again."""

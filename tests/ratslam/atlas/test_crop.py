@@ -9,13 +9,14 @@ import pytest
 
 from ratslam.atlas.crop import crop_map, keyframes_in_box, keyframes_of_piece, keyframes_of_steps
 from ratslam.atlas.difference import difference, keyframe_content
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend, RecallState
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.recall.config import RecallConfig
 from ratslam.recall.memory import crop_rows
 from tactile.base.se2 import compose
 from tests.ratslam.keyframes.map_cases import CELL, LAP, STEP, drive, new_map
 from tests.ratslam.keyframes.merging_cases import Drive, circles
-from tests.ratslam.recall.test_merged_rows import CAPACITY, COUNT, random_memory
+from tests.ratslam.recall.test_merged_rows import CAPACITY, COUNT, SIZE, TOUCH, random_memory
 
 END = LAP + 60
 ROUND, LAPS = 80, 4
@@ -128,29 +129,44 @@ def test_an_empty_part_is_refused(made) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_posterior_of_rows_that_are_gone_is_novelty(seed: int) -> None:
-    stream = np.random.default_rng(seed)
-    config = RecallConfig(sector_fov="whiskers", modes=4)
-    memory = random_memory(stream, config)
-    map = drive(new_map(), {}, last=COUNT)
+def test_the_memory_keeps_the_rows_that_remain(seed: int) -> None:
+    memory, rows, inside = cropped_memory(seed)
+    after, count = crop_rows(memory, rows), int(inside.sum())
+    kept = np.flatnonzero(inside)
+    assert int(after.count) == count
+    assert int(after.distinct) == count, "each keyframe has a label of its own"
+    np.testing.assert_array_equal(np.asarray(after.view)[:, :count].T, rows.rows.view)
+    for name in ("x", "y", "heading", "cosine", "sine"):
+        np.testing.assert_array_equal(np.asarray(getattr(after, name))[:count], getattr(memory, name)[kept])
+
+
+def cropped_memory(seed: int):
+    """A memory, the rows of a crop of two of three keyframes, and which these are."""
+    memory = random_memory(np.random.default_rng(seed), TOUCH)
     inside = np.arange(COUNT) % 3 > 0
-    rows = crop_map(map, new_map(), inside)
-    views = np.asarray(memory.view).T[:COUNT][inside]
-    rows = rows._replace(rows=rows.rows._replace(view=views))
-    after = crop_rows(memory, rows)
-    left = np.zeros(CAPACITY, bool)
-    left[:COUNT] = inside
-    for old, new in ((memory, after), (memory.control, after.control)):
-        held = left[np.asarray(old.anchor)]
-        np.testing.assert_allclose(np.asarray(new.mass), np.where(held, old.mass, 0))
-        count = int(inside.sum())
-        np.testing.assert_allclose(np.asarray(new.rest)[:, :count], np.asarray(old.rest)[:, left])
-        assert not np.asarray(new.rest)[:, count:].any()
-        kept = np.flatnonzero(left)
-        np.testing.assert_array_equal(kept[np.asarray(new.anchor)[held]], np.asarray(old.anchor)[held])
-    assert int(after.count) == inside.sum()
-    assert int(after.distinct) == inside.sum(), "each keyframe has a label of its own"
-    np.testing.assert_array_equal(np.asarray(after.view)[:, : inside.sum()].T, views)
+    rows = crop_map(drive(new_map(), {}, last=COUNT), new_map(), inside)
+    view = np.asarray(memory.view).T[:COUNT][inside]
+    return memory, rows._replace(rows=rows.rows._replace(view=view)), inside
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_belief_in_rows_that_are_gone_is_novelty_at_once(seed: int) -> None:
+    stream = np.random.default_rng(seed)
+    memory, rows, inside = cropped_memory(seed)
+    recall = {"sector_fov": "whiskers", "guard": 3}
+    config = RecallBackendConfig.model_validate({"recall": recall, "pose_cells": {"cells_xy": 9}})
+    backend = RecallBackend(config, (1, SIZE, 1))
+    mass = np.zeros((2, CAPACITY), np.float32)
+    mass[:, :COUNT] = stream.dirichlet(np.ones(2 * COUNT + 1))[:-1].reshape(2, COUNT)
+    belief = backend.no_belief(CAPACITY)._replace(mass=mass)
+    belief = belief._replace(activity=np.full(belief.activity.shape, mass.sum() / belief.activity.size))
+    state = RecallState(belief, None, memory, np.zeros(3), np.ones(()))
+    after = backend.crop_rows(state, rows).belief
+    count = int(inside.sum())
+    np.testing.assert_allclose(np.asarray(after.mass)[:, :count], mass[:, :COUNT][:, inside])
+    assert not np.asarray(after.mass)[:, count:].any()
+    recalled = mass[:, :COUNT][:, inside][:, : count - 3]
+    assert 0.1 < recalled.sum() == pytest.approx(float(after.activity.sum()), abs=1e-6)
 
 
 def test_settings_of_the_map_stay() -> None:

@@ -20,10 +20,8 @@ from ratslam.examples import dead_reckoning
 
 
 def pose_cells(method, source, **more):
-    """Both engines of the pose cells."""
-    engine = "window" if method == "classic" else "dense"
-    parts = {"pose_cells": {"cells_xy": 11}, "attractor": {"engine": engine}, "templates": {"source": source}}
-    return method, parts | more
+    """A small network."""
+    return method, {"pose_cells": {"cells_xy": 11}, "templates": {"source": source}} | more
 
 
 # Selects sequences every few frames, so that it does so throughout the session.

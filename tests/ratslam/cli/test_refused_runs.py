@@ -164,9 +164,9 @@ def test_wrong_checkpoints_are_refused(capsys, square, tmp_path):
     refuses(capsys, [*again, square / "steps.csv"], "not a map")
     refuses(capsys, [*again, tmp_path / "none.npz"], "none.npz")
     refuses(
-        capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_xy=25"],
-        "map.npz: made with other settings: pose_cells.cells_xy is 25 and was 21 when the map was made;",
-        "; expected a map made with this configuration; `--set pose_cells.cells_xy=21` takes those of the",
+        capsys, [*again, square / "map.npz", "--set", "pose_cells.cells_heading=40"],
+        "map.npz: made with other settings: pose_cells.cells_heading is 40 and was 36 when the map was made;",
+        "; expected a map made with this configuration; `--set pose_cells.cells_heading=36` takes those of",
     )  # fmt: skip
     assert not (tmp_path / "run").exists()
 

@@ -28,8 +28,8 @@ def corridor_run(tmp_path_factory):
     config = folder / "long.yaml"
     golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
     config.write_text(
-        f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 11, cell_size: 0.05}}\n"
-        "attractor: {engine: dense}\n"
+        f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 61, cells_heading: 9, cell_size: 0.3}}\n"
+        "recall: {frame_distance: 0.05}\n"
     )
     with (
         open_observations(load_config(config)) as (completed, source),

@@ -83,11 +83,11 @@ def test_a_preset_that_is_named_gives_the_same(case):
 
 
 def test_settings_of_the_configuration_go_before_presets():
-    config = RunConfig.model_validate(ARM | {"pose_cells": {"cells_xy": 31}, "recall": {"modes": 2}})
+    config = RunConfig.model_validate(ARM | {"pose_cells": {"cells_xy": 31}, "recall": {"enter": 0.4}})
     completed = complete(config, open_source(config))
     assert completed.pose_cells.cells_xy == 31
-    assert completed.recall.modes == 2
-    assert completed.recall.mode_decay == PRESETS["touch"]["recall"]["mode_decay"]
+    assert completed.recall.enter == 0.4
+    assert completed.keyframes.select_every == PRESETS["touch"]["keyframes"]["select_every"]
 
 
 def test_no_preset_is_used_if_the_list_is_empty_or_views_are_not_of_whiskers():

@@ -17,15 +17,15 @@ def config(**settings: Any) -> LoopConfig:
 
 
 def test_all_settings_that_differ_are_named() -> None:
-    here = config(recall={"modes": 3}, pose_cells={"cells_xy": 15}, session={"precision": "float32"})
+    here = config(recall={"guard": 3}, pose_cells={"cells_xy": 15}, session={"precision": "float32"})
     expected = (
-        "m.npz: made with other settings: pose_cells.cells_xy is 15 and was 21, recall.modes is 3 and was 5, "
+        "m.npz: made with other settings: pose_cells.cells_xy is 15 and was 21, recall.guard is 3 and was 5, "
         "session.precision is float32 and was float64 when the map was made; expected a map made with this "
-        "configuration; `--set pose_cells.cells_xy=21 --set recall.modes=5 --set session.precision=float64` "
+        "configuration; `--set pose_cells.cells_xy=21 --set recall.guard=5 --set session.precision=float64` "
         "takes those of the map"
     )
     with pytest.raises(InputError) as error:
-        check_same_settings("m.npz", config(recall={"modes": 5}, pose_cells={"cells_xy": 21}), here)
+        check_same_settings("m.npz", config(recall={"guard": 5}, pose_cells={"cells_xy": 21}), here)
     assert str(error.value) == expected
 
 

@@ -72,7 +72,8 @@ def test_a_continued_map_holds_the_session_before(halves, capsys, tmp_path: Path
 
 def test_a_corrected_map_is_of_the_same_session(capsys, tmp_path: Path) -> None:
     made = read_map(WHOLE).open_session().map
-    undo_sequence(read_map(WHOLE), int(made.candidates()[:, 5].max()), tmp_path / "undone.npz")
+    log = made.solution().log
+    undo_sequence(read_map(WHOLE), int(log.table()[log.accepted_rows(), 5].max()), tmp_path / "undone.npz")
     error = refused(capsys, tmp_path / "both", WHOLE, tmp_path / "undone.npz")
     assert "leave one of them out: each holds all of the other" in error
 

@@ -102,10 +102,10 @@ def test_the_kernel_has_the_rows_of_the_map(first: int, monkeypatch: pytest.Monk
             assert not np.asarray(values[count:]).any()
         views, _ = session.map.appearance.stored(session.map.kept_keyframes().taken.rows)
         assert np.array_equal(np.asarray(memory.view)[:, :count], views.T)
-        for modes in (memory, memory.control):
-            assert not np.asarray(modes.rest)[:, count:].any()
-            assert (np.asarray(modes.anchor) < max(count, 1)).all()
-            assert float(np.sum(modes.mass) + np.sum(modes.rest)) < 1 + 1e-9
+        activity, mass = (np.asarray(values) for values in state.belief)
+        assert not mass[:, count:].any()
+        assert mass.sum() < 1 + 1e-6
+        assert activity.sum() == pytest.approx(mass.sum(), abs=1e-6)
         counts.append(count)
         return state
 

@@ -30,7 +30,7 @@ def session_of(
     view_shape: tuple[int, ...], cell_size: float | None, precision: str, **keyframes: bool
 ) -> Session:
     """A session with one setting for all, on pose cells small enough for a test, compiled once."""
-    cells = {"pose_cells": {"cells_xy": 11, "cell_size": cell_size}, "attractor": {"engine": "dense"}}
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": cell_size}}
     config = RecallBackendConfig.model_validate({**cells, "keyframes": keyframes})
     return Session(RecallBackend(config, view_shape, np.dtype(precision)), reserve=512, precision=precision)
 

@@ -28,7 +28,7 @@ def symmetric(log: InMemorySource) -> InMemorySource:
 
 @pytest.fixture(scope="module")
 def session():
-    cells = {"pose_cells": {"cells_xy": 11, "cell_size": scenes.CELL}, "attractor": {"engine": "dense"}}
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": scenes.CELL}}
     config = RecallBackendConfig.model_validate(cells)
     return Session(RecallBackend(config, (3, 6, 1), np.dtype("float64")), reserve=512)
 

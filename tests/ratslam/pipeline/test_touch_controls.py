@@ -54,7 +54,7 @@ def test_images_without_information_give_no_closures(
         assert np.allclose(found.path, dead_reckoning(walk.readings), atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [4, 8, 22])
+@pytest.mark.parametrize("seed", [30, 34, 37])
 def test_weak_sequences_alone_are_not_accepted(seed: int) -> None:
     """Recall proposes sequences in these sessions that would do beside a strong one."""
     settings, session = PRESETS["touch"]["keyframes"], empty_session()

@@ -27,8 +27,8 @@ REACH = 0.1
 """Distance within which a closure is true, m: two pose cells."""
 
 
-CELLS = {"pose_cells": {"cells_xy": 11}, "attractor": {"engine": "dense"}}
-"""Few pose cells, on the whole torus: they compile in half of the time."""
+CELLS = {"pose_cells": {"cells_xy": 11}}
+"""Few pose cells."""
 
 
 class Walk(NamedTuple):

@@ -1,4 +1,4 @@
-"""Memories and random cases for the recall filter."""
+"""Memories, beliefs and random cases for recall."""
 
 from __future__ import annotations
 
@@ -8,10 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.network.config import Network, PoseCellConfig
+from ratslam.network.pose_cells import Belief, anchor
 from ratslam.recall import observation_model
-from ratslam.recall.config import RecallConfig
-from ratslam.recall.filter import recognise
-from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback, init_memory
+from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.recall.filter import recognise, view_cells
+from ratslam.recall.memory import (
+    MapFeedback,
+    accumulate_motion,
+    apply_map_feedback,
+    corrected_motion,
+    init_memory,
+)
 
 CELL = 0.1
 SIZE = 12
@@ -21,6 +29,15 @@ SEEDS = range(16)
 ANGLE = 0.15
 FAN = RecallConfig(sector_fov="auto", guard=GUARD)
 FLAT = RecallConfig(sector_fov="none", guard=GUARD)
+ROW = 36, 13, 168
+"""Cells of a network in which no two places of `spaced` share one."""
+SMALL = 12, 13, 13
+
+
+def network_of(config, cell=CELL, shape=ROW):
+    """The network that follows from settings; its first sides are of no account here."""
+    cells = PoseCellConfig(cells_heading=shape[0], cell_size=cell)
+    return Network(cells, config.excite, config.excite_heading, config.miss, config.leak)
 
 
 def filled(
@@ -37,7 +54,7 @@ def filled(
     dtype=float,
     capacity=CAPACITY,
 ):
-    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest, all mass is novelty."""
+    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest."""
     count = len(poses)
     store = np.zeros((views.shape[1], capacity))
     store[:, :count] = views.T
@@ -52,40 +69,57 @@ def filled(
     return apply_map_feedback(memory, MapFeedback(poses, bias, turn_error, since, angle, scale))
 
 
-def with_modes(memory, frames, masses, offsets=None):
-    """The memory with modes at these frames."""
-    modes = len(memory.mass)
-    anchor, mass, offset = np.zeros(modes, np.int32), np.zeros(modes), np.zeros((modes, 3))
-    anchor[: len(frames)], mass[: len(frames)] = frames, masses
-    if offsets is not None:
-        offset[: len(frames)] = offsets
-    dtype = memory.mass.dtype
-    return memory._replace(
-        anchor=jnp.asarray(anchor), mass=jnp.asarray(mass, dtype), offset=jnp.asarray(offset, dtype)
-    )
+def holding(config, memory, masses=None, cell=CELL, shape=ROW):
+    """The belief that gives these masses, by keyframe, to view cells of shift 0; the rest is novelty."""
+    shifts = sector_shifts(config).tolist()
+    mass = np.zeros((len(shifts), len(memory.label)))
+    for frame, value in (masses or {}).items():
+        mass[shifts.index(0), frame] = value
+    return believing(config, memory, mass, cell, shape)
+
+
+def believing(config, memory, mass, cell=CELL, shape=ROW):
+    """The belief of masses [S, C] of the view cells."""
+    mass = jnp.asarray(mass, jnp.float32)
+    silent = Belief(jnp.zeros(shape, jnp.float32), mass)
+    return anchoring(config, network_of(config, cell, shape))(memory, silent)
 
 
 @cache
-def filter_of(config, cell=CELL):
-    return jax.jit(
-        lambda memory, view: recognise(
-            config, cell, memory, observation_model.view_likelihood(config, cell, memory, view), config.local
-        )
-    )
+def anchoring(config, network):
+    """Drives the pose cells at a memory's poses by the mass of a belief."""
+    return jax.jit(lambda memory, held: anchor(network, held, view_cells(config, memory), held.mass))
+
+
+@cache
+def filter_of(config, cell=CELL, shape=ROW):
+    network = network_of(config, cell, shape)
+
+    def look(memory, belief, view):
+        weighed = observation_model.view_likelihood(config, cell, memory, view)
+        return recognise(config, network, memory, belief, corrected_motion(memory), weighed, config.local)
+
+    return jax.jit(look)
 
 
 @cache
 def compile_label_filter(config):
-    def read(memory, label):
+    network = network_of(config)
+
+    def read(memory, belief, label):
         weighed = observation_model.label_likelihood(config, memory, label)
-        return *recognise(config, CELL, memory, weighed, config.local), weighed
+        return *recognise(
+            config, network, memory, belief, corrected_motion(memory), weighed, config.local
+        ), weighed
 
     return jax.jit(read)
 
 
-def observe(config, memory, view, cell=CELL):
-    memory, found = filter_of(config, cell)(memory, jnp.asarray(view, memory.x.dtype))
-    return jax.tree.map(np.asarray, memory), jax.tree.map(np.asarray, found)
+def observe(config, memory, view, belief=None, cell=CELL):
+    """The belief after a view, and the result; without a belief all is novelty."""
+    belief = holding(config, memory, cell=cell) if belief is None else belief
+    look = filter_of(config, cell, belief.activity.shape)
+    return jax.tree.map(np.asarray, look(memory, belief, jnp.asarray(view, memory.x.dtype)))
 
 
 def spaced(count, cells=4.0):
@@ -94,7 +128,8 @@ def spaced(count, cells=4.0):
 
 
 def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
-    """A memory in mid-session, with frames so close that all shares matter, and a half-known view."""
+    """A memory in mid-session, with frames so close that all shares matter, its belief in a small network,
+    and a half-known view."""
     stream = np.random.default_rng(seed)
     count = int(stream.integers(GUARD + 2, CAPACITY))
     poses = np.cumsum(stream.normal(0, 0.6 * CELL, (count, 3)), axis=0)
@@ -108,13 +143,16 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     # Not at the newest frame, which is guarded, but near older frames of the map.
     pose = poses[stream.integers(0, count - GUARD)] + stream.normal(0, [CELL, CELL, 0.3])
     memory = memory._replace(pose=jnp.asarray(pose, dtype))
-    masses = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1]
-    frames = stream.integers(0, count - GUARD, config.modes)
-    memory = with_modes(memory, frames, masses, stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4])
+    mass = np.zeros((len(sector_shifts(config)), CAPACITY))
+    frames = stream.integers(0, count - GUARD, 4)
+    shifts = stream.integers(0, len(mass), 4) if angle else np.full(4, len(mass) // 2)
+    np.add.at(mass, (shifts, frames), stream.dirichlet(np.full(5, 0.7))[:-1])
+    belief = believing(config, memory, mass, shape=SMALL)
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
-    near = np.roll(views[frames[int(masses.argmax())]], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
-    return memory, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)
+    heaviest = frames[int(mass[shifts, frames].argmax())]
+    near = np.roll(views[heaviest], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
+    return memory, belief, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)
 
 
 # The loops

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +10,8 @@ import pytest
 from ratslam.backends.config import RecallBackendConfig
 from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
-from ratslam.recall.filter import recognise
-from ratslam.recall.memory import accumulate_motion, current_pose, store_keyframe
+from ratslam.recall.filter import place_of, recognise
+from ratslam.recall.memory import accumulate_motion, corrected_motion, current_pose, store_keyframe
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
@@ -29,10 +26,10 @@ from tests.ratslam.recall.recall_cases import (
     compile_label_filter,
     errors_by_loops,
     filled,
-    filter_of,
+    holding,
+    network_of,
     observe,
     spaced,
-    with_modes,
 )
 
 # Recallable frames
@@ -42,7 +39,7 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     stream = np.random.default_rng(0)
     views = stream.random((40, SIZE))
     memory = filled(FAN, views, spaced(40), angle=ANGLE, scale=0.0)
-    after, found = observe(FAN, memory, views[7])
+    _, found = observe(FAN, memory, views[7])
     assert (found.match, found.log_ratio, found.posterior, found.novelty, found.view_fits) == (
         -1,
         0,
@@ -53,14 +50,14 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     assert found.keyframe == 40
     assert observe(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
-    memory = accumulate_motion(jax.tree.map(jnp.asarray, after), jnp.asarray([CELL, 0.0, 0.5]))
-    memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5), jnp.asarray([1.0, 2.0, 3.0]))
+    memory = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.5]))
+    memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5))
     assert int(memory.count) == 41
     assert np.array_equal(memory.view[:, 40], views[7])
-    assert np.array_equal(memory.packet[40], [1, 2, 3])
     assert (int(memory.label[40]), int(memory.distinct)) == (5, 1)
-    pose = [memory.x[40], memory.y[40], np.arctan2(memory.sine[40], memory.cosine[40])]
-    assert np.array(pose) == pytest.approx(compose(spaced(40)[-1], np.array([CELL, 0, 0.5])))
+    pose = np.array([memory.x[40], memory.y[40], memory.heading[40]])
+    assert pose == pytest.approx(compose(spaced(40)[-1], np.array([CELL, 0, 0.5])))
+    assert [memory.cosine[40], memory.sine[40]] == pytest.approx([np.cos(0.5), np.sin(0.5)])
     assert np.array_equal(memory.motion, np.zeros(3))
     assert (float(memory.length), float(memory.turn)) == (0, 0)
     assert float(memory.since) == pytest.approx(CELL)
@@ -77,7 +74,7 @@ def test_the_newest_frames_are_never_recalled():
                 assert found.match == frame
                 continue
             assert found.match < max(count - GUARD, 0)
-            assert (after.anchor[after.mass > 0] < count - GUARD).all()
+            assert not after.mass[:, max(count - GUARD, 0) :].any()
             assert found.posterior < 0.1
         if count <= GUARD:
             assert found.match == -1
@@ -114,73 +111,99 @@ def test_a_contradicting_view_removes_mass():
     stream = np.random.default_rng(0)
     views = stream.random((40, SIZE))
     before = 0.6
-    memory = with_modes(filled(FAN, views, spaced(40), angle=ANGLE), [9], [before])
+    memory = filled(FAN, views, spaced(40), angle=ANGLE)
 
     def at_nine(view):
-        after, _ = observe(FAN, memory, view)
-        return float(after.mass[after.anchor == 9].sum())
+        after, _ = observe(FAN, memory, view, holding(FAN, memory, {9: before}))
+        return float(after.mass[:, 9].sum())
 
     assert at_nine(views[9]) > 0.95
     assert at_nine(1 - np.round(views[9])) < 0.1 * before  # fits nothing at all
     assert at_nine(views[25]) < 0.1 * before  # fits another frame
 
 
+BLANK = ObservationLikelihood(
+    likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
+    certain=jnp.bool_(True), informative=jnp.bool_(False),
+)  # fmt: skip
+"""A view that says nothing."""
+
+
+def blind(memory, belief):
+    network = network_of(FLAT)
+    return recognise(FLAT, network, memory, belief, corrected_motion(memory), BLANK, FLAT.local)
+
+
 def test_odometry_alone_is_never_evidence():
     # A straight path driven twice: odometry repeats the first drive exactly, without any views.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
-    blank = ObservationLikelihood(
-        likelihood=jnp.ones((1, CAPACITY)), novelty=jnp.ones(()), background=jnp.full(SAMPLES, jnp.nan),
-        certain=jnp.bool_(True), informative=jnp.bool_(False),
-    )  # fmt: skip
-    blind = jax.jit(partial(recognise, FLAT, CELL, local=FLAT.local))
+    look = jax.jit(blind)
     # A view that all frames share is no evidence either.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure in (0.0, 0.3, 1.0):
         for seeing in (False, True):
-            start = with_modes(memory, [0], [sure])
-            start = start._replace(pose=jnp.asarray([0.0, 0.0, 0.0]))
-            belief, limit = start, sure
+            robot = memory._replace(pose=jnp.asarray([0.0, 0.0, 0.0]))
+            belief, limit = holding(FLAT, memory, {0: sure}), sure
             for _ in range(20):
-                limit = limit * (1 - FLAT.mode_decay) + (1 - limit) * FLAT.enter
-                belief = accumulate_motion(belief, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
-                belief, _ = filter_of(FLAT)(belief, jnp.asarray(same)) if seeing else blind(belief, blank)
-                belief = belief._replace(pose=current_pose(belief), motion=jnp.zeros(3), length=jnp.zeros(()))
-                assert float(belief.mass.sum()) <= limit + 1e-9
+                limit = limit * (1 - FLAT.leak) + (1 - limit) * FLAT.enter
+                robot = accumulate_motion(robot, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
+                belief, _ = observe(FLAT, robot, same, belief) if seeing else look(robot, belief)
+                robot = robot._replace(pose=current_pose(robot), motion=jnp.zeros(3), length=jnp.zeros(()))
+                assert float(belief.activity.sum()) <= limit + 1e-5
             # Nor is it evidence against: the mass is still there.
-            assert seeing or float(belief.mass.sum()) > 0.5 * limit
+            assert seeing or float(belief.activity.sum()) > 0.5 * limit
 
 
-def test_a_mode_that_reaches_no_frame_becomes_novelty():
-    memory = with_modes(filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1), [9], [1.0])
+def test_a_view_without_evidence_changes_no_odds():
+    """Every packet keeps what the motion leaves it, and only what enters anew is added."""
+    memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40), scale=0.1)
+    after, found = jax.jit(blind)(memory, holding(FLAT, memory, {9: 0.5, 20: 0.1}))
+    entered = 0.4 * FLAT.enter * (1 - FLAT.local) / (40 - GUARD)
+    expected = np.array([0.5, 0.1]) * (1 - FLAT.leak) / (1 + FLAT.miss) + entered
+    assert np.asarray(after.mass[0, [9, 20]]) == pytest.approx(expected, rel=1e-4)
+    assert float(found.log_ratio) == 0
+    assert float(after.mass.sum()) + float(found.novelty) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_packet_that_reaches_no_frame_becomes_novelty():
+    memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1)
+    belief = holding(FLAT, memory, {9: 1.0})
     view = np.full(SIZE, FLAT.floor * 0.1)
     on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
     aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
-    assert observe(FLAT, on_way, view)[1].novelty < 0.05
-    assert observe(FLAT, aside, view)[1].novelty == pytest.approx(1, abs=1e-9)
+    assert observe(FLAT, on_way, view, belief)[1].novelty < 0.05
+    assert observe(FLAT, aside, view, belief)[1].novelty == pytest.approx(1, abs=1e-6)
 
 
-def test_a_mode_has_the_heading_of_its_frames():
-    # A path driven out and back: two frames at one place have opposite headings and equal views.
-    stream = np.random.default_rng(0)
-    views, poses = stream.random((40, SIZE)), spaced(40)
-    views[10], poses[10] = views[9], poses[9] + [0, 0, np.pi]
-    after, _ = observe(FLAT, filled(FLAT, views, poses), views[9])
-    assert after.anchor[0] in (9, 10)
-    assert abs(math.cos(after.offset[0, 2])) == pytest.approx(1, abs=0.1)
+def test_a_path_driven_out_and_back_is_followed_in_the_heading_of_the_robot():
+    """Two paths lie at the same places with opposite headings and equal views: motion tells them apart."""
+    views = np.repeat(np.random.default_rng(0).random((20, SIZE)), 2, axis=0)
+    poses = np.repeat(spaced(20, 2.0), 2, axis=0)
+    poses[1::2, 2] = np.pi
+    memory = filled(FLAT, views, poses)
+    for begin, step in ((10, 2), (21, -2)):
+        belief, robot = holding(FLAT, memory, {begin: 0.5}), memory
+        robot = accumulate_motion(robot, jnp.asarray([2 * CELL, 0.0, 0.0]))
+        after, found = observe(FLAT, robot, views[begin + step], belief)
+        assert found.match == begin + step
+        assert after.mass[0, begin + step] > 0.9
+        heading = place_of(memory, jax.tree.map(jnp.asarray, found))[2]
+        assert np.cos(float(heading) - poses[begin, 2]) == pytest.approx(1)
 
 
 # Given ids
 
 
-def label_likelihood(memory, label):
-    return jax.tree.map(np.asarray, compile_label_filter(FLAT)(memory, jnp.int32(label)))
+def label_likelihood(memory, label, masses=None):
+    read = compile_label_filter(FLAT)
+    return jax.tree.map(np.asarray, read(memory, holding(FLAT, memory, masses), jnp.int32(label)))
 
 
 def test_ids_are_evidence_for_and_against_frames():
     ids = np.arange(40) // 4
-    memory = with_modes(filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids), [9], [0.6])
+    memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     known = len(set(ids.tolist()))
-    same, other, new = (label_likelihood(memory, label) for label in (ids[9], ids[30], 77))
+    same, other, new = (label_likelihood(memory, label, {9: 0.6}) for label in (ids[9], ids[30], 77))
 
     weighing = same[2]
     assert weighing.likelihood.shape == (1, CAPACITY)
@@ -194,7 +217,7 @@ def test_ids_are_evidence_for_and_against_frames():
     assert new[2].novelty > new[2].likelihood.max()
     assert np.isnan(weighing.background).all()
 
-    mass = [float(after.mass[after.anchor == 9].sum()) for after, *_ in (same, other, new)]
+    mass = [float(after.mass[0, 9]) for after, *_ in (same, other, new)]
     assert mass[0] > 0.9
     assert max(mass[1:]) < 0.6
     assert (same[1].match, same[1].shift) == (9, 0)
@@ -215,7 +238,7 @@ def test_an_id_is_new_once():
     memory = filled(FLAT, np.zeros((2, 0)), spaced(2), labels=[4, 4])
     given_then = [(9, 2), (9, 2), (-1, 2), (4, 2), (0, 3)]
     for label, distinct in given_then:
-        memory = store_keyframe(memory, jnp.zeros(0), jnp.int32(label), jnp.zeros(3))
+        memory = store_keyframe(memory, jnp.zeros(0), jnp.int32(label))
         assert int(memory.distinct) == distinct
 
 
@@ -226,7 +249,7 @@ def test_the_newest_frames_are_not_recalled_by_id():
     for label in range(40 - GUARD, 40):
         after, found, _ = label_likelihood(memory, label)
         assert found.match < 40 - GUARD
-        assert (after.anchor[after.mass > 0] < 40 - GUARD).all()
+        assert not after.mass[:, 40 - GUARD :].any()
 
 
 # Calibration

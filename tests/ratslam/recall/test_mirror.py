@@ -18,10 +18,9 @@ from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.mirror import (
     MIRROR,
     NEVER_GIVEN,
+    Look,
     both_looks,
-    first_look,
     mirror_view,
-    modes_of,
     permuted_label,
 )
 from tactile.base.se2 import correct_heading
@@ -111,24 +110,22 @@ def test_most_ids_have_another_one_and_few_share_it():
 
 
 def test_the_control_looks_for_the_mirror_image_and_nowhere_near_the_map():
-    """In the mirror the motion and its bias change sides, the error of turns is the same share of them."""
-    memory, view = random_case(3)
+    """In the mirror the motion changes sides, and so do its bias and the error of its turns."""
+    memory, belief, view = random_case(3)
     memory = memory._replace(label=jnp.arange(64, dtype=jnp.int32), count=jnp.int32(64))
-    memory = memory._replace(control=modes_of(memory)._replace(mass=memory.mass / 2))
-    own = first_look(memory, jnp.asarray(view), jnp.int32(7), 0.4)
-    both = jax.tree.map(np.asarray, both_looks(memory, own, jnp.asarray(view[::-1])))
+    motion, local = jnp.asarray([0.3, 0.1, -0.2]), jnp.asarray(0.4)
+    control = jax.tree.map(lambda value: value / 2, belief)
+    own = Look(belief, motion, jnp.asarray(view), jnp.int32(7), local)
+    both = jax.tree.map(np.asarray, both_looks(memory, own, control, jnp.asarray(view[::-1])))
     assert both.local.tolist() == [0.4, 0.0]
-    assert both.bias.tolist() == [float(memory.bias), -float(memory.bias)]
-    assert both.motion == pytest.approx(np.stack([memory.motion, memory.motion * MIRROR]), abs=0)
+    assert both.motion == pytest.approx(np.stack([motion, motion * MIRROR]), abs=0)
     assert np.array_equal(both.view, [view, view[::-1]])
     assert both.label.tolist() == [7, int(permutation()(memory, jnp.int32(7)))]
-    for found, *pair in zip(both.modes, modes_of(memory), memory.control, strict=True):
+    for found, *pair in zip(both.belief, belief, control, strict=True):
         assert np.array_equal(found, np.stack(pair))
-    straight, mirrored = (
-        correct_heading(motion, float(memory.length), bias, TURN_ERROR)
-        for motion, bias in zip(both.motion, both.bias, strict=True)
-    )
-    assert mirrored == pytest.approx(straight * MIRROR, abs=1e-12)
+    straight = correct_heading(memory.motion, memory.length, BIAS, TURN_ERROR)
+    mirrored = correct_heading(memory.motion * MIRROR, memory.length, -BIAS, TURN_ERROR)
+    assert np.asarray(mirrored) == pytest.approx(np.asarray(straight) * MIRROR, abs=1e-12)
 
 
 # The two filters change places
@@ -137,7 +134,7 @@ def test_the_control_looks_for_the_mirror_image_and_nowhere_near_the_map():
 def backend_of(kind):
     fov = 1.2 if kind == "ordered sectors" else "none"
     recall = {"guard": COUNT - 1, "local": 0.0, "sector_fov": fov}
-    cells = {"pose_cells": {"cells_xy": 11, "cell_size": CELL}, "attractor": {"engine": "dense"}}
+    cells = {"pose_cells": {"cells_xy": 11, "cell_size": CELL}}
     shape = WIDE_SHAPE if kind == "columns" else SHAPE
     return RecallBackend(RecallBackendConfig.model_validate({**cells, "recall": recall}), shape)
 

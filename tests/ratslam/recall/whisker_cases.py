@@ -10,9 +10,16 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback, init_memory
+from ratslam.recall.memory import (
+    MapFeedback,
+    accumulate_motion,
+    apply_map_feedback,
+    corrected_motion,
+    init_memory,
+)
 from ratslam.recall.observation_model import touch_likelihood
 from ratslam.recall.whisker_likelihood import DEAD, PRIOR, estimate_background, log_odds_table, pixel_layout
+from tests.ratslam.recall.recall_cases import SMALL, believing, holding, network_of
 
 CELL = 0.05
 SHAPE = (3, 6, 1)
@@ -38,7 +45,7 @@ def learn(images):
 
 
 def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=float):
-    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest, all mass is novelty."""
+    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest."""
     count = len(poses)
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
     store = np.zeros((SIZE, CAPACITY), np.int32)
@@ -53,7 +60,8 @@ def spaced(count, cells=4.0):
 
 
 def random_case(seed, config=BOTH):
-    """A memory in the middle of a path that doubles back, with all arrays filled, and a half-known image."""
+    """A memory in the middle of a path that doubles back, with all arrays filled, its belief, and a
+    half-known image."""
     stream = np.random.default_rng(seed)
     count = int(stream.integers(GUARD + 2, CAPACITY + 1))
     poses = np.cumsum(stream.normal(0, 0.5 * CELL, (count, 3)), axis=0)
@@ -62,20 +70,15 @@ def random_case(seed, config=BOTH):
     memory = filled(config, images, poses, learn(images))
     old = max(count - GUARD, 0)
     rows = len(sector_shifts(config))
-    before, rest = np.zeros((2, rows, CAPACITY))
+    before, mass = np.zeros((2, rows, CAPACITY))
     before[:, :old] = stream.exponential(1, (rows, old))
     before[:, CAPACITY // 3] = 0.0
-    rest[:, :old] = stream.dirichlet(np.full(rows * old + 1, 0.3))[:-1].reshape(rows, old) * 0.6
-    mass = stream.dirichlet(np.full(config.modes + 1, 0.7))[:-1] * (1 - rest.sum())
-    offset = stream.normal(0, 0.5 * CELL, (config.modes, 3)) * [1, 1, 4]
-    memory = memory._replace(
-        before=jnp.asarray(before), rest=jnp.asarray(rest), mass=jnp.asarray(mass),
-        anchor=jnp.asarray(stream.integers(0, max(old, 1), config.modes), jnp.int32),
-        offset=jnp.asarray(offset),
-    )  # fmt: skip
+    mass[:, :old] = stream.dirichlet(np.full(rows * old + 1, 0.3))[:-1].reshape(rows, old)
+    memory = memory._replace(before=jnp.asarray(before))
+    belief = believing(config, memory, mass, CELL, SMALL)
     memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
     near = images[stream.integers(0, max(old, 1))]
-    return memory, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
+    return memory, belief, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
 
 
 @cache
@@ -85,9 +88,12 @@ def compile_likelihood(config):
 
 @cache
 def filter_of(config):
-    def observe(memory, level):
+    network = network_of(config, CELL)
+
+    def observe(memory, belief, level):
         memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        return recognise(config, CELL, memory, weighing, config.local)
+        motion = corrected_motion(memory)
+        return memory, *recognise(config, network, memory, belief, motion, weighing, config.local)
 
     return jax.jit(observe)
 
@@ -100,5 +106,7 @@ def weigh(config, memory, level):
     return host(compile_likelihood(config)(memory, jnp.asarray(level, jnp.int32)))
 
 
-def observe(config, memory, level):
-    return host(filter_of(config)(memory, jnp.asarray(level, jnp.int32)))
+def observe(config, memory, level, belief=None):
+    """The memory and the belief after an image, and the result; without a belief all is novelty."""
+    belief = holding(config, memory, cell=CELL) if belief is None else belief
+    return host(filter_of(config)(memory, belief, jnp.asarray(level, jnp.int32)))

@@ -70,7 +70,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         failed = "keyframes.min_score: too much" if score > 40 else None
         values = {
             "energy_all": (score - 7) ** 2 + job.seed,
-            "exm_arr": 1 / (1 + abs(score - 12) + job.config.recall.modes),
+            "exm_arr": 1 / (1 + abs(score - 12) + job.config.recall.guard),
         }
         found = record(time=1000 / score, error=failed, **({} if failed else values))
         return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})

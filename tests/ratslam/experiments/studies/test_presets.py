@@ -33,13 +33,13 @@ def preset(name, path=SQUARE, *overrides, **options):
 
 @pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers", "growth", "cells"}))
 def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
-    study, _ = preset(name, SQUARE, "session.seed=7", "recall.modes=3")
+    study, _ = preset(name, SQUARE, "session.seed=7", "recall.guard=3")
     assert study.name == f"square-{name}"
     jobs = study.jobs
     assert {job.seed for job in jobs} == ({0, 1, 2} if name == "pareto" else {7})
-    assert {job.config.recall.modes for job in jobs} & {3}
+    assert {job.config.recall.guard for job in jobs} & {3}
     if name != "vary":
-        assert {job.config.recall.modes for job in jobs} == {3}
+        assert {job.config.recall.guard for job in jobs} == {3}
 
 
 def test_every_part_is_turned_off_in_a_row_of_its_own():
@@ -54,11 +54,11 @@ def test_every_part_is_turned_off_in_a_row_of_its_own():
 def test_every_number_is_varied_in_both_directions_within_its_limits():
     found = variations(override(load(SQUARE), ["recall.local=0.9"]), 0.2)
     names = [name for name, _ in found]
-    assert names.count("recall.reach") == names.count("keyframes.min_score") == 2
+    assert names.count("recall.excite") == names.count("keyframes.min_score") == 2
     assert names.count("keyframes.noise.per_cell") == 2
     assert names.count("recall.local") == 1  # a share: it cannot exceed 1
-    assert ("recall.modes", 6) in found
-    assert ("recall.modes", 10) in found
+    assert ("recall.guard", 16) in found
+    assert ("recall.guard", 24) in found
     assert len(preset("vary")[0].jobs) == 1 + len(variations(load(SQUARE), 0.2))
     with pytest.raises(InputError, match="--by"):
         preset("vary", by=1.0)

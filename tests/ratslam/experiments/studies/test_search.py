@@ -23,7 +23,7 @@ TUNE = {
     "trials": 14,
     "parameters": {
         "keyframes.min_score": {"low": 1.0, "high": 39.0, "log": True},
-        "recall.modes": {"low": 1, "high": 8},
+        "recall.guard": {"low": 1, "high": 8},
         "session.precision": {"choices": ["float32", "float64"]},
     },
     "objectives": ["energy_all", "exm_arr"],
@@ -68,7 +68,7 @@ def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, t
     for trial in trials:
         score = trial.varied["keyframes.min_score"]
         assert 1 <= score <= 39
-        assert trial.varied["recall.modes"] in range(1, 9)
+        assert trial.varied["recall.guard"] in range(1, 9)
         assert mean(trial) == pytest.approx((score - 7) ** 2 + 0.5)
         assert trial.optimal == (not any(dominates(other, trial) for other in trials))
     different = {json.dumps(trial.varied) for trial in trials}

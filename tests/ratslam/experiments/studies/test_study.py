@@ -22,7 +22,7 @@ MAZE = ROOT / "configs" / "whisker_maze.yaml"
 SQUARE = ROOT / "configs" / "square.yaml"
 AXES = {
     "keyframes.min_score": st.floats(1, 50, allow_subnormal=False),
-    "recall.modes": st.integers(1, 8),
+    "recall.guard": st.integers(1, 8),
     "backend": st.sampled_from(["recall", "classic"]),
     "session.precision": st.sampled_from(["float32", "float64"]),
     "simulation.whisking.rate": st.floats(0.5, 4),
@@ -208,7 +208,7 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
             {"vary": {"keyframes.min_scor": [1, 2]}},
             ["study.yaml:1:", "keyframes.min_scor: unknown key", "'min_score'"],
         ),
-        ({"rows": {"a": {"recall.mode_decay": "x"}}}, ["recall.mode_decay: 'x'", "a number"]),
+        ({"rows": {"a": {"recall.leak": "x"}}}, ["recall.leak: 'x'", "a number"]),
         ({"set": {"keyframes.min_score": [1]}}, ["keyframes.min_score: a list of 1"]),
         ({"vary": {"keyframes.min_score": []}}, ["vary.keyframes.min_score", "at least 1"]),
         ({"vary": {"keyframes.min_score": 3}}, ["vary.keyframes.min_score: 3", "a list"]),
@@ -234,7 +234,7 @@ TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objec
         ({"tune": TUNE | {"minimise": ["exm_arr"]}}, ["tune: a quantity named twice"]),
         ({"tune": TUNE | {"parameters": {}}}, ["tune.parameters"]),
         (tuning("keyframes.x", low=1, high=2), ["keyframes.x: unknown key"]),
-        (tuning("recall.mode_decay", low=0.1, high=2.0), ["recall.mode_decay: 2"]),
+        (tuning("recall.leak", low=0.1, high=2.0), ["recall.leak: 2"]),
         ({"rows": {"a": {"copies": -1}}}, ["rows.a.copies: -1"]),
         ({"rows": {"a": {"ablation": {"whiskers": False}}}}, ["rows.a.ablation.whiskers: unknown key"]),
         ({"rows": {"a": {"ablation": {"verify": 0}}}}, ["rows.a.ablation.verify: 0", "true or false"]),
@@ -262,11 +262,11 @@ def test_every_error_is_reported_once(folder):
         read(
             folder,
             vary={"backend": ["recall", "classic"], "keyframes.min_scor": [1, 2]},
-            set={"recall.mode_decay": "x"},
+            set={"recall.leak": "x"},
         )
     lines = str(caught.value).splitlines()
     assert len(lines) == 2
-    assert "recall.mode_decay: 'x'" in str(caught.value)
+    assert "recall.leak: 'x'" in str(caught.value)
     assert "keyframes.min_scor: unknown key" in str(caught.value)
 
 

@@ -1,0 +1,182 @@
+"""Sessions whose network doubles its sides: the same bits live, in replay and restored, with and without a
+probe, and one compilation for each capacity and sides."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ratslam.core.session import CHUNK, Probe
+from ratslam.network.pose_cells import Belief
+from ratslam.recall.memory import accumulate_motion
+from tests.ratslam.network import alike_places
+from tests.ratslam.network.alike_places import PLACES
+
+CELLS, LAPS = 11, 7
+PROBED = 160
+"""Steps of the session with a probe."""
+STOPS = 24, PROBED, 245
+"""In the middle of a chunk between two doublings, and before and after the capacity has grown."""
+
+
+@cache
+def readings():
+    return alike_places.laps(LAPS)
+
+
+@cache
+def compiled():
+    """A session without a probe; every test begins it anew, and nothing is compiled twice."""
+    return alike_places.session(CELLS)
+
+
+def begun():
+    session = compiled()
+    session.restart()
+    return session
+
+
+class Run:
+    """The results of a session over all readings, and its arrays in the end and where it stopped."""
+
+    def __init__(self, session, sizes):
+        self.steps, self.stops, self.kinds, at = [], {}, [], 0
+        for size in sizes:
+            chunk = readings()[at : at + size]
+            self.steps += session.replay(chunk) if size > 1 else [session.step(chunk[0])]
+            at += size
+            activity, mass = session.state.belief
+            self.kinds.append((mass.shape[1], *activity.shape[:0:-1]))
+            if at in STOPS:
+                self.stops[at] = session.arrays()
+        self.arrays, self.closures = session.arrays(), session.map.closures()
+
+
+@cache
+def live():
+    """One reading at a time."""
+    return Run(begun(), [1] * len(readings()))
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def assert_same_steps(one, other):
+    for first, second in zip(one, other, strict=True):
+        jax.tree.map(
+            np.testing.assert_array_equal,
+            first._replace(probed=None, seldom=None),
+            second._replace(probed=None, seldom=None),
+        )
+
+
+def test_the_network_doubles_on_the_way_and_loops_are_closed():
+    run = live()
+    sides = [kind[1:] for kind in run.kinds]
+    assert sorted(set(sides)) == [(CELLS, CELLS), (CELLS, 2 * CELLS), (2 * CELLS, 2 * CELLS)]
+    assert sides == sorted(sides)
+    assert sides.index((CELLS, 2 * CELLS)) == CHUNK, "only between chunks"
+    assert sides[STOPS[0] - 1] == (CELLS, 2 * CELLS)
+    assert {kind[0] for kind in run.kinds} == {256, 512}, "the capacity grows too"
+    assert run.steps[-1].evidence.certainty > 0.9
+    assert len(run.closures) > (LAPS - 3) * PLACES
+
+
+@pytest.mark.parametrize("sizes", [[280], [7, 16, 33, 64, 1, 159]], ids=["whole", "parts"])
+def test_live_and_replay_give_the_same_bits(sizes):
+    run = Run(begun(), sizes)
+    assert_same_steps(run.steps, live().steps)
+    assert_same(run.arrays, live().arrays)
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_restored_session_goes_on_with_the_same_bits(stop):
+    session = begun()
+    session.restore(live().stops[stop])
+    steps = list(session.replay(readings()[stop:]))
+    assert_same_steps(steps, live().steps[stop:])
+    assert_same(session.arrays(), live().arrays)
+
+
+def test_a_session_that_has_not_begun_is_restored():
+    session = begun()
+    session.restore(session.arrays())
+    assert_same_steps(session.replay(readings()[:40]), live().steps[:40])
+
+
+def test_each_capacity_and_sides_are_compiled_once():
+    """Live, in parts and again."""
+    kinds = set(live().kinds)
+    run = Run(begun(), [len(readings())])
+    assert compiled().compilations() == len(kinds)
+    assert run.arrays["sides"].tolist() == [2 * CELLS, 2 * CELLS]
+
+
+# The probe
+
+
+@cache
+def probed():
+    """A session whose chosen cells are recorded at every step, and all of them at every 20th."""
+    backend = alike_places.session(CELLS).backend
+    chosen, cells = recorded_cells(), backend.probe()
+    probe = Probe(partial(lambda state: cells.each(state, chosen)), cells.hold, 20)
+    session = alike_places.session(CELLS, probe=probe)
+    return cells, list(session.replay(readings()[:PROBED])), session.arrays()
+
+
+def recorded_cells():
+    return np.random.default_rng(0).choice(36 * CELLS**2, 2000, replace=False)
+
+
+def test_a_session_with_a_probe_has_the_same_results():
+    _, steps, arrays = probed()
+    assert_same_steps(steps, live().steps[:PROBED])
+    assert_same(arrays, live().stops[PROBED])
+
+
+def test_chosen_cells_are_read_as_all_cells_are():
+    _, steps, *_ = probed()
+    both = [step for step in steps if step.seldom is not None]
+    assert len(both) == len(steps) // 20
+    assert sum(step.probed.any() for step in both) > 2
+    for step in both:
+        assert step.probed.dtype == np.float32
+        assert np.array_equal(step.probed, step.seldom[recorded_cells()])
+
+
+@pytest.mark.parametrize("layers", [1, -4])
+def test_the_preferred_poses_of_cells_turn_with_the_robot(layers):
+    """Cells are read as odometry has moved them since the last view, without its systematic errors."""
+    backend = compiled().backend
+    belief = Belief(np.random.default_rng(0).random((36, CELLS, CELLS)).astype(np.float32), np.zeros((1, 9)))
+    state = backend.init(None, 256)._replace(belief=belief)
+    memory = state.memory._replace(turn_error=jnp.asarray(0.25))
+    turn = jnp.asarray([0.0, 0.0, 0.8 * layers * np.pi / 18])
+    state = state._replace(memory=accumulate_motion(memory, turn))
+    expected = np.roll(belief.activity, layers, axis=0).ravel()
+    found = jax.jit(backend.probe().each)(state, recorded_cells())
+    assert np.asarray(found) == pytest.approx(expected[recorded_cells()], abs=1e-4)
+
+
+def test_the_probe_names_active_cells_packet_and_certainty():
+    cells, steps, *_ = probed()
+    assert cells.shape == (36, CELLS, CELLS)
+    for step in steps:
+        if step.seldom is not None:
+            at, activity = cells.active(step.seldom)
+            assert (activity > 0).all()
+            assert np.array_equal(activity, step.seldom[at])
+            assert not np.delete(step.seldom, at).any()
+        x, y, heading = cells.packet(step.evidence)
+        assert 0 <= x < CELLS
+        assert 0 <= y < CELLS
+        assert 0 <= heading < 36
+        assert cells.energy(step.evidence) == step.evidence.certainty
