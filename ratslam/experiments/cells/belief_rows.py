@@ -10,6 +10,7 @@ Basnak et al. 2025. Several pose hypotheses in RatSLAM: Milford, Wiles & Wyeth 2
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from ratslam.experiments.cells.belief_world import (
     CELLS,
     LOOKS,
     PARTICLES,
+    RoomClosures,
     World,
     additive,
     circles,
@@ -31,10 +33,12 @@ from ratslam.experiments.cells.belief_world import (
     particles,
     random_looks,
     random_world,
+    room_closures,
     see,
 )
 from ratslam.experiments.cells.figure import CellFigure, CellTask
 from ratslam.experiments.cells.panel_grid import head_panel, panel_grid
+from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.keyframes.config import KeyframeMapConfig
 from ratslam.network.config import PoseCellConfig
@@ -240,13 +244,16 @@ class RoomsResult(NamedTuple):
     Attributes:
         share: by belief, [n, T] probability of the true room over that of both. packet: by belief, [n, T] of
             the best packet. found: by belief, [n] probability of the true room at the end. told: [n, T] bool,
-            whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`.
+            whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`. closures,
+            unlike: of sessions of the whole product, in rooms that look alike and in others.
     """
 
     share: Mapping[str, np.ndarray]
     packet: Mapping[str, np.ndarray]
     found: Mapping[str, np.ndarray]
     told: np.ndarray
+    closures: Sequence[RoomClosures]
+    unlike: Sequence[RoomClosures]
 
 
 def alike_rooms(seed: int) -> World:
@@ -268,8 +275,8 @@ def alike_rooms(seed: int) -> World:
     return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
 
 
-def measure_rooms(task: CellTask) -> RoomsResult:
-    """The probabilities of the two rooms."""
+def measure_rooms(task: CellTask, sessions: int = 3) -> RoomsResult:
+    """The probabilities of the two rooms, and closures of so many sessions of the whole product."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {}
     for seed in task.seeds(20):
         world = alike_rooms(seed)
@@ -282,7 +289,12 @@ def measure_rooms(task: CellTask) -> RoomsResult:
         {name: np.array([row[k] for row in rows]) for name, rows in found.items()} for k in range(3)
     )
     told = np.cumsum(np.abs(share[EXACT] - 0.5) > SIGN, axis=1) > 0
-    return RoomsResult(share, packet, last, told)
+    seeds = range(task.first, task.first + sessions)
+    closures, unlike = (
+        list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
+        for alike in (True, False)
+    )
+    return RoomsResult(share, packet, last, told, closures, unlike)
 
 
 def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
@@ -326,9 +338,15 @@ def table_rooms(result: RoomsResult) -> list[str]:
             ),
         ]
         lines.append(markdown_row([name, *cells]))
+    both = (result.closures, result.unlike)
+    alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in both)
     return [
         *lines,
         "",
+        f"{len(result.closures)} sessions of the whole product with given place ids. Until the first"
+        f" difference: {alike[0]} closures (goal: 0; control, rooms that do not look alike: {unlike[0]}). At"
+        f" the end of the lap: {alike[1]} into the room of the robot, {alike[2]} elsewhere (control:"
+        f" {unlike[1]}, {unlike[2]}).",
         f"A packet of more than {CANDIDATE:g} is a candidate; the keyframe map judges sequences of them, so"
         " two equal packets are at the edge of one. Not shown: a room that is not in the map, for which any"
         " belief takes one that is.",

@@ -25,7 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.backends.config import RecallBackendConfig
+from ratslam.backends.recall import RecallBackend
 from ratslam.core.precision import prepare_precision
+from ratslam.core.session import Session
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
 from ratslam.network.pose_cells import SUPPORT, Belief
@@ -35,7 +38,7 @@ from ratslam.recall.memory import MapFeedback, frozen_memory
 from ratslam.recall.observation_model import SAMPLES, ObservationLikelihood
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
-from tactile.base.types import Array
+from tactile.base.types import Array, Odometry, observation
 
 CONFIG = RecallConfig(sector_fov="none", guard=1, local=0.0)
 """Settings of the product, with view cells of one shift that are all recalled, and re-entry everywhere."""
@@ -69,6 +72,15 @@ class World(NamedTuple):
     novelty: np.ndarray
     truth: np.ndarray
     start: np.ndarray
+
+
+class RoomClosures(NamedTuple):
+    """Loop closures of a session after the robot was set down in one of two rooms: those made before the
+    first difference, and at the end those into the room where it is and into the other."""
+
+    early: int
+    true: int
+    false: int
 
 
 class NetworkTrace(NamedTuple):
@@ -189,6 +201,47 @@ def network(world: World, enter: float = CONFIG.enter, cells: PoseCellConfig = C
     )
     belief = np.column_stack([mass, np.maximum(1 - mass.sum(axis=1), 0.0)])
     return NetworkTrace(belief, posterior)
+
+
+def room_closures(seed: int, difference: int, alike: bool = True) -> RoomClosures:
+    """A session of the whole product, views, network and map, with given place ids.
+
+    The robot maps a room by two laps of a circle, drives to another one and maps it likewise. It is then set
+    down at the beginning of one of them, which the seed chooses, as a piece of the map of its own
+    (`Session.begin_piece`), and drives one lap. The ids of both rooms are the same up to `difference` if they
+    look alike, else nowhere.
+    """
+    prepare_precision("float64")
+    random = stream(seed, "cells.room_closures")
+    ring, way = np.tile(np.arange(AROUND), 2), np.arange(60)
+    other = np.where(alike & (ring <= difference), ring, 100 + ring)
+    own = bool(random.integers(2))
+    mapped = np.concatenate([ring, 200 + way, other, 300 + way])
+    label = np.concatenate([mapped, (ring if own else other)[:AROUND]])
+    lap, straight = pace(np.ones(2 * AROUND)), np.tile([0.04, 0.0, 0.0], (60, 1))
+    motion = np.concatenate([lap, straight, lap, straight, lap[:AROUND]])
+    motion += random.normal(0, [0.002, 0.001, 0.01], motion.shape)
+    timed = np.column_stack([motion, np.full(len(motion), 0.5)])
+    config = RecallBackendConfig.model_validate({"templates": {"source": "labels"}})
+    session = Session(RecallBackend(config, (1, 1, 1)), reserve=len(label))
+    seen = [
+        observation(Odometry(*moved), None, view_shape=(1, 1, 1), label=int(one))
+        for moved, one in zip(timed, label, strict=True)
+    ]
+
+    def closures(first: int, last: int) -> np.ndarray:
+        """Earlier steps of all closures of the last piece, after some more steps."""
+        for _ in session.replay(seen[first:last]):
+            pass
+        found = session.map.closures()
+        return found[found[:, 0] >= len(mapped), 1]
+
+    closures(0, len(mapped))
+    session.begin_piece()
+    early = closures(len(mapped), len(mapped) + difference)
+    late = closures(len(mapped) + difference, len(label))
+    inside = (late < len(ring)) if own else (late >= len(ring) + len(way))
+    return RoomClosures(len(early), int(inside.sum()), int((~inside).sum()))
 
 
 @lru_cache(maxsize=8)

@@ -9,6 +9,7 @@ import pytest
 
 from ratslam.experiments.cells.belief_rows import (
     CONTROL,
+    DIFFERENCE,
     EXACT,
     FIGURES,
     MANY,
@@ -27,7 +28,15 @@ from ratslam.experiments.cells.belief_rows import (
     measure_posterior,
     measure_rooms,
 )
-from ratslam.experiments.cells.belief_world import CONFIG, World, exact, network, random_world, transition
+from ratslam.experiments.cells.belief_world import (
+    CONFIG,
+    World,
+    exact,
+    network,
+    random_world,
+    room_closures,
+    transition,
+)
 from ratslam.experiments.cells.figure import CellTask
 from ratslam.network.config import PoseCellConfig
 
@@ -41,7 +50,7 @@ def posterior() -> PosteriorResult:
 
 @pytest.fixture(scope="module")
 def rooms() -> RoomsResult:
-    return measure_rooms(SMALL)
+    return measure_rooms(SMALL, sessions=0)
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +126,14 @@ def test_rooms_that_look_alike_share_the_belief_until_they_differ(rooms: RoomsRe
     assert np.abs(share[~rooms.told] - 0.5).max() < 0.1
     assert share[:, -1].min() > 0.9
     assert rooms.share[CONTROL][:, -1].max() < 0.9
+
+
+@pytest.mark.soak
+def test_the_product_closes_loops_into_the_room_of_the_robot_if_rooms_do_not_look_alike() -> None:
+    found = room_closures(41000, DIFFERENCE, alike=False)
+    assert found.early > 10
+    assert found.true > 20
+    assert found.false == 0
 
 
 def test_rooms_that_never_differ_keep_their_shares() -> None:
