@@ -72,6 +72,7 @@ def sizes() -> SizeResult:
         return measure_sizes(CellTask(31001, sessions=1), "short", sides=(7, 21), sizes=())
 
 
+@pytest.mark.soak
 def test_the_usual_size_is_the_product_and_a_tiny_network_closes_less(
     sizes: SizeResult, result: LesionResult
 ) -> None:
@@ -86,6 +87,7 @@ def test_the_usual_size_is_the_product_and_a_tiny_network_closes_less(
     }
 
 
+@pytest.mark.soak
 def test_table_and_picture_of_sizes(sizes: SizeResult, tmp_path: Path) -> None:
     figure = FIGURES["scale"]
     assert sum(line.startswith(("| 7 ", "| 21 ")) for line in figure.table(sizes)) == 4
