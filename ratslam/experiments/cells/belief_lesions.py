@@ -351,7 +351,7 @@ SIDES = (7, 11, 15, 21, 31, 42)
 """Cells along x and along y."""
 SIZES = (0.025, 0.035, 0.07, 0.1)
 """Of a cell, m, each with the sides that cover what the usual network covers."""
-CALLS = 200
+CALLS = 20
 """Of which the fastest counts."""
 
 
@@ -498,8 +498,8 @@ def draw_sizes(result: SizeResult, png: Path) -> None:
         axes[0][1].plot(update, closed, "o", ms=5, color=colour)
     for panel, across in zip(axes[0], ("cells a side", "time of an update (us)"), strict=True):
         panel.set_ylim(bottom=0)
-        panel.set_xlim(left=0)
         style.name_axes(panel, across, "revisits closed")
+    axes[0][1].set_xscale("log")
     style.add_legend(figure, axes[0][0])
     figure.savefig(png)
 
