@@ -1,4 +1,4 @@
-"""RatSLAM backend with Bayesian recall and verified loop closures."""
+"""RatSLAM backend whose pose cells hold the belief, with verified loop closures."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ class RecallBackend(Backend):
     def kernel(
         self, state: RecallState, observation: Observation
     ) -> tuple[RecallState, Estimate, RecallEvidence]:
-        """Recalls the view, injects activity by its posterior, moves the packet and stores the view."""
+        """Moves by the odometry; a view that becomes a keyframe weighs the belief and is stored."""
         odometry, view, visible, clean = finite_values(self.dtype, observation)
         seen, view = self.prepare(observation, view, visible)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
