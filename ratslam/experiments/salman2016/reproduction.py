@@ -17,8 +17,10 @@ from evaluation.metrics.direction_metrics import (
     direction_metrics,
     lap_of_step,
 )
+from evaluation.metrics.energy_metric import energy, energy_all_pairs, successive_pairs
 from evaluation.metrics.experience_metric import experience_metric
 from evaluation.metrics.session_metrics import (
+    SessionResult,
     TouchMetrics,
     experience_metric_if_defined,
     lap_ends,
@@ -31,6 +33,7 @@ from evaluation.plots.paper_figures import DrivenPath, MeasuredQuantity, experie
 from ratslam.config.run_config import RunConfig
 from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.experiments.salman2016.protocols import (
+    BY_MAZE,
     COMMON,
     LATER_MAZE_START,
     METHODS,
@@ -50,7 +53,7 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 
 KEY = ("condition", "method", "control")
-FIELDS = (*TouchMetrics._fields, "em_ratio", *DIRECTION_METRICS, "across_share", "threshold")
+FIELDS = (*TouchMetrics._fields, *BY_MAZE[2:], "em_ratio", *DIRECTION_METRICS, "across_share", "threshold")
 """Columns of metrics in NAME.csv."""
 
 Rows = Sequence[ResultRow]
@@ -66,6 +69,9 @@ LABELS = {
     "arcr_chain_free": "ARCR without the chain",
     "em": "EM, all pairs (m2 + rad2)",
     "em_experiences": "EM through the experiences",
+    "em_position": "EM, m2",
+    "em_heading": "EM, rad2",
+    "em_successive": "EM, successive",
     "em_odometry": "EM of odometry",
     "em_ratio": "EM / dead reckoning's",
     "closures": "closures",
@@ -137,6 +143,8 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
             paper = protocol.paper.get((condition.name, quantity))
             cells = [_cell(column(rows, (condition.name, *key), quantity)) for key in columns]
             lines.append(_line(f"  {condition.name}", width, "-" if paper is None else f"{paper:.4g}", cells))
+    if len(protocol.methods) > len(Protocol._field_defaults["methods"]):
+        lines += ["", *_render_mazes(protocol, rows)]
     lines.append("")
     for claim in protocol.claims:
         lines.append(f"claim: {claim.text} ({LABELS[claim.quantity]})")
@@ -151,6 +159,24 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
             f"--sets {DECISIVE} lowers that to {2.0 ** (1 - DECISIVE):.0%}."
         )
     return "\n".join([*lines, *([protocol.note] if protocol.note else [])])
+
+
+def _render_mazes(protocol: Protocol, rows: Rows) -> list[str]:
+    """ARR and ARCR of each maze beside the paper's, and the parts of EM."""
+    lines = [f"{'Each maze':<58}{'paper':>8}" + "".join(f"{LABELS[quantity]:>15}" for quantity in BY_MAZE)]
+    for condition in protocol.conditions:
+        paper = protocol.paper.get((condition.name, "arr"), np.nan)
+        for method in protocol.methods:
+            alike, of = 0, 0
+            for row in rows:
+                if row.key == (condition.name, method, "none"):
+                    name, of = f"  {condition.name}, {method}, seed {row.seed}", of + 1
+                    alike += abs(row.values["arr"] - paper) < ALIKE
+                    cells = "".join(f"{_cell(column([row], row.key, quantity)):>15}" for quantity in BY_MAZE)
+                    lines.append(f"{name:<58}{'-' if np.isnan(paper) else f'{paper:.4g}':>8}{cells}")
+            if of and np.isfinite(paper):
+                lines.append(f"    ARR within {ALIKE} of the paper's: {alike} of {of}")
+    return lines
 
 
 def series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str]]:
@@ -271,7 +297,7 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
     jobs = []
     for number in range(sets):
         set_seed = int(stream(seed, f"reproduce.set.{number}").integers(2**31))
-        for method in ["classic"] if protocol.swept else METHODS:
+        for method in ["classic"] if protocol.swept else protocol.methods:
             # Without images the classic method matches all steps; it is compared with its chance level only.
             controls: tuple[Control, ...]
             controls = ("none", "shuffled", "blank") if method == "ours" else ("none", "shuffled")
@@ -291,7 +317,7 @@ def session_config(
 ) -> RunConfig:
     """The configuration of a condition's session with a method."""
     settings = [f"simulation.seed={seed}", *COMMON, *METHODS[method]]
-    if method == "classic":
+    if method != "ours":
         (views,) = (views for views in THRESHOLDS if f"touch.image.transform={views}" in condition.settings)
         settings.append(f"templates.threshold={THRESHOLDS[views]}")
     document = parse("simulation: {}\n", "the reproduction")
@@ -331,9 +357,20 @@ def run_job(job: TrialJob) -> ResultRow:
     result = run_session(config, log)
     metrics = touch_metrics(result, job.config.score.experience_metric)
     ratio = metrics.em / metrics.em_odometry if metrics.em_odometry else np.nan
-    values = {**metrics._asdict(), "em_ratio": ratio, **direction_metrics(result, job.laps, LATER_MAZE_START)}
+    values = {**metrics._asdict(), **parts_of_em(result), "em_ratio": ratio}
+    values |= direction_metrics(result, job.laps, LATER_MAZE_START)
     drawn = (job.laps, result) if job.number == 0 and job.key[2] == "none" else None
     return ResultRow(job.key, job.number, job.seed, values, drawn)
+
+
+def parts_of_em(result: SessionResult) -> dict[str, float]:
+    """EM over all pairs in m2 and in rad2, and EM from each experience to the next one that is active."""
+    parts = energy_all_pairs(result.trajectory, result.truth)
+    place = result.place
+    entered = np.flatnonzero((np.diff(place, prepend=-1) != 0) & (place >= 0))
+    nodes = result.node[place[entered]]
+    successive = energy(nodes, result.truth[entered], successive_pairs(len(entered)))
+    return dict(zip(BY_MAZE[2:], (parts.trans2, parts.rot2, successive.total), strict=True))
 
 
 def sweep_job(job: TrialJob) -> list[ResultRow]:

@@ -18,6 +18,7 @@ from ratslam.experiments.salman2016.reproduction import (
     PAPER,
     judge_claim,
     match_thresholds,
+    parts_of_em,
     plan_jobs,
     render_claims,
     session_config,
@@ -29,6 +30,7 @@ from ratslam.experiments.trials.touch_trial import capacity_for, collect_session
 from robot.sources.in_memory import truncate_log
 from robot.touch_source import observation_of
 from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose
 from tests.helpers.laps import session, square
 
 TINY = (
@@ -147,6 +149,25 @@ def test_a_table_states_the_significance_of_few_sets(sets, stated):
     assert ("in 25% of cases" in text) == stated
     assert ("CONFIRMED: difference 0.1" in text) == (sets > 1)
     assert "0.1765" in text
+    assert "Each maze" in text
+    near = [abs(0.1 * k - 0.1765) < 0.05 for k in range(sets)]
+    assert f"of the paper's: {sum(near)} of {sets}" in text
+
+
+def test_em_between_successive_experiences_needs_no_whole_map():
+    """One link turned by half a turn: the mean over all pairs is large, that of successive ones small."""
+    result = session(square("CCC"))
+    turned = result.trajectory.copy()
+    half = len(turned) // 2
+    turned[half:] = compose(
+        compose(turned[half - 1], [0, 0, np.pi]), between(turned[half - 1], turned[half:])
+    )
+    steps = np.arange(len(turned))
+    broken = result._replace(trajectory=turned, node=turned, place=steps)
+    parts = parts_of_em(broken)
+    assert parts["em_heading"] > 0.4 * np.pi**2
+    assert parts["em_successive"] == pytest.approx(np.pi**2 / (len(steps) - 1), rel=0.05)
+    assert set(parts_of_em(broken)) == {"em_position", "em_heading", "em_successive"}
 
 
 def test_matched_thresholds_reach_the_arcr_that_all_conditions_reach():
@@ -183,10 +204,15 @@ def test_all_conditions_are_valid_and_run_on_the_same_sets(name):
     assert all({claim.here, claim.there} <= names | {""} for claim in protocol.claims)
     assert {condition for condition, _ in protocol.paper} <= names
     for job in jobs:
-        if job.key[1] == "classic":
+        if job.key[1] != "ours":
             transform = job.config.touch.image.transform
             assert job.config.templates.threshold == THRESHOLDS[transform]
-            assert job.config.templates.energy == 0.05
+            energy = float(job.key[1].partition("energy ")[2] or 0.03)
+            assert job.config.templates.energy == energy
+    compared = name in ("fig5", "fig6", "fig7")
+    assert {job.key[1] for job in jobs if job.key[1] != "ours"} >= (
+        {"classic", "classic, energy 0.02", "classic, energy 0.05"} if compared else {"classic"}
+    )
 
 
 @pytest.mark.soak
@@ -200,7 +226,7 @@ def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path, capsys):
     assert "claim: RCP raises ARR" in text
     with (tmp_path / "fig6.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (2 + 3)
+    assert len(rows) == 2 * (3 * 2 + 3)
     ours = [row for row in rows if row["method"] == "ours" and row["control"] != "none"]
     assert all(
         row["closures"] == "0" and float(row["em_ratio"]) == pytest.approx(1, abs=0.05) for row in ours
