@@ -29,12 +29,15 @@ _ROOM, _MARGIN = 0.15, 0.06  # shares of the map's size: for drifting odometry, 
 
 
 def run_charts(report: RunReport) -> dict[str, Any]:
-    """The charts of a run by name: `map`, and those of `error`, `doubt`, `spread`, `cost` that have data."""
+    """The charts of a run by name: `map`, and those of `error`, `doubt`, `belief`, `spread`, `cost` that have
+    data."""
     charts = {"map": map_chart(report), "error": error_chart([report])}
     if np.isfinite(report.doubt).any():
         charts["doubt"] = _doubt_chart(report)
     elif report.run.truth is None:
         charts["spread"] = _spread_chart(report)
+    if len(report.belief):
+        charts["belief"] = _belief_chart(report)
     if len(report.cost.time):
         charts["cost"] = _cost_chart(report)
     return {name: chart for name, chart in charts.items() if chart is not None}
@@ -126,6 +129,18 @@ def _doubt_chart(report: RunReport) -> Any:
     doubt = _line(np.column_stack([time, report.doubt]), "probability worse than odometry", "final", width=2)
     limit = np.array([[time[0], DOUBTED], [time[-1], DOUBTED]])
     traces = [doubt, _line(limit, "limit above which a map is doubted", "limit", dash="dash", width=1.4)]
+    figure = _figure(traces, "time, s", "probability")
+    figure.update_yaxes(range=[-0.02, 1.02])
+    return figure
+
+
+def _belief_chart(report: RunReport) -> Any:
+    time = report.run.time[report.belief_step] - report.run.time[0]
+    kinds = (("heaviest packet", "final"), ("second packet", "doubted"), ("new place", "odometry"))
+    traces = [
+        _line(np.column_stack([time, share]), name, role, width=1.2)
+        for (name, role), share in zip(kinds, report.belief.T, strict=True)
+    ]
     figure = _figure(traces, "time, s", "probability")
     figure.update_yaxes(range=[-0.02, 1.02])
     return figure

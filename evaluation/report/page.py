@@ -29,6 +29,11 @@ _CAPTIONS = {
         "Doubt over time",
         "Probability, by the map itself, that it is worse than odometry. It needs no truth.",
     ),
+    "belief": (
+        "Belief of the pose cells",
+        "Probability of the heaviest packet of activity, of the one that competes with it, and of a new "
+        "place, at every keyframe.",
+    ),
     "spread": ("Uncertainty over time", "Standard deviation of the position, by the method itself."),
     "cost": (
         "Cost of a step",

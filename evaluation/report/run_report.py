@@ -28,7 +28,7 @@ from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers, align_layers
 from evaluation.report.run_files import RunFile, list_run_files
 from evaluation.report.verdict import Verdict, judge_map
-from tactile.base.bounded import read_json, read_plain_yaml
+from tactile.base.bounded import read_json, read_plain_yaml, read_text
 from tactile.base.errors import InputError
 from tactile.base.se2 import between
 
@@ -56,7 +56,9 @@ class RunReport(NamedTuple):
     Attributes:
         backend, source: method, and kind of source; '' where the configuration cannot be read.
         doubt: [N] probability at each step that the map is worse than odometry, NaN: not judged.
-        spread: [N] standard deviation of the position at each step, m.
+        spread: [N] standard deviation of the position at each step, m. belief: [n, 3] probability of the
+            heaviest packet of the pose cells, of the second and of a new place, at the steps `belief_step`
+            [n]; n = 0 of methods whose pose cells hold no belief.
         online_error: error of the current pose. cost: computing time a step, s, against the number of steps.
         run: its arrays, pieces of the map as `arrange_pieces` draws them.
         layers: paths in the frame of the map, to which `layers.to_map` moves `walls`.
@@ -73,6 +75,8 @@ class RunReport(NamedTuple):
     verdict: Verdict
     doubt: np.ndarray
     spread: np.ndarray
+    belief: np.ndarray
+    belief_step: np.ndarray
     online_error: Series
     cost: Series
     layers: Layers
@@ -120,6 +124,7 @@ def read_run_report(directory: Path) -> RunReport:
         verdict=verdict,
         doubt=doubt,
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
+        **_belief(steps, count),
         online_error=Series(*_columns(directory / "online_error.csv", "t", "error")),
         cost=Series(step, seconds / np.maximum(steps_of, 1)),
         layers=layers,
@@ -184,6 +189,17 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     if len(path) < len(run.time) or np.array_equal(path, run.final):
         return None
     return arrange_pieces(run._replace(final=path)).final[:, :2]
+
+
+def _belief(steps: Path, count: int) -> dict[str, np.ndarray]:
+    header = read_text(steps, "a file of a run directory").partition("\n")[0].split(",")
+    if "second" not in header:
+        return {"belief": np.zeros((0, 3)), "belief_step": np.zeros(0, int)}
+    keyframe, *belief = (
+        read_column(steps, name)[:count] for name in ("keyframe", "posterior", "second", "novelty")
+    )
+    at = np.flatnonzero(keyframe >= 0)
+    return {"belief": np.stack(belief, axis=1)[at], "belief_step": at}
 
 
 def _columns(file: Path, *names: str) -> list[np.ndarray]:

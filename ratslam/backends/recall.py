@@ -50,6 +50,10 @@ HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""
 
 
+SHOWN = 4
+"""Number of competing packets that are shown."""
+
+
 class RecallOutcome(IntEnum):
     """Outcome of a step."""
 
@@ -89,10 +93,9 @@ class RecallEvidence(NamedTuple):
     match: Scalar
     shift: Scalar
     posterior: Scalar
+    second: Scalar
     log_ratio: Scalar
     novelty: Scalar
-    entropy: Scalar
-    rivals: Scalar
     view_fits: Scalar
     background: Array
     mirror_match: Scalar
@@ -295,8 +298,11 @@ class RecallBackend(Backend):
         )
 
     def activity(self, state: RecallState) -> PoseCellActivity:
-        cells = np.asarray(state.belief.activity)
-        return PoseCellActivity(cells.sum(axis=0), cells.sum(axis=(1, 2)))
+        cells, memory = np.asarray(state.belief.activity), state.memory
+        poses = np.stack([np.asarray(each) for each in (memory.x, memory.y, memory.heading)], axis=1)
+        turns = -sector_shifts(self.recall) * float(memory.angle)
+        packets = pose_cells.packets(self.network, state.belief, poses, turns, SHOWN)
+        return PoseCellActivity(cells.sum(axis=0), cells.sum(axis=(1, 2)), packets)
 
     def new_map(self) -> KeyframeMap:
         """An empty keyframe map; keyframes of views and given ids are not merged, because their sequences are

@@ -27,14 +27,17 @@ class Action(IntEnum):
 
 
 class PoseCellActivity(NamedTuple):
-    """Sums of the activity of a pose-cell network, host arrays.
+    """Activity of a pose-cell network, host arrays.
 
     Attributes:
-        xy: [N, N] over the headings, rows are y. heading: [K] over x and y.
+        xy: [N, N] sum over the headings, rows are y. heading: [K] sum over x and y. packets: [n, 4] poses in
+            the map and activity of the packets that compete, heaviest first, m, m, rad; None of a network
+            whose activity is no posterior.
     """
 
     xy: np.ndarray
     heading: np.ndarray
+    packets: np.ndarray | None = None
 
 
 class GridDrawing(NamedTuple):

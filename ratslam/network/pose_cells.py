@@ -37,12 +37,15 @@ import numpy as np
 from jax import lax
 
 from ratslam.network.config import Network
+from tactile.base.se2 import wrap
 from tactile.base.types import Array
 
 OUTGROWN = 1.25
 """Length of a map, in periods of the network, from which its side doubles."""
 LARGEST = 8
 """Largest factor by which a side grows."""
+BASIN = 2.0
+"""Radius of a packet, cells."""
 SUPPORT = 8.0
 """Squared deviation at which the kernel (1 - d2 / 8)^4 ends: like exp(-d2 / 2), but compact."""
 
@@ -220,6 +223,24 @@ def excitation(sd: float, size: int) -> np.ndarray:
     """
     reach = min(int(np.ceil(np.sqrt(SUPPORT) * sd)) - 1, (size - 1) // 2)
     return np.asarray(np.maximum(1 - (np.arange(-reach, reach + 1) / sd) ** 2 / SUPPORT, 0) ** 4)
+
+
+def packets(network: Network, belief: Belief, poses: np.ndarray, turns: np.ndarray, most: int) -> np.ndarray:
+    """The heaviest packets, at most `most`: [n, 4] pose of the heaviest view cell, m, m, rad, and mass within
+    `BASIN` cells of it. On the host; compiles nothing.
+
+    Args:
+        poses: [C, 3] of the rows of view cells. turns: [S] rad, by which the robot is turned at each shift.
+    """
+    mass, reach = np.array(belief.mass), BASIN * network.cells.cell_size
+    found = np.zeros((0, 4))
+    while len(found) < most and mass.max(initial=0.0) > 0:
+        shift, row = np.unravel_index(int(mass.argmax()), mass.shape)
+        basin = np.hypot(*(poses[:, :2] - poses[row, :2]).T) < reach
+        heading = wrap(poses[row, 2] + turns[shift])
+        found = np.vstack([found, [*poses[row, :2], heading, mass[:, basin].sum()]])
+        mass[:, basin] = 0
+    return found
 
 
 def _convolve(activity: Array, axis: int, weights: np.ndarray) -> Array:

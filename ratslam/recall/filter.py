@@ -21,15 +21,13 @@ import numpy as np
 
 from ratslam.network import pose_cells
 from ratslam.network.config import Network
-from ratslam.network.pose_cells import SUPPORT, Belief, ViewCells
+from ratslam.network.pose_cells import BASIN, SUPPORT, Belief, ViewCells
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.memory import Memory, allowed_shifts, current_pose, pose_spread, recallable
 from ratslam.recall.observation_model import SAMPLES, ObservationLikelihood
 from tactile.base.se2 import wrap
 from tactile.base.types import Array
 
-BASIN = 2.0
-"""Radius around the best keyframe, cells, whose mass counts as the candidate's."""
 FACING = float(np.cos(0.5))
 """Cosine of the largest heading difference at which a keyframe faces as the robot does."""
 
@@ -40,9 +38,9 @@ class RecallResult(NamedTuple):
     Attributes:
         keyframe: int32, the keyframe that the view became, -1 for none. match: int32, the most likely
             keyframe, -1 for none. shift: int32, sector shift of the view against it. posterior: of all
-            keyframes within `BASIN` cells of it. log_ratio: log-likelihood ratio of the match against
-            novelty. novelty: its posterior. entropy: of the packet at the match, all others and novelty,
-            nats. rivals: mass of all others over that of the packet. view_fits: int32, 1 if the view fits a
+            keyframes within `BASIN` cells of it: of the heaviest packet. second: the same of the heaviest
+            keyframe apart from it: of the packet that competes. log_ratio: log-likelihood ratio of the match
+            against novelty. novelty: its posterior. view_fits: int32, 1 if the view fits a
             keyframe at the map's pose, 0 if it fits none there, -1 if none is there. background: [SAMPLES]
             errors against ruled-out keyframes, NaN for none.
     """
@@ -51,10 +49,9 @@ class RecallResult(NamedTuple):
     match: Array
     shift: Array
     posterior: Array
+    second: Array
     log_ratio: Array
     novelty: Array
-    entropy: Array
-    rivals: Array
     view_fits: Array
     background: Array
 
@@ -90,9 +87,10 @@ def recognise(
 
     match = _peak(jnp.max(mass, axis=0))
     shift = _peak(mass[:, match])
-    basin = (memory.x - memory.x[match]) ** 2 + (memory.y - memory.y[match]) ** 2 < (BASIN * cell) ** 2
+    basin = _basin(cell, memory, match)
     packet = jnp.sum(jnp.where(basin[None], mass, 0.0))
-    others = jnp.maximum(jnp.sum(mass) - packet, 0.0)
+    others = jnp.where(basin, 0.0, jnp.sum(mass, axis=0))
+    second = jnp.sum(jnp.where(_basin(cell, memory, _peak(others)), others, 0.0))
     gain = jnp.log(jnp.where(certain, jnp.broadcast_to(likelihood, mass.shape)[shift, match], 1.0) / novelty)
     near = known & _is_here(cell, memory, current_pose(memory))
     best = jnp.max(jnp.where(near, jnp.max(likelihood, axis=0), 0.0))
@@ -103,10 +101,9 @@ def recognise(
         match=jnp.where(found, match, -1),
         shift=jnp.where(found, jnp.asarray(shifts)[shift], 0),
         posterior=jnp.where(certain, packet, 0.0),
+        second=jnp.where(certain, second, 0.0),
         log_ratio=jnp.where(found, gain, 0.0),
         novelty=jnp.where(certain, novel, 1.0),
-        entropy=_entropy(jnp.stack([packet, others, novel])),
-        rivals=others / jnp.where(packet > 0, packet, 1.0),
         view_fits=jnp.where(told, (best >= novelty).astype(jnp.int32), -1),
         background=observation.background,
     )
@@ -154,9 +151,9 @@ def _entry(
     return everywhere * cells.used + around * near
 
 
-def _entropy(masses: Array) -> Array:
-    """Entropy of masses [n], nat."""
-    return -jnp.sum(jnp.where(masses > 0, masses * jnp.log(jnp.where(masses > 0, masses, 1.0)), 0.0))
+def _basin(cell: float, memory: Memory, row: Array) -> Array:
+    """[C] whether each keyframe is in the packet of one."""
+    return (memory.x - memory.x[row]) ** 2 + (memory.y - memory.y[row]) ** 2 < (BASIN * cell) ** 2
 
 
 def _is_here(cell: float, memory: Memory, here: Array) -> Array:
@@ -170,8 +167,8 @@ def empty_result(memory: Memory) -> RecallResult:
     """The result of a step without a keyframe."""
     zero = jnp.zeros_like(memory.length)
     return RecallResult(
-        keyframe=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), posterior=zero, log_ratio=zero,
-        novelty=zero + 1, entropy=zero, rivals=zero, view_fits=jnp.int32(-1),
+        keyframe=jnp.int32(-1), match=jnp.int32(-1), shift=jnp.int32(0), posterior=zero, second=zero,
+        log_ratio=zero, novelty=zero + 1, view_fits=jnp.int32(-1),
         background=jnp.full(SAMPLES, jnp.nan, zero.dtype),
     )  # fmt: skip
 

@@ -64,7 +64,7 @@ class Drawing:
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         arrow = self._rr.Arrows3D(vectors=[[0.15, 0.0, 0.0]], colors=[BLUE])
         self._log("world/robot/heading", arrow, static=True)
-        for name, colour in (("doubt", RED), ("lost", ORANGE)):
+        for name, colour in (("doubt", RED), ("lost", ORANGE), ("novelty", GREY)):
             self._log(f"health/{name}", self._rr.SeriesLines(colors=[colour], names=[name]), static=True)
         if run.head is not None:
             self._log("world/robot/head/bases", self._rr.Points3D(run.head.base, radii=0.003), static=True)
@@ -180,6 +180,22 @@ class Drawing:
         colours = self._rr.components.Colormap.Viridis
         self._log("pose_cells/activity", self._rr.DepthImage(picture, colormap=colours))
         self._log("pose_cells/heading", self._rr.BarChart(activity.heading))
+        if activity.packets is not None:
+            self._draw_packets(activity.packets)
+            novelty = max(0.0, 1.0 - float(activity.heading.sum()))
+            self._log("health/novelty", self._rr.Scalars(novelty))
+
+    def _draw_packets(self, packets: np.ndarray) -> None:
+        heading, mass = packets[:, 2:].T
+        vectors = 0.15 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(mass))])
+        colours = [[*ORANGE, round(255 * min(1.0, share))] for share in mass.tolist()]
+        arrows = self._rr.Arrows3D(
+            origins=_on_floor(packets),
+            vectors=vectors,
+            colors=colours,
+            labels=[f"{share:.0%}" for share in mass],
+        )
+        self._log("world/packets", arrows)
 
     def _draw_grid(self, grid: GridDrawing) -> None:
         cells = np.rint(100 * grid.probability).astype(np.uint8)[::-1]

@@ -148,11 +148,15 @@ def visit(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Visit]]:
 @pytest.mark.parametrize(
     ("kind", "verdict", "charts"),
     [
-        ("square", "Believe this map. It is .* likely no worse .* Against the truth", "map error doubt cost"),
+        (
+            "square",
+            "Believe this map. It is .* likely no worse .* Against the truth",
+            "map error doubt belief cost",
+        ),
         ("grid", "The map is not judged.* Against the truth", "map error cost"),
-        ("blind", "Believe this map.* The truth is unknown, so there is no score", "map doubt cost"),
-        ("killed", "(Believe|Take|Do not believe) .* Against the truth", "map error doubt cost"),
-        ("doubted", "Do not believe this map. It is 93% likely worse", "map error doubt cost"),
+        ("blind", "Believe this map.* The truth is unknown, so there is no score", "map doubt belief cost"),
+        ("killed", "(Believe|Take|Do not believe) .* Against the truth", "map error doubt belief cost"),
+        ("doubted", "Do not believe this map. It is 93% likely worse", "map error doubt belief cost"),
     ],
 )
 def test_a_page_shows_its_run(kind: str, verdict: str, charts: str, runs: Any, visit: Any) -> None:

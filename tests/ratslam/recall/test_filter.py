@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +53,7 @@ def test_mass_is_conserved(seed, kind, scale):
     assert after.activity.sum() == pytest.approx(after.mass.sum(), abs=ROUNDING)
     assert 0 <= found.posterior <= 1 + ROUNDING
     assert 0 <= found.novelty <= 1
-    assert 0 <= found.entropy <= math.log(3) + ROUNDING
+    assert 0 <= found.second <= 1 - found.posterior + ROUNDING
     if scale:
         assert after.activity.sum() + found.novelty == pytest.approx(1, abs=ROUNDING)
         assert found.posterior + found.novelty <= 1 + ROUNDING
@@ -67,7 +65,7 @@ def test_a_packet_and_novelty_are_all_where_all_frames_lie_within_a_cell():
     views = stream.random((30, SIZE))
     _, found = observe(FAN, filled(FAN, views, poses, angle=ANGLE), views[7])
     assert found.posterior + found.novelty == pytest.approx(1, abs=ROUNDING)
-    assert found.rivals == pytest.approx(0, abs=ROUNDING)
+    assert found.second == pytest.approx(0, abs=ROUNDING)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-6, 0.1])

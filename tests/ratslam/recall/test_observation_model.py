@@ -64,7 +64,7 @@ def test_mass_is_conserved(seed, config, kind):
     assert (after.activity >= 0).all()
     assert after.activity.sum() + found.novelty == pytest.approx(1, abs=1e-5)
     assert 0 <= found.posterior <= 1 + 1e-5
-    assert 0 <= found.entropy <= math.log(3) + 1e-5
+    assert 0 <= found.second <= 1 - found.posterior + 1e-5
 
 
 @pytest.mark.parametrize(

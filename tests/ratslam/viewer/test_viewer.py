@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import signal
 import socket
@@ -122,6 +123,23 @@ def test_the_file_shows_the_pose_cells_and_the_graph(shown):
     assert np.abs(np.array(places)[:, :2] - done.nodes[:, :2]).max() < 0.2
     links = column(chunks, "/world/links", "LineStrips3D:strips")[last]
     assert len(links) == len(done.links)
+
+
+def test_the_file_shows_packets_that_compete(shown):
+    directory, file = shown
+    chunks = store(file)
+    said = column(chunks, "/world/packets", "Arrows3D:labels")
+    novelty = column(chunks, "/health/novelty", "Scalars:scalars")
+    assert list(said) == list(novelty)
+    shares = {step: sum(float(text.rstrip("%")) / 100 for text in texts) for step, texts in said.items()}
+    known = {step: shares[step] + value for step, (value,) in novelty.items()}
+    assert all(value < 1.03 for value in known.values())  # no more than four, each rounded to one percent
+    assert max(known.values()) > 0.9
+    # As the column of the steps says: at the end of a run of 16 steps the last keyframe's.
+    rows = list(csv.DictReader((directory / "steps.csv").read_text().splitlines()))
+    last = [float(row["posterior"]) for row in rows if int(row["keyframe"]) >= 0][-1]
+    (final,) = (texts for step, texts in said.items() if step == max(said))
+    assert final[0] == f"{last:.0%}"
 
 
 def test_the_file_shows_closures_as_they_are_judged(shown):
