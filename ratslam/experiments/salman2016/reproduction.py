@@ -136,13 +136,15 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
     methods = [method for method, control in columns if control == "none"]
     heads = [CONTROL_LABELS[control] + method for method, control in columns]
     width = max(34, *(len(condition.name) + 4 for condition in protocol.conditions))
+    wide = max(24, *(len(head) + 2 for head in heads))
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets: median (least-most)"]
     for quantity in protocol.quantities:
-        lines += ["", _line(LABELS[quantity], width, "paper", heads)]
+        lines += ["", _line(LABELS[quantity], width, "paper", heads, wide)]
         for condition in protocol.conditions:
             paper = protocol.paper.get((condition.name, quantity))
             cells = [_cell(column(rows, (condition.name, *key), quantity)) for key in columns]
-            lines.append(_line(f"  {condition.name}", width, "-" if paper is None else f"{paper:.4g}", cells))
+            printed = "-" if paper is None else f"{paper:.4g}"
+            lines.append(_line(f"  {condition.name}", width, printed, cells, wide))
     if len(protocol.methods) > len(Protocol._field_defaults["methods"]):
         lines += ["", *_render_mazes(protocol, rows)]
     lines.append("")
@@ -152,7 +154,7 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
             keys = ((name, method, "none") for name in (claim.here, claim.there))
             here, there = (column(rows, key, claim.quantity) for key in keys)
             verdict = judge_claim(claim, here, there)
-            lines.append(f"  {method:<8} {verdict.word.upper()}: {verdict.text}")
+            lines.append(f"  {method:<20} {verdict.word.upper()}: {verdict.text}")
     if protocol.claims and 1 < done < DECISIVE:
         lines.append(
             f"By chance all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
@@ -187,8 +189,8 @@ def series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str
     return [(method, "none") for method in methods] + (controls if protocol.controls else [])
 
 
-def _line(name: str, width: int, paper: str, cells: Sequence[str]) -> str:
-    return f"{name:<{width}}{paper:>8}" + "".join(f"{cell:>24}" for cell in cells)
+def _line(name: str, width: int, paper: str, cells: Sequence[str], column: int) -> str:
+    return f"{name:<{width}}{paper:>8}" + "".join(f"{cell:>{column}}" for cell in cells)
 
 
 def _cell(values: np.ndarray) -> str:
