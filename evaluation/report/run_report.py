@@ -114,6 +114,7 @@ def read_run_report(directory: Path) -> RunReport:
     file, score = directory / "gridscore.json", None
     if file.exists():
         score = read_json(file, "the scores of a grid", GridScore.model_validate)
+    belief, belief_step = _belief(steps, count)
     step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
     return RunReport(
         name=name,
@@ -124,7 +125,8 @@ def read_run_report(directory: Path) -> RunReport:
         verdict=verdict,
         doubt=doubt,
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
-        **_belief(steps, count),
+        belief=belief,
+        belief_step=belief_step,
         online_error=Series(*_columns(directory / "online_error.csv", "t", "error")),
         cost=Series(step, seconds / np.maximum(steps_of, 1)),
         layers=layers,
@@ -191,15 +193,16 @@ def _map_path(directory: Path, run: RunArrays) -> np.ndarray | None:
     return arrange_pieces(run._replace(final=path)).final[:, :2]
 
 
-def _belief(steps: Path, count: int) -> dict[str, np.ndarray]:
+def _belief(steps: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`RunReport.belief` and the steps of its rows."""
     header = read_text(steps, "a file of a run directory").partition("\n")[0].split(",")
     if "second" not in header:
-        return {"belief": np.zeros((0, 3)), "belief_step": np.zeros(0, int)}
+        return np.zeros((0, 3)), np.zeros(0, int)
     keyframe, *belief = (
         read_column(steps, name)[:count] for name in ("keyframe", "posterior", "second", "novelty")
     )
     at = np.flatnonzero(keyframe >= 0)
-    return {"belief": np.stack(belief, axis=1)[at], "belief_step": at}
+    return np.stack(belief, axis=1)[at], at
 
 
 def _columns(file: Path, *names: str) -> list[np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,8 @@ from ratslam.recall.signed_likelihood import stored_image
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
 from tactile.base.se2 import compose, correct_heading
 from tactile.base.types import Array, Observation
+
+T = TypeVar("T")
 
 HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""
@@ -236,18 +238,14 @@ class RecallBackend(Backend):
         travelled = jnp.hypot(odometry.dx, odometry.dy)
         onwards = compose(state.packet, correct_heading(moved, travelled, memory.bias, memory.turn_error))
         state = state._replace(memory=memory)
-        state, result, control = lax.cond(
+        none = filter.empty_result(memory)
+        state, result, control = _once(
             is_keyframe,
-            lambda: self._recall(state, features, observation.label),
-            lambda: (state, filter.empty_result(memory), _candidate(filter.empty_result(memory))),
+            lambda found: self._recall(found[0], features, observation.label),
+            (state, none, _candidate(none)),
         )
         memory = state.memory
         packet = jnp.where(result.match >= 0, filter.place_of(memory, result), onwards)
-        memory = lax.cond(
-            is_keyframe,
-            lambda: recall_memory.store_keyframe(memory, features, observation.label),
-            lambda: memory,
-        )
         health = self._health(state.health, result.view_fits)
         has_room = memory.count < memory.label.shape[0]
         outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
@@ -369,7 +367,8 @@ class RecallBackend(Backend):
     def _recall(
         self, state: RecallState, view: Array, label: Array
     ) -> tuple[RecallState, RecallResult, mirror.Candidate]:
-        """Recognises the view, and its mirror image where the rule of acceptance reads the control."""
+        """Recognises and stores a view; where the rule of acceptance reads the control, this looks for its
+        mirror image."""
         memory, motion = state.memory, recall_memory.corrected_motion(state.memory)
 
         def recognise(memory: Memory, look: mirror.Look) -> tuple[Memory, Belief, RecallResult]:
@@ -382,13 +381,15 @@ class RecallBackend(Backend):
         look = mirror.Look(state.belief, motion, view, label, jnp.asarray(self.recall.local, self.dtype))
         if state.control is None:
             memory, belief, result = recognise(memory, look)
+            memory = recall_memory.store_keyframe(memory, view, label)
             state = state._replace(belief=belief, memory=memory)
             return state, result, _candidate(filter.empty_result(memory))
         both = mirror.both_looks(memory, look, state.control, self._mirrored(view, memory.angle))
         _, (beliefs, results) = lax.scan(lambda _, one: (None, recognise(memory, one)[1:]), None, both)
         own, control = (jax.tree.map(lambda x, k=k: x[k], beliefs) for k in (0, 1))
         result, false = (jax.tree.map(lambda x, k=k: x[k], results) for k in (0, 1))
-        return state._replace(belief=own, control=control), result, _candidate(false)
+        memory = recall_memory.store_keyframe(memory, view, label)
+        return state._replace(belief=own, control=control, memory=memory), result, _candidate(false)
 
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
@@ -405,6 +406,16 @@ class RecallBackend(Backend):
 
     def _mirrored(self, view: Array, angle: Array) -> Array:
         return mirror.mirror_view(view, self.view_shape, angle) if len(view) else view
+
+
+def _once(condition: Array, change: Callable[[T], T], value: T) -> T:
+    """The changed value, or the value. A loop of at most one round, because XLA copies the results of a
+    branch, but not what a loop leaves as it is."""
+
+    def once(carry: tuple[Array, T]) -> tuple[Array, T]:
+        return jnp.bool_(False), change(carry[1])
+
+    return lax.while_loop(lambda carry: carry[0], once, (condition, value))[1]
 
 
 def _candidate(result: RecallResult) -> mirror.Candidate:

@@ -29,9 +29,11 @@ shifts, C rows of view cells.
 
 from __future__ import annotations
 
-from functools import reduce
+import math
+from functools import partial, reduce
 from typing import NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -44,6 +46,9 @@ OUTGROWN = 1.25
 """Length of a map, in periods of the network, from which its side doubles."""
 LARGEST = 8
 """Largest factor by which a side grows."""
+ROWS = 256
+"""Rows of view cells that are joined to pose cells at a time, up to the last in use: a step takes time for
+the keyframes that there are, not for those that there is room for."""
 BASIN = 2.0
 """Radius of a packet, cells."""
 SUPPORT = 8.0
@@ -118,10 +123,10 @@ def predict(network: Network, belief: Belief, cells: ViewCells, motion: Array) -
     Returns:
         mass [S, C] that reaches the view cells, and mass that finds none; float32.
     """
-    activity = belief.activity
-    ties = tie(network, activity.shape, integrate_path(cells, motion))
-    density = excite(network, drive(activity.shape, ties, jnp.ones_like(belief.mass)))
-    found = (1 - network.leak) * read(ties, excite(network, activity / (density + network.miss)))
+    activity, moved = belief.activity, integrate_path(cells, motion)
+    density = excite(network, drive(network, activity.shape, moved, jnp.ones_like(belief.mass)))
+    excited = excite(network, activity / (density + network.miss))
+    found = (1 - network.leak) * read(network, moved, excited)
     return found, jnp.maximum(jnp.sum(activity) - jnp.sum(found), 0.0)
 
 
@@ -133,8 +138,8 @@ def inhibit(mass: Array, novel: Array) -> tuple[Array, Array]:
 
 def anchor(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
     """The belief after view cells of mass [S, C] drive their pose cells."""
-    shape, mass = belief.activity.shape, mass.astype(jnp.float32)
-    return Belief(drive(shape, tie(network, shape, cells), mass), mass)
+    mass = mass.astype(jnp.float32)
+    return Belief(drive(network, belief.activity.shape, cells, mass), mass)
 
 
 def integrate_path(cells: ViewCells, motion: Array) -> ViewCells:
@@ -167,7 +172,8 @@ def tie(network: Network, shape: tuple[int, ...], cells: ViewCells) -> Ties:
         at = value * (1 / unit)
         first = jnp.floor(at)
         share.append((at - first).astype(jnp.float32))
-        low.append(first.astype(jnp.int32) % size)
+        on_ring = (first - size * jnp.floor(first * (1 / size))).astype(jnp.int32)  # vector code, unlike %
+        low.append(jnp.where(on_ring == size, 0, on_ring))
         high.append(jnp.where(low[-1] + 1 == size, 0, low[-1] + 1))
     index, weight = [], []
     for heading, y, x in np.ndindex(2, 2, 2):
@@ -191,20 +197,53 @@ def activity_at(network: Network, belief: Belief, motion: Array, chosen: Array) 
     heading = layer.astype(single) * (2 * np.pi / cells.cells_heading)
     x, y = (value.astype(single) * cells.cell_size for value in (x, y))
     at = ViewCells(x, y, heading, jnp.cos(heading), jnp.sin(heading), jnp.ones_like(x))
-    return read(tie(network, belief.activity.shape, integrate_path(at, motion)), belief.activity)
+    return read(network, integrate_path(at, motion), belief.activity)
 
 
-def drive(shape: tuple[int, ...], ties: Ties, mass: Array) -> Array:
+def drive(network: Network, shape: tuple[int, ...], cells: ViewCells, mass: Array) -> Array:
     """K v: the activity [H, Y, X] that view cells of mass [S, C], float32, give to their pose cells."""
-    cells = jnp.zeros(int(np.prod(shape)), jnp.float32)
-    update = (ties.weight * mass[None]).reshape(-1)
-    return cells.at[ties.index.reshape(-1)].add(update, mode="promise_in_bounds").reshape(shape)
+
+    def add(k: Array, activity: Array) -> Array:
+        ties = _tie_block(network, shape, cells, k)
+        update = (ties.weight * _rows(k, mass)[None]).reshape(-1)
+        return activity.at[ties.index.reshape(-1)].add(update, mode="promise_in_bounds")
+
+    activity = jnp.zeros(int(np.prod(shape)), jnp.float32)
+    return lax.fori_loop(0, _blocks(cells), add, activity).reshape(shape)
 
 
-def read(ties: Ties, activity: Array) -> Array:
+def read(network: Network, cells: ViewCells, activity: Array) -> Array:
     """K'Y: the activity [S, C] at the view cells."""
-    held = activity.reshape(-1).at[ties.index].get(mode="promise_in_bounds")
-    return jnp.sum(ties.weight * held, axis=0)
+
+    def fetch(k: Array, held: Array) -> Array:
+        ties = _tie_block(network, activity.shape, cells, k)
+        there = activity.reshape(-1).at[ties.index].get(mode="promise_in_bounds")
+        part = jnp.sum(ties.weight * there, axis=0)
+        return lax.dynamic_update_slice_in_dim(held, part, k * part.shape[-1], axis=-1)
+
+    return lax.fori_loop(0, _blocks(cells), fetch, jnp.zeros(cells.used.shape, jnp.float32))
+
+
+def _tie_block(network: Network, shape: tuple[int, ...], cells: ViewCells, k: Array) -> Ties:
+    """Ties of block k. They are the result of a branch, always taken, because XLA would otherwise compute
+    each one amid the scatter that needs it, which takes twice the time."""
+    none = jnp.zeros((8, *_rows(k, cells.x).shape), jnp.int32)
+    block = jax.tree.map(partial(_rows, k), cells)
+    untied = Ties(none, none.astype(jnp.float32))
+    return lax.cond(k >= 0, partial(tie, network, shape), lambda _: untied, block)
+
+
+def _blocks(cells: ViewCells) -> Array:
+    """int32 number of blocks of rows up to the last view cell in use."""
+    row = jnp.arange(1, cells.used.shape[-1] + 1, dtype=jnp.int32)
+    size = math.gcd(len(row), ROWS)
+    return (jnp.max(jnp.where(cells.used > 0, row, 0)) + (size - 1)) // size
+
+
+def _rows(k: Array, rows: Array) -> Array:
+    """Block k of rows [..., C]."""
+    size = math.gcd(rows.shape[-1], ROWS)
+    return lax.dynamic_slice_in_dim(rows, k * size, size, axis=-1)
 
 
 def excite(network: Network, activity: Array) -> Array:

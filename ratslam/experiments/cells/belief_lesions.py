@@ -84,7 +84,7 @@ def permuted_together(seed: int) -> Functions:
 
     def tie_moved(network: Network, shape: tuple[int, ...], cells: ViewCells) -> Ties:
         ties = tie(network, shape, cells)
-        return ties._replace(index=jnp.asarray(_order(seed, shape))[ties.index])
+        return ties._replace(index=jnp.asarray(_order(seed, shape), jnp.int32)[ties.index])
 
     def excite_moved(network: Network, activity: Array) -> Array:
         order = _order(seed, activity.shape)

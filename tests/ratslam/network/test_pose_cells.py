@@ -41,8 +41,8 @@ def predict(case, poses=None, motion=None):
 
 
 tie = jax.jit(pose_cells.tie, static_argnums=(0, 1))
-drive = jax.jit(pose_cells.drive, static_argnums=0)
-read, integrate_path = jax.jit(pose_cells.read), jax.jit(pose_cells.integrate_path)
+drive = jax.jit(pose_cells.drive, static_argnums=(0, 1))
+read, integrate_path = jax.jit(pose_cells.read, static_argnums=0), jax.jit(pose_cells.integrate_path)
 excite = jax.jit(pose_cells.excite, static_argnums=0)
 activity_at = jax.jit(pose_cells.activity_at, static_argnums=0)
 
@@ -53,11 +53,11 @@ activity_at = jax.jit(pose_cells.activity_at, static_argnums=0)
 @given(seeds)
 def test_what_view_cells_drive_and_what_they_read_are_adjoint(seed):
     case, stream = random_case(seed), np.random.default_rng(seed)
-    ties = tie(case.network, case.shape, cells_at(case.poses, case.used))
+    cells = cells_at(case.poses, case.used)
     mass = stream.random(case.used.shape).astype(np.float32)
     activity = stream.random(case.shape).astype(np.float32)
-    given_to = np.sum(np.asarray(drive(case.shape, ties, mass), float) * activity)
-    got_from = np.sum(np.asarray(read(ties, jnp.asarray(activity)), float) * mass)
+    given_to = np.sum(np.asarray(drive(case.network, case.shape, cells, mass), float) * activity)
+    got_from = np.sum(np.asarray(read(case.network, cells, jnp.asarray(activity)), float) * mass)
     assert given_to == pytest.approx(got_from, rel=ROUNDING)
 
 
@@ -82,11 +82,7 @@ def test_places_whole_laps_apart_share_their_cells(seed, x, y, turns):
     case = random_case(seed)
     laps = np.array([x * case.shape[2] * CELL, y * case.shape[1] * CELL, turns * 2 * np.pi])
     here, there = (
-        drive(
-            case.shape,
-            tie(case.network, case.shape, cells_at(poses, case.used)),
-            case.belief.mass,
-        )
+        drive(case.network, case.shape, cells_at(poses, case.used), case.belief.mass)
         for poses in (case.poses, case.poses + laps)
     )
     assert np.abs(here - there).max() < ROUNDING
@@ -211,10 +207,10 @@ def test_a_packet_is_not_blurred_by_any_motion(seed, step):
     motion = np.array(step) * [CELL, CELL, 1]
     for pose, whole in ((on_cell, 1.0), (between, None)):
         belief = held(network, shape, [[pose]], [[1.0]])
-        rest = read(tie(network, shape, cells_at([[pose]])), belief.activity)
+        rest = read(network, cells_at([[pose]]), belief.activity)
         there = cells_at([[compose(np.array(pose), motion)]])
         moved = integrate_path(there, jnp.asarray(motion))
-        found = read(tie(network, shape, moved), belief.activity)
+        found = read(network, moved, belief.activity)
         assert float(found[0, 0]) == pytest.approx(whole or float(rest[0, 0]), abs=1e-4)
         prior, lost = predictor(network)(belief, there, jnp.asarray(motion))
         assert float(prior[0, 0]) > 0.9
@@ -376,3 +372,22 @@ def test_at_the_start_all_is_novelty():
     assert not np.asarray(found).any()
     assert float(lost) == 0
     assert jax.tree.map(jnp.shape, belief) == jax.tree.map(jnp.shape, silent((12, 11, 11), (3, 5)))
+
+
+@pytest.mark.parametrize("rows", [1, 255, 256, 257, 600])
+def test_rows_are_joined_in_blocks_up_to_the_last_in_use(rows):
+    """However many rows there is room for, and wherever the last one in use is."""
+    network, shape, stream = network_of(), (36, 21, 21), np.random.default_rng(rows)
+    poses = stream.uniform(-1, 1, (1, 1024, 3))
+    mass = stream.random((1, 1024)).astype(np.float32)
+    used = np.arange(1024)[None] < rows
+    whole = drive(network, shape, cells_at(poses, used), jnp.asarray(mass))
+    alone = drive(network, shape, cells_at(poses[:, :rows], used[:, :rows]), jnp.asarray(mass[:, :rows]))
+    assert float(whole.sum()) == pytest.approx(mass[used].sum(), rel=1e-5)
+    assert np.abs(whole - alone).max() < ROUNDING
+    held_there = read(network, cells_at(poses, used), whole)
+    assert (
+        np.abs(held_there[:, :rows] - read(network, cells_at(poses[:, :rows], used[:, :rows]), alone)).max()
+        < ROUNDING
+    )
+    assert not held_there[:, rows:].any()
