@@ -140,7 +140,8 @@ def draw_measured(
         if given.any():
             where, paper = np.flatnonzero(given), quantity.paper[given]
             axes.hlines(paper, where - 0.42, where + 0.42, color=INK, lw=1.1, ls=_DOTS, label="paper")
-        axes.set_xticks(range(len(conditions)), conditions, rotation=20, ha="right")
+        names = [name.replace(", ", ",\n") for name in conditions]
+        axes.set_xticks(range(len(conditions)), names, rotation=55, ha="right", rotation_mode="anchor")
         axes.set_xlim(-0.6, len(conditions) - 0.4)
         if quantity.log:
             axes.set_yscale("log")

@@ -165,17 +165,19 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
 
 def _render_mazes(protocol: Protocol, rows: Rows) -> list[str]:
     """ARR and ARCR of each maze beside the paper's, and the parts of EM."""
-    lines = [f"{'Each maze':<58}{'paper':>8}" + "".join(f"{LABELS[quantity]:>15}" for quantity in BY_MAZE)]
+    shown = [row for row in rows if row.key[1] in protocol.methods and row.key[2] == "none"]
+    names = [f"  {row.key[0]}, {row.key[1]}, seed {row.seed}" for row in shown]
+    width = max(map(len, names), default=0) + 2
+    lines = [_line("Each maze", width, "paper", [LABELS[quantity] for quantity in BY_MAZE], 15)]
     for condition in protocol.conditions:
         paper = protocol.paper.get((condition.name, "arr"), np.nan)
         for method in protocol.methods:
             alike, of = 0, 0
-            for row in rows:
-                if row.key == (condition.name, method, "none"):
-                    name, of = f"  {condition.name}, {method}, seed {row.seed}", of + 1
-                    alike += abs(row.values["arr"] - paper) < ALIKE
-                    cells = "".join(f"{_cell(column([row], row.key, quantity)):>15}" for quantity in BY_MAZE)
-                    lines.append(f"{name:<58}{'-' if np.isnan(paper) else f'{paper:.4g}':>8}{cells}")
+            for name, row in zip(names, shown, strict=True):
+                if row.key[:2] == (condition.name, method):
+                    cells = [_cell(column([row], row.key, quantity)) for quantity in BY_MAZE]
+                    lines.append(_line(name, width, _cell(np.array([paper])), cells, 15))
+                    alike, of = alike + (abs(row.values["arr"] - paper) < ALIKE), of + 1
             if of and np.isfinite(paper):
                 lines.append(f"    ARR within {ALIKE} of the paper's: {alike} of {of}")
     return lines
