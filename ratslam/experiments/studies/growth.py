@@ -82,7 +82,7 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> GrowthStudy:
     if lengths := plan.lengths("known ground"):
         tasks.append(GrowthTask("known ground", _with_laps(config, lengths[-1]), lengths))
     if lengths := plan.lengths("new ground"):
-        tasks.append(GrowthTask("new ground", _with_new_ground(config, lengths[-1]), lengths))
+        tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths))
     if not tasks:
         raise InputError("--preset growth", "no session", "known_ground or new_ground above 0 steps")
     return GrowthStudy(f"{path.stem}-growth", tasks)
@@ -103,7 +103,7 @@ def _with_laps(config: RunConfig, steps: int) -> RunConfig:
     return found
 
 
-def _with_new_ground(config: RunConfig, steps: int) -> RunConfig:
+def with_new_ground(config: RunConfig, steps: int) -> RunConfig:
     """The configuration in the largest maze, on a random route that enters no cell twice, of at least so many
     steps."""
     assert config.simulation is not None

@@ -29,6 +29,7 @@ from evaluation.metrics.statistics import wilson_interval
 from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.experiments.studies.executor import run_tasks
+from ratslam.experiments.studies.growth import with_new_ground
 from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
@@ -59,13 +60,15 @@ HALL = {"mechanics": {"baseline": HALL_BASELINE.model_dump()}}
 
 
 class TouchRow(NamedTuple):
-    """A row: label, settings `simulation`, `touch` and `keyframes` of its sessions, and their number."""
+    """A row: label, settings `simulation`, `touch` and `keyframes` of its sessions, their number, and if they
+    enter no cell twice, their whisks."""
 
     label: str
     simulation: dict[str, Any] = {}  # noqa: RUF012
     touch: dict[str, Any] = {}  # noqa: RUF012
     keyframes: dict[str, Any] = {}  # noqa: RUF012
     sessions: int = 12
+    new_ground: int = 0
 
 
 def _head(*radii: float) -> dict[str, Any]:
@@ -110,6 +113,7 @@ ROWS = {
         {"may_be_carried": True},
         sessions=5,
     ),
+    "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
     "3 dead": TouchRow("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),
@@ -279,11 +283,12 @@ def run_and_measure(
 
 def task_config(task: TouchTask) -> RunConfig:
     """The configuration of a session."""
-    _, simulation, touch, keyframes, _ = ROWS[task.row]
+    _, simulation, touch, keyframes, _, new_ground = ROWS[task.row]
     maze = {"seed": task.maze} | simulation.get("maze", {})
     simulation = simulation | {"seed": task.seed, "maze": maze}
     parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
-    return RunConfig.model_validate(parts)
+    config = RunConfig.model_validate(parts)
+    return with_new_ground(config, new_ground) if new_ground else config
 
 
 def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:

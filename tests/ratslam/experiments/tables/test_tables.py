@@ -57,6 +57,15 @@ def test_touch_rows_are_valid_configurations(row):
     assert touch.task_config(touch.TouchTask(row, 31103)).simulation.seed == 3
 
 
+def test_new_ground_enters_no_cell_twice_and_differs_by_maze():
+    tasks = (touch.TouchTask("new ground", maze) for maze in (31103, 31104))
+    one, other = (touch.task_config(task).simulation for task in tasks)
+    cells = one.path.cells
+    assert len(set(cells)) == len(cells) > 50
+    assert cells != other.path.cells
+    assert one.maze.seed == 31103
+
+
 @pytest.mark.parametrize("row", grid.ROWS)
 def test_grid_rows_are_valid_configurations(row):
     assert grid.task_config(grid.GridTask("A", row, 9003)).create_simulation.seed == 9003
