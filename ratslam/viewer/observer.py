@@ -112,7 +112,7 @@ class Viewer:
         self._writer.join(1.0)
         if code == GONE:
             return  # the process has said so
-        if late or self.dropped:
+        if late or self.dropped or code:
             lost = f", {self.dropped} of {self.offered} messages were dropped" if self.dropped else ""
             state = "did not keep up" if late or code == 0 else "ended early"
             tell(f"warning: the view at {self.target} {state}{lost}; the results are complete")
