@@ -286,6 +286,15 @@ def add_tables(tables: Commands) -> None:
     health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
+    closures = add(
+        "closures", _closures_lines, "fits and tests the log-odds of closure sequences", "--sessions 2"
+    )
+    add_count(closures, "--sessions", 6, "sessions per row")
+    add_workers(closures)
+    closures.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder for closure_judge.json, the weights"
+    )
+    closures.set_defaults(file="closure_judge.json")
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
@@ -376,6 +385,12 @@ def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from ratslam.experiments.tables.health import health_table
 
     return health_table(arguments.sessions, arguments.workers)
+
+
+def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from ratslam.experiments.tables.closures import closures_table
+
+    return closures_table(arguments.sessions, arguments.workers, arguments.output)
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:

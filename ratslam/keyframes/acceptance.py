@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.keyframes.closure_judge import AT_ONCE, judge_sequences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, solved_map
@@ -48,7 +51,8 @@ def believe(graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> N
 
 
 class AcceptByEvidence(Acceptance):
-    """A sequence is accepted by its evidence less what the map's covariance says against it."""
+    """A sequence is accepted by its evidence less what the map's covariance says against it; where sequences
+    are selected later, only if it is likely to be true."""
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         if log.verdict(sequence) != Verdict.OPEN:
@@ -58,7 +62,15 @@ class AcceptByEvidence(Acceptance):
         test = verify_sequence(graph, log, sequence, candidate)
         if test is None:
             return False
-        log.judge(sequence, Verdict.ACCEPTED if test.fits else Verdict.OPEN, test.distance)
+        fits = test.fits and self._is_likely(graph, log, sequence)
+        log.judge(sequence, Verdict.ACCEPTED if fits else Verdict.OPEN, test.distance)
         if test.breaks_odometry:
             break_odometry(graph, log, sequence)
         return log.verdict(sequence) == Verdict.ACCEPTED
+
+    def _is_likely(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
+        """False if a sequence should wait for the next selection."""
+        if not graph.config.select_every:
+            return True
+        (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence]))
+        return not odds < AT_ONCE

@@ -74,6 +74,8 @@ class Appearance(Checkpointed, ABC):
 
     NEAR_SHARE: ClassVar = NEAR
     """See `Ground.near_share`."""
+    JUDGED: ClassVar = False
+    """Whether `ratslam.keyframes.closure_judge` has weights for such views."""
 
     def present(self) -> Appearance:
         """The present metric with the views so far, whose memory is shared: a view never changes."""
@@ -130,7 +132,7 @@ class Appearance(Checkpointed, ABC):
         keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
 
     @abstractmethod
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """[n] log-odds that the view of a keyframe and that of each of the keyframes `others` [n] are of one
         place, nat; `reversed` as in `misfit`."""
 
@@ -208,7 +210,7 @@ class ViewAppearance(Appearance):
         """Mean absolute differences."""
         return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
 
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """1 for equal views, 0 at the scale of errors, which few different places stay below."""
         return 1 - self.unlikeness(frame, others, reversed) / max(self._scale[1], 1e-300)
 
@@ -239,6 +241,7 @@ class WhiskerAppearance(Appearance):
     """
 
     VALUES = ("_likeness",)
+    JUDGED = True
 
     def __init__(
         self,
@@ -297,7 +300,7 @@ class WhiskerAppearance(Appearance):
             self._likeness, pixels.group, self._level.rows, pixels.opposite, frames, others, reversed
         )
 
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return -self._temper * self.unlikeness(frame, others, reversed)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
@@ -416,7 +419,7 @@ class LabelAppearance(Appearance):
     def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return (self._label.rows[others] != self._label.rows[frame]).astype(float)
 
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return SAME_ID_LOG_ODDS * (1 - 2 * self.unlikeness(frame, others, reversed))
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:

@@ -273,7 +273,8 @@ class KeyframeGraph(Checkpointed):
         scales = (config.robust_per_score, config.robust_least, config.robust_most)
         closures = log.closures(self.sector_angle, variance, scales)
         if config.select_every:
-            worth = 2 * np.maximum(closures.score - config.sequence_cost, 1.0) / closures.size
+            spare = (closures.score - config.sequence_cost) * closures.credit
+            worth = 2 * np.maximum(spare, 1.0) / closures.size
             # A sequence must be able to cost more than its evidence, else it could never be refused.
             return closures._replace(
                 scale=worth, cost_limit=np.maximum(config.closure_cost_limit, 1.5 * worth)
@@ -292,10 +293,10 @@ class KeyframeGraph(Checkpointed):
         taken = self.taken.rows
         return self.appearance.unlikeness(taken[frame], taken[others], reversed)
 
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """See `Appearance.log_odds`."""
         taken = self.taken.rows
-        return self.appearance.log_odds(int(taken[frame]), taken[others], reversed)
+        return self.appearance.log_odds(taken[frame], taken[others], reversed)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """See `Appearance.misfit`."""

@@ -121,6 +121,10 @@ class ClosureLog(Checkpointed):
         own = np.bincount(rows[known, 3], self._evidence.rows[known, 1], self.sequences)
         return own + self._merged.rows[:, 0]
 
+    def credit(self) -> np.ndarray:
+        """[R] share of its evidence that counts for every sequence: the odds that it is true, at most 1."""
+        return np.exp(np.nan_to_num(np.minimum(self._log_odds.rows, 0.0)))
+
     def sizes(self) -> np.ndarray:
         """[R] number of candidates of every sequence, merged ones included."""
         return self.left() + self._merged.rows[:, 1].astype(np.int64)
@@ -190,9 +194,9 @@ class ClosureLog(Checkpointed):
         return sequences
 
     def take_verdicts(self, other: ClosureLog, sequences: np.ndarray) -> None:
-        """Takes over the verdicts and weights of sequences [n] from a log of the same candidates."""
-        self._verdict.rows[sequences] = other._verdict.rows[sequences]
-        self._weight.rows[sequences] = other._weight.rows[sequences]
+        """Takes over what is known of sequences [n] from a log of the same candidates."""
+        for name in ("_verdict", "_weight", "_log_odds"):
+            getattr(self, name).rows[sequences] = getattr(other, name).rows[sequences]
         self._lines = None
 
     def follow(self, other: ClosureLog) -> None:
@@ -232,6 +236,10 @@ class ClosureLog(Checkpointed):
         accepted = self._verdict.rows[sequences] == Verdict.ACCEPTED
         before = np.where(accepted, self._log_odds.rows[sequences], np.nan)
         self._log_odds.rows[sequences] = np.fmax(before, log_odds)
+
+    def rate_anew(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
+        """Stores the log odds [n] that sequences [n] are true, NaN where nothing is said."""
+        self._log_odds.rows[sequences] = log_odds
 
     def strike(self, frame: int, spare: int) -> None:
         """Strikes out the candidates of accepted sequences other than `spare` at `frame` and later, because
@@ -308,6 +316,7 @@ class ClosureLog(Checkpointed):
             scale=np.clip(scales[0] * score, *scales[1:]),
             score=score + merged[:, 0],
             size=np.bincount(sequence, minlength=len(sequences)) + merged[:, 1],
+            credit=self.credit()[sequences],
         )
 
     def weigh(self, weights: np.ndarray) -> None:

@@ -25,6 +25,7 @@ from ratslam.keyframes.appearance import Appearance
 from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.calibration import calibration_from_views
 from ratslam.keyframes.carried_solution import is_retraced, kept_part, retraced_solution
+from ratslam.keyframes.closure_judge import doubt_of_closures
 from ratslam.keyframes.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.keyframes.experiences import ExperienceChange, Experiences
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -138,7 +139,8 @@ class KeyframeMap(Checkpointed, Map):
 
     def final_doubt(self) -> float:
         if self._worse is None:
-            self._worse = worse_than_odometry(self.keyframes(), self.solution())
+            graph, found = self.keyframes(), self.solution()
+            self._worse = float(np.fmax(worse_than_odometry(graph, found), doubt_of_closures(graph, *found)))
         return self._worse
 
     def online_trajectory(self) -> np.ndarray:

@@ -26,6 +26,7 @@ import numpy as np
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.calibration import HeadingNoise, learn_heading_noise, log_posterior, starting_noise
 from ratslam.keyframes.claimed_revisits import claims_cost
+from ratslam.keyframes.closure_judge import judge_anew
 from ratslam.keyframes.closure_selection import (
     ACCEPTED_WEIGHT,
     FINE,
@@ -142,6 +143,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
         return None
     place = graph.placement(log).place
     sequences = np.flatnonzero(candidates)
+    judge_anew(graph, log, sequences)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
     earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
     cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
@@ -167,8 +169,8 @@ def selection_case(
     for sequence in sequences.tolist():
         log.judge(sequence, Verdict.ACCEPTED)
     problem, (first, last) = graph.problem(log, cut), log.spans()[sequences].T
-    scores, views_cost = log.scores()[sequences], partial(claims_cost, graph)
-    return SelectionProblem(problem, scores, first, last, views_cost, place)
+    evidence = np.maximum(log.scores() * log.credit(), 1.0)[sequences]
+    return SelectionProblem(problem, evidence, first, last, partial(claims_cost, graph), place)
 
 
 def selected_map(

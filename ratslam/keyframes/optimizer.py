@@ -70,8 +70,9 @@ class LoopClosures(NamedTuple):
     Attributes:
         i, j: [M] keyframes. turn: [M] rad. sequence: [M] the sequence of each, 0..R - 1. variance: [3] of
             each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score, size: [R]
-            evidence and number of closures, those of merged keyframes included. cost_limit: largest
-            chi-square of one closure, [R] by sequence or one for all.
+            evidence and number of closures, those of merged keyframes included. credit: [R] share of that
+            evidence that counts. cost_limit: largest chi-square of one closure, [R] by sequence or one for
+            all.
     """
 
     i: np.ndarray
@@ -82,6 +83,7 @@ class LoopClosures(NamedTuple):
     scale: np.ndarray
     score: np.ndarray = np.zeros(0)
     size: np.ndarray = np.zeros(0)
+    credit: np.ndarray = np.zeros(0)
     cost_limit: np.ndarray | float = np.inf
 
 

@@ -35,6 +35,7 @@ class SignedAppearance(Appearance):
     """
 
     VALUES = ("_likeness",)
+    JUDGED = True
 
     def __init__(self, size: int) -> None:
         self._image = GrowableArray((size,), np.float64)
@@ -82,7 +83,7 @@ class SignedAppearance(Appearance):
         first = project(model, images[np.atleast_1d(frame)].T)
         return -log_odds(model, first, project(model, images[others].T))
 
-    def log_odds(self, frame: int, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return -self.unlikeness(frame, others, reversed)
 
     def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:

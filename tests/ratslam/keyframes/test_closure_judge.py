@@ -1,0 +1,175 @@
+"""The judge of closures: true sequences have higher log-odds than false ones, and what they are worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.core.growable_array import GrowableArray
+from ratslam.keyframes.acceptance import AcceptByEvidence
+from ratslam.keyframes.appearance import LabelAppearance
+from ratslam.keyframes.closure_judge import (
+    AT_ONCE,
+    BEYOND,
+    KINDS,
+    doubt_of_closures,
+    judge_anew,
+    judge_sequences,
+    log_odds,
+    sequence_evidence,
+    session_share,
+    shipped_weights,
+)
+from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.keyframes.loop_closures import Candidate, Verdict
+from ratslam.keyframes.map_health import DOUBTED
+from tests.ratslam.keyframes.lap_cases import APPEARANCES, CLEAN, FALSE, LAP, LAPS, closed, drive, solution
+
+FIRST = np.array([0])
+
+
+class JudgedLabels(LabelAppearance):
+    """Ids that count as views with weights."""
+
+    JUDGED = True
+
+
+@pytest.fixture(params=APPEARANCES)
+def graph(request):
+    return drive(APPEARANCES[request.param]())
+
+
+@pytest.fixture
+def judged():
+    """Laps that are judged, and their clean map."""
+    graph = drive(JudgedLabels())
+    found = solution(graph, closed(CLEAN))
+    graph.pose.rows[:] = found.fit.poses
+    return graph, found.log
+
+
+def cuts(graph, *frames):
+    """Breaks of the odometry before keyframes."""
+    cut = GrowableArray((), np.int64)
+    cut.replace(np.full(graph.count, -1))
+    cut.rows[list(frames)] = 0
+    return cut
+
+
+def evidence(graph, log, sequences, cut=None, after=BEYOND):
+    fit = solution(graph, log).fit
+    return sequence_evidence(graph, fit, log, cuts(graph) if cut is None else cut, sequences, after)
+
+
+def test_a_true_sequence_has_higher_log_odds_than_a_false_one_of_the_same_map(graph):
+    log = closed([*CLEAN, FALSE[1]])
+    odds = log_odds(evidence(graph, log, np.arange(log.sequences)), shipped_weights())
+    assert odds[:-1].min() > odds[-1]
+
+
+def test_nothing_is_said_of_a_sequence_across_a_break_of_the_odometry(graph):
+    log, every = closed(CLEAN), np.arange(len(CLEAN))
+    odds = log_odds(evidence(graph, log, every, cuts(graph, 2 * LAP + 30)), shipped_weights())
+    assert list(np.isnan(odds)) == [False, False, True, False]  # before the third and the fourth sequence
+    apart = cuts(graph, *(LAP * np.arange(1, LAPS)))
+    assert np.isnan(log_odds(evidence(graph, log, every, apart), shipped_weights())).all()
+
+
+def test_views_count_up_to_a_break_and_no_further_than_the_keyframes_known(graph):
+    log = closed(CLEAN)
+    whole = evidence(graph, log, FIRST).counts.sum(axis=(2, 3))
+    ended = evidence(graph, log, FIRST, after=0).counts.sum(axis=(2, 3))
+    assert np.all(ended < whole)
+    assert np.all(whole <= 20 + 2 * BEYOND)
+    cut = evidence(graph, log, FIRST, cuts(graph, LAP + 30)).counts.sum(axis=(2, 3))
+    assert np.all((ended <= cut) & (cut < whole))
+
+
+def test_judging_changes_nothing_and_gives_the_same_bits_again(judged):
+    graph, log = judged
+    before = {**graph.arrays(), **log.arrays()}
+    first, again = (
+        judge_sequences(graph, graph.fit(), log, graph.cut, np.arange(len(CLEAN))) for _ in range(2)
+    )
+    assert first.tobytes() == again.tobytes()
+    after = {**graph.arrays(), **log.arrays()}
+    assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
+
+
+def test_of_views_without_weights_and_of_a_robot_that_may_be_carried_nothing_is_said(judged):
+    graph, log = judged
+    assert np.isfinite(judge_sequences(graph, graph.fit(), log, graph.cut, FIRST)).all()
+    graph.config = graph.config.model_copy(update={"may_be_carried": True})
+    assert np.isnan(judge_sequences(graph, graph.fit(), log, graph.cut, FIRST)).all()
+    graph = drive(LabelAppearance())
+    assert np.isnan(judge_sequences(graph, graph.fit(), closed(CLEAN), graph.cut, FIRST)).all()
+
+
+def test_a_map_of_false_closures_is_doubted_and_one_of_true_ones_is_not(judged):
+    graph, _ = judged
+    clean, false = (solution(graph, closed(sequences)) for sequences in (CLEAN, FALSE))
+    assert doubt_of_closures(graph, *clean) < 0.1
+    assert doubt_of_closures(graph, *false) > DOUBTED
+    assert np.isnan(doubt_of_closures(graph, *solution(graph, closed([]))))
+
+
+def test_less_likely_than_not_a_sequence_counts_by_its_odds(judged):
+    _, log = judged
+    log.rate_anew(np.arange(3), np.array([np.log(0.25), 2.0, np.nan]))
+    assert log.credit() == pytest.approx([0.25, 1.0, 1.0, 1.0])
+
+
+def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
+    graph, log = judged
+    log.rate_anew(np.arange(len(CLEAN)), np.full(len(CLEAN), -7.0))
+    gone = np.zeros(graph.count, bool)
+    gone[log.members(1)[0, 0]] = True
+    log.merge(gone, np.arange(graph.count), np.zeros(graph.count, bool))
+    judge_anew(graph, log, np.arange(len(CLEAN)))
+    odds = np.array([log.table()[log.table()[:, 5] == k, 9][0] for k in range(len(CLEAN))])
+    assert list(odds == -7.0) == [False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("select_every", "odds", "accepted"), [(50, -1.0, False), (50, 3.0, True), (0, -1.0, True)]
+)
+def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_every, odds, accepted):
+    graph, _ = judged
+    graph.config = KeyframeMapConfig(select_every=select_every)
+    judge = "ratslam.keyframes.acceptance.judge_sequences"
+    monkeypatch.setattr(judge, lambda *map_and_sequences: np.array([odds]))
+    log = closed(CLEAN[:1])
+    log.judge(0, Verdict.OPEN)
+    frame, match, shift, _ = log.members(0)[-1].tolist()
+    assert AcceptByEvidence().judge(graph, log, 0, Candidate(frame, match, shift, 0.9, 3.0)) is accepted
+    assert (odds >= AT_ONCE) == accepted or not select_every
+
+
+ODDS = st.lists(st.floats(-8, 8), min_size=1, max_size=60).map(np.array)
+
+
+@given(ODDS, st.floats(0.05, 0.95), st.floats(0.1, 3.0))
+def test_more_likely_sequences_add_to_the_share_and_so_to_all(odds, usual, more):
+    added = session_share(odds, usual)
+    assert np.isfinite(added)
+    assert session_share(odds + more, usual) >= added
+
+
+@given(st.floats(0.05, 0.95))
+def test_the_usual_share_adds_nothing(usual):
+    assert session_share(np.zeros(0), usual) == pytest.approx(0.0, abs=1e-9)
+    share = np.full(1000, np.log(usual / (1 - usual)))
+    assert session_share(share, usual) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_shipped_weights_are_those_of_the_features(judged):
+    graph, log = judged
+    weights = shipped_weights()
+    assert weights.of.shape == evidence(graph, log, FIRST).features().shape[1:]
+    assert 0 < weights.share < 1
+    assert np.all(weights.of[:, 1:3] >= 0)  # what odometry foretells is never evidence against it
+    within, around = weights.of[:, 3 : 3 + KINDS], weights.of[:, 3 + KINDS :]
+    assert np.all(within[:, :2] <= 0)
+    assert np.all(around[:, :2] <= 0)  # nor are contradictions evidence for it
