@@ -238,6 +238,16 @@ def test_a_drawing_process_that_fails_at_once_is_said_once(capfd):
     assert "ended early" in error
 
 
+def test_a_drawing_process_that_fails_after_the_last_message_is_said(capfd):
+    reads_all = "import sys; sys.stdin.buffer.read(); raise SystemExit(1)"
+    with Viewer("nowhere", command=[sys.executable, "-c", reads_all]) as viewer:
+        viewer.update((bytes(100),), None)
+    assert viewer.dropped == 0
+    error = capfd.readouterr().err
+    assert error.count("warning:") == 1
+    assert "ended early; the results are complete" in error
+
+
 @pytest.mark.parametrize(
     ("target", "words"),
     [
