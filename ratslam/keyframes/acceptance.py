@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.keyframes.closure_judge import AT_ONCE, judge_sequences
+from ratslam.keyframes.closure_judge import AT_ONCE, judge_newest
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, solved_map
@@ -72,5 +70,4 @@ class AcceptByEvidence(Acceptance):
         """False if a sequence should wait for the next selection."""
         if not graph.config.select_every:
             return True
-        (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence]))
-        return not odds < AT_ONCE
+        return not judge_newest(graph, log, sequence) < AT_ONCE

@@ -128,6 +128,13 @@ def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> 
     log.rate_anew(whole, odds + max(more, 0.0))
 
 
+def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
+    """Log-odds of a sequence of the present map, with the share of true ones at the last `judge_anew`."""
+    (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
+    known = log.log_odds()[np.isfinite(log.log_odds())]
+    return float(odds + max(share_added(known, shipped_weights().share), 0.0))
+
+
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
     1 / (1 + exp(sum of L)); NaN if nothing is said of any."""
@@ -139,11 +146,16 @@ def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: G
 def session_share(odds: np.ndarray, usual: float) -> float:
     """What the share of true sequences in a session adds to their log-odds [n], which are right where it is
     the usual one (Saerens et al. 2002)."""
-    added, prior = 0.0, np.log(usual / (1 - usual))
+    added = 0.0
     for _ in range(ROUNDS):
-        share = (expit(odds + added).sum() + PRIOR_COUNT * usual) / (len(odds) + PRIOR_COUNT)
-        added = float(np.log(share / (1 - share)) - prior)
+        added = share_added(odds + added, usual)
     return added
+
+
+def share_added(odds: np.ndarray, usual: float) -> float:
+    """The same from log-odds [n] to which it is added already."""
+    share = (expit(odds).sum() + PRIOR_COUNT * usual) / (len(odds) + PRIOR_COUNT)
+    return float(np.log(share / (1 - share)) - np.log(usual / (1 - usual)))
 
 
 def sequence_evidence(

@@ -237,6 +237,10 @@ class ClosureLog(Checkpointed):
         before = np.where(accepted, self._log_odds.rows[sequences], np.nan)
         self._log_odds.rows[sequences] = np.fmax(before, log_odds)
 
+    def log_odds(self) -> np.ndarray:
+        """[R] log odds that every sequence is true, NaN where it is not judged."""
+        return self._log_odds.rows
+
     def rate_anew(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
         """Stores the log odds [n] that sequences [n] are true, NaN where nothing is said."""
         self._log_odds.rows[sequences] = log_odds

@@ -16,10 +16,12 @@ from ratslam.keyframes.closure_judge import (
     KINDS,
     doubt_of_closures,
     judge_anew,
+    judge_newest,
     judge_sequences,
     log_odds,
     sequence_evidence,
     session_share,
+    share_added,
     shipped_weights,
 )
 from ratslam.keyframes.config import KeyframeMapConfig
@@ -128,8 +130,7 @@ def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
     gone[log.members(1)[0, 0]] = True
     log.merge(gone, np.arange(graph.count), np.zeros(graph.count, bool))
     judge_anew(graph, log, np.arange(len(CLEAN)))
-    odds = np.array([log.table()[log.table()[:, 5] == k, 9][0] for k in range(len(CLEAN))])
-    assert list(odds == -7.0) == [False, True, False, False]
+    assert list(log.log_odds() == -7.0) == [False, True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -138,8 +139,8 @@ def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
 def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_every, odds, accepted):
     graph, _ = judged
     graph.config = KeyframeMapConfig(select_every=select_every)
-    judge = "ratslam.keyframes.acceptance.judge_sequences"
-    monkeypatch.setattr(judge, lambda *map_and_sequences: np.array([odds]))
+    judge = "ratslam.keyframes.acceptance.judge_newest"
+    monkeypatch.setattr(judge, lambda *map_and_sequence: odds)
     log = closed(CLEAN[:1])
     log.judge(0, Verdict.OPEN)
     frame, match, shift, _ = log.members(0)[-1].tolist()
@@ -155,6 +156,22 @@ def test_more_likely_sequences_add_to_the_share_and_so_to_all(odds, usual, more)
     added = session_share(odds, usual)
     assert np.isfinite(added)
     assert session_share(odds + more, usual) >= added
+
+
+@given(ODDS, st.floats(0.05, 0.95))
+def test_the_share_is_known_from_log_odds_that_hold_it(odds, usual):
+    added = session_share(odds, usual)
+    assert share_added(odds + added, usual) == pytest.approx(added, abs=1e-3)
+
+
+def test_the_newest_sequence_is_judged_with_the_share_of_the_others(judged):
+    graph, log = judged
+    alone = judge_newest(graph, log, 3)
+    assert alone == pytest.approx(judge_sequences(graph, graph.fit(), log, graph.cut, np.array([3]))[0])
+    log.rate_anew(np.arange(3), np.full(3, 5.0))
+    assert judge_newest(graph, log, 3) > alone
+    log.rate_anew(np.arange(3), np.full(3, -5.0))
+    assert judge_newest(graph, log, 3) == alone  # few true ones make none less likely
 
 
 @given(st.floats(0.05, 0.95))
