@@ -15,9 +15,11 @@ simulated sessions; `python -m ratslam reproduce tables closures` fits and tests
 those of independent views, because successive views are alike.
 
 Recall chooses a sequence because the views at the places that it claims are alike, which they may be by
-chance; the views around them are not chosen. So the evidence of recall counts e^L times where L is below 0
-(`ClosureLog.credit`). L of true sequences is small while a session is young: a sequence is weighed against
-the others with less evidence, not refused by L alone. The rule is ours.
+chance; the views around them are not chosen. So the evidence of recall counts less where L is low
+(`ClosureLog.credit`), a sequence that is not likely waits for a selection (`AT_ONCE`), and a map whose
+sequences are together likelier false than true is doubted. L of true sequences is small while a session is
+young, or where odometry is noisier than it was taken to be: a sequence is weighed against the others with
+less evidence, not refused by L alone. The rules are ours.
 """
 
 from __future__ import annotations

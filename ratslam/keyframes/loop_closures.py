@@ -22,6 +22,9 @@ CSV_COLUMNS = (
     "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
 )
 
+UNLIKELY = -1.5
+"""Log-odds below which the evidence of a sequence counts less; true ones of a young session, or of one whose
+odometry is noisier than foretold, reach it."""
 CONFIRMED_WEIGHT = 0.5
 """Robust weight above which a sequence confirms what it joins."""
 
@@ -122,8 +125,9 @@ class ClosureLog(Checkpointed):
         return own + self._merged.rows[:, 0]
 
     def credit(self) -> np.ndarray:
-        """[R] share of its evidence that counts for every sequence: the odds that it is true, at most 1."""
-        return np.exp(np.nan_to_num(np.minimum(self._log_odds.rows, 0.0)))
+        """[R] share of its evidence that counts for every sequence: 1 down to log-odds of `UNLIKELY`, below
+        them as the odds fall."""
+        return np.exp(np.nan_to_num(np.minimum(self._log_odds.rows - UNLIKELY, 0.0)))
 
     def sizes(self) -> np.ndarray:
         """[R] number of candidates of every sequence, merged ones included."""

@@ -25,7 +25,7 @@ from ratslam.keyframes.closure_judge import (
     shipped_weights,
 )
 from ratslam.keyframes.config import KeyframeMapConfig
-from ratslam.keyframes.loop_closures import Candidate, Verdict
+from ratslam.keyframes.loop_closures import UNLIKELY, Candidate, Verdict
 from ratslam.keyframes.map_health import DOUBTED
 from tests.ratslam.keyframes.lap_cases import APPEARANCES, CLEAN, FALSE, LAP, LAPS, closed, drive, solution
 
@@ -117,9 +117,9 @@ def test_a_map_of_false_closures_is_doubted_and_one_of_true_ones_is_not(judged):
     assert np.isnan(doubt_of_closures(graph, *solution(graph, closed([]))))
 
 
-def test_less_likely_than_not_a_sequence_counts_by_its_odds(judged):
+def test_an_unlikely_sequence_counts_less_as_its_odds_fall(judged):
     _, log = judged
-    log.rate_anew(np.arange(3), np.array([np.log(0.25), 2.0, np.nan]))
+    log.rate_anew(np.arange(3), np.array([UNLIKELY + np.log(0.25), UNLIKELY / 2, np.nan]))
     assert log.credit() == pytest.approx([0.25, 1.0, 1.0, 1.0])
 
 
