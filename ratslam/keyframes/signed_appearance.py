@@ -35,7 +35,6 @@ class SignedAppearance(Appearance):
     """
 
     VALUES = ("_likeness",)
-    JUDGED = True
 
     def __init__(self, size: int) -> None:
         self._image = GrowableArray((size,), np.float64)
