@@ -122,19 +122,18 @@ def judge_sequences(
 
 
 def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
-    """Stores the log-odds of sequences [n] of the present map in the log, with the share of true ones where
-    it is above the usual one; of those that have lost keyframes by merging the former ones stay."""
+    """Stores the log-odds of sequences [n] of the present map in the log, with the share of true ones; of
+    those that have lost keyframes by merging the former ones stay."""
     whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
     odds = judge_sequences(graph, graph.fit(), log, graph.cut, whole)
-    more = session_share(odds[np.isfinite(odds)], shipped_weights().share)
-    log.rate_anew(whole, odds + max(more, 0.0))
+    log.rate_anew(whole, odds + session_share(odds[np.isfinite(odds)], shipped_weights().share))
 
 
 def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
     """Log-odds of a sequence of the present map, with the share of true ones at the last `judge_anew`."""
     (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
     known = log.log_odds()[np.isfinite(log.log_odds())]
-    return float(odds + max(share_added(known, shipped_weights().share), 0.0))
+    return float(odds + share_added(known, shipped_weights().share))
 
 
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
@@ -147,7 +146,7 @@ def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: G
 
 def session_share(odds: np.ndarray, usual: float) -> float:
     """What the share of true sequences in a session adds to their log-odds [n], which are right where it is
-    the usual one (Saerens et al. 2002)."""
+    the usual one (Saerens et al. 2002); at least 0: a young session has few true ones and needs them."""
     added = 0.0
     for _ in range(ROUNDS):
         added = share_added(odds + added, usual)
@@ -157,7 +156,7 @@ def session_share(odds: np.ndarray, usual: float) -> float:
 def share_added(odds: np.ndarray, usual: float) -> float:
     """The same from log-odds [n] to which it is added already."""
     share = (expit(odds).sum() + PRIOR_COUNT * usual) / (len(odds) + PRIOR_COUNT)
-    return float(np.log(share / (1 - share)) - np.log(usual / (1 - usual)))
+    return max(float(np.log(share / (1 - share)) - np.log(usual / (1 - usual))), 0.0)
 
 
 def sequence_evidence(
