@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -29,7 +28,7 @@ from ratslam.keyframes.signed_appearance import SignedAppearance
 from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
-from ratslam.recall import filter, mirror
+from ratslam.recall import filter
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
 from ratslam.recall.filter import RecallResult
@@ -70,13 +69,11 @@ class RecallState(NamedTuple):
     """State of the kernel.
 
     Attributes:
-        belief: of the pose cells. control: that of the control (`ratslam.recall.mirror`); None where no rule
-            reads it. memory: of the view cells. packet: [3] the place of the heaviest packet, m, m, rad.
-        health: running share of revisits (keyframes near older ones on the map) whose view fits.
+        belief: of the pose cells. memory: of the view cells. packet: [3] the place of the heaviest packet, m,
+            m, rad. health: running share of revisits (keyframes near older ones on the map) whose view fits.
     """
 
     belief: Belief
-    control: Belief | None
     memory: Memory
     packet: Array
     health: Array
@@ -86,9 +83,8 @@ class RecallEvidence(NamedTuple):
     """Evidence of one step.
 
     Attributes:
-        keyframe to background: see `RecallResult`. mirror_match to mirror_log_ratio: the same of the control
-            (`ratslam.recall.mirror`); with whiskers those of no match. certainty: activity of all pose cells.
-            packet, health: see `RecallState`. outcome: a `RecallOutcome`, int32.
+        keyframe to background: see `RecallResult`. certainty: activity of all pose cells. packet, health: see
+            `RecallState`. outcome: a `RecallOutcome`, int32.
     """
 
     keyframe: Scalar
@@ -100,10 +96,6 @@ class RecallEvidence(NamedTuple):
     novelty: Scalar
     view_fits: Scalar
     background: Array
-    mirror_match: Scalar
-    mirror_shift: Scalar
-    mirror_posterior: Scalar
-    mirror_log_ratio: Scalar
     certainty: Scalar
     packet: Array
     health: Scalar
@@ -117,7 +109,7 @@ class RecallBackend(Backend):
         view_shape: (R, C, K) of the observations' views. dtype: of all floating state but the belief.
     """
 
-    SINGLE = ("belief", "control")
+    SINGLE = ("belief",)
 
     def __init__(
         self,
@@ -146,7 +138,6 @@ class RecallBackend(Backend):
         del key
         return RecallState(
             self.no_belief(capacity),
-            self.no_belief(capacity) if self._reads_control else None,
             recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
             jnp.zeros(3, self.dtype),
             jnp.ones((), self.dtype),
@@ -160,7 +151,8 @@ class RecallBackend(Backend):
         """The same memory in larger arrays."""
         empty = self.init(None, capacity)
         grown = state._replace(memory=enlarge(state.memory, empty.memory))
-        return self._each(grown, lambda one: one._replace(mass=enlarge(one.mass, empty.belief.mass)))
+        mass = enlarge(state.belief.mass, empty.belief.mass)
+        return grown._replace(belief=state.belief._replace(mass=mass))
 
     def sides(self, feedback: MapFeedback) -> tuple[int, ...]:
         """Cells of the network along x and y. Pieces of a map need no cells for the ground between them."""
@@ -170,36 +162,32 @@ class RecallBackend(Backend):
 
     def cover(self, state: RecallState, sides: tuple[int, ...]) -> RecallState:
         """The state with more pose cells, silent until they are driven at the map's feedback."""
-        return self._each(state, lambda one: pose_cells.cover(self.network, one, sides))
+        return state._replace(belief=pose_cells.cover(self.network, state.belief, sides))
 
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
         """View cells take over the poses, bias and scales of the map, and pose cells follow them: what the
         last view said of each keyframe is driven again at its new pose."""
         memory = recall_memory.apply_map_feedback(state.memory, feedback)
-        return self._each(state._replace(memory=memory), partial(self._anchor, memory))
+        return state._replace(memory=memory, belief=self._anchor(memory, state.belief))
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
         memory = recall_memory.merge_rows(state.memory, merged)
-        return self._each(state._replace(memory=memory), lambda one: pose_cells.merge_rows(one, merged))
+        return state._replace(memory=memory, belief=pose_cells.merge_rows(state.belief, merged))
 
     def begin_piece(self, state: RecallState) -> RecallState:
         """All is novelty; the health is that of the start."""
         memory, health = recall_memory.begin_piece(state.memory), jnp.ones((), self.dtype)
-        return self._each(
-            state._replace(memory=memory, health=health), lambda one: jax.tree.map(jnp.zeros_like, one)
-        )
+        belief = jax.tree.map(jnp.zeros_like, state.belief)
+        return state._replace(belief=belief, memory=memory, health=health)
 
     def crop_rows(self, state: RecallState, cropped: CroppedRows) -> RecallState:
         """The memory of a cropped map; mass of keyframes that are gone becomes novelty."""
         memory = crop_rows(state.memory, cropped)
-
-        def crop(belief: Belief) -> Belief:
-            belief = pose_cells.lose_rows(belief, cropped.left)
-            # Anchored at once, because the next feedback may be steps away.
-            return self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows))
-
-        return self._each(state._replace(memory=memory), crop)
+        belief = pose_cells.lose_rows(state.belief, cropped.left)
+        # Anchored at once, because the next feedback may be steps away.
+        belief = self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows))
+        return state._replace(belief=belief, memory=memory)
 
     def state_of(self, map: Map, capacity: int) -> RecallState:
         """The keyframes of a map and the motion since the newest; all of the belief is novelty."""
@@ -219,11 +207,6 @@ class RecallBackend(Backend):
         cells = filter.view_cells(self.recall, memory)
         return pose_cells.anchor(self.network, belief, cells, belief.mass)
 
-    def _each(self, state: RecallState, change: Callable[[Belief], Belief]) -> RecallState:
-        """The state with a changed belief and a changed control."""
-        control = state.control and change(state.control)
-        return state._replace(belief=change(state.belief), control=control)
-
     def kernel(
         self, state: RecallState, observation: Observation
     ) -> tuple[RecallState, Estimate, RecallEvidence]:
@@ -238,11 +221,10 @@ class RecallBackend(Backend):
         travelled = jnp.hypot(odometry.dx, odometry.dy)
         onwards = compose(state.packet, correct_heading(moved, travelled, memory.bias, memory.turn_error))
         state = state._replace(memory=memory)
-        none = filter.empty_result(memory)
-        state, result, control = _once(
+        state, result = _once(
             is_keyframe,
             lambda found: self._recall(found[0], features, observation.label),
-            (state, none, _candidate(none)),
+            (state, filter.empty_result(memory)),
         )
         memory = state.memory
         packet = jnp.where(result.match >= 0, filter.place_of(memory, result), onwards)
@@ -261,8 +243,8 @@ class RecallBackend(Backend):
             lost=health < self.config.min_fit_share,
         )
         evidence = RecallEvidence(
-            **result._asdict(), **control._asdict(), certainty=jnp.sum(state.belief.activity), packet=packet,
-            health=health, outcome=outcome,
+            **result._asdict(), certainty=jnp.sum(state.belief.activity), packet=packet, health=health,
+            outcome=outcome,
         )  # fmt: skip
         return state._replace(memory=memory, packet=packet, health=health), estimate, evidence
 
@@ -315,12 +297,8 @@ class RecallBackend(Backend):
 
     def _acceptance(self) -> Callable[[KeyframeGraph], Acceptance]:
         """By odds for views and given ids; with whiskers, sequences are selected against each other."""
-        return AcceptByOdds if self._reads_control else lambda graph: AcceptByEvidence()
-
-    @property
-    def _reads_control(self) -> bool:
-        """Whether the rule of acceptance reads the control."""
-        return self.pixels is None and self.ablation.verify
+        views = self.pixels is None and self.ablation.verify
+        return AcceptByOdds if views else lambda graph: AcceptByEvidence()
 
     def _appearance(self) -> Appearance:
         if self.labels:
@@ -364,32 +342,15 @@ class RecallBackend(Backend):
             return stored_image(flat, alive)
         return pixel_levels(flat, alive.astype(self.dtype)).astype(jnp.int32)
 
-    def _recall(
-        self, state: RecallState, view: Array, label: Array
-    ) -> tuple[RecallState, RecallResult, mirror.Candidate]:
-        """Recognises and stores a view; where the rule of acceptance reads the control, this looks for its
-        mirror image."""
-        memory, motion = state.memory, recall_memory.corrected_motion(state.memory)
-
-        def recognise(memory: Memory, look: mirror.Look) -> tuple[Memory, Belief, RecallResult]:
-            memory, likelihood = self.likelihood(self.recall, memory, look.view, look.label)
-            belief, result = filter.recognise(
-                self.recall, self.network, memory, look.belief, look.motion, likelihood, look.local
-            )
-            return memory, belief, result
-
-        look = mirror.Look(state.belief, motion, view, label, jnp.asarray(self.recall.local, self.dtype))
-        if state.control is None:
-            memory, belief, result = recognise(memory, look)
-            memory = recall_memory.store_keyframe(memory, view, label)
-            state = state._replace(belief=belief, memory=memory)
-            return state, result, _candidate(filter.empty_result(memory))
-        both = mirror.both_looks(memory, look, state.control, self._mirrored(view, memory.angle))
-        _, (beliefs, results) = lax.scan(lambda _, one: (None, recognise(memory, one)[1:]), None, both)
-        own, control = (jax.tree.map(lambda x, k=k: x[k], beliefs) for k in (0, 1))
-        result, false = (jax.tree.map(lambda x, k=k: x[k], results) for k in (0, 1))
+    def _recall(self, state: RecallState, view: Array, label: Array) -> tuple[RecallState, RecallResult]:
+        """Recognises and stores a view."""
+        motion = recall_memory.corrected_motion(state.memory)
+        memory, likelihood = self.likelihood(self.recall, state.memory, view, label)
+        belief, result = filter.recognise(
+            self.recall, self.network, memory, state.belief, motion, likelihood, self.recall.local
+        )
         memory = recall_memory.store_keyframe(memory, view, label)
-        return state._replace(belief=own, control=control, memory=memory), result, _candidate(false)
+        return state._replace(belief=belief, memory=memory), result
 
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
@@ -404,9 +365,6 @@ class RecallBackend(Backend):
             return touch_likelihood(config, memory, view, self.pixels)
         return memory, view_likelihood(config, self.cell, memory, view)
 
-    def _mirrored(self, view: Array, angle: Array) -> Array:
-        return mirror.mirror_view(view, self.view_shape, angle) if len(view) else view
-
 
 def _once(condition: Array, change: Callable[[T], T], value: T) -> T:
     """The changed value, or the value. A loop of at most one round, because XLA copies the results of a
@@ -416,7 +374,3 @@ def _once(condition: Array, change: Callable[[T], T], value: T) -> T:
         return jnp.bool_(False), change(carry[1])
 
     return lax.while_loop(lambda carry: carry[0], once, (condition, value))[1]
-
-
-def _candidate(result: RecallResult) -> mirror.Candidate:
-    return mirror.Candidate(result.match, result.shift, result.posterior, result.log_ratio)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.keyframes.closure_judge import AT_ONCE, judge_newest
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -18,9 +17,6 @@ from ratslam.keyframes.verification import verify_sequence
 
 class Acceptance(Checkpointed, ABC):
     """A rule with what it has learned."""
-
-    def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
-        """Takes note of the newest keyframe's evidence."""
 
     def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         """Takes over the heading bias that the views show."""

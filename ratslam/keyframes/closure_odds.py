@@ -1,30 +1,25 @@
 """Acceptance of closure sequences by the odds that they are true.
 
-The odds of a sequence are those of its score under the null of this session (`null_model`), times how well
-odometry foretold its place among all others (`odometry_scan`), with the calibration for which the other
-sequences vote (`calibration_vote`); or how well the map foretells it where its covariance is narrow enough to
-be linear. The rule is ours.
+The odds of a sequence are those of its score among the false sequences of this session (the null), times how
+well odometry foretold its place among all others (`OdometryScan`), with the calibration for which the other
+sequences vote (`vote`); or how well the map foretells it where its covariance is narrow enough to be linear.
+The rules are ours.
 
-The vote of all closure sequences on the calibration of the odometry, before any of them is accepted.
-
-Each sequence is true with some odds, and if it is true it favours the heading biases and turn errors with
-which odometry leads to its place. A false sequence favours none that others favour as well. Nothing is
-linearised.
-
-The null: scores of closure sequences that are false by construction, and the odds that follow.
-
-The control of recall recognises places in mirror images (`ratslam.recall.mirror`). Its sequences have the
-number and the scores of the false sequences of this world. A sequence of score s is then true with odds
+**The null.** Nobody says which sequences are false, but all have odds: each of the others counts as false by
+the probability that it is, as judged last, and as false while it is not judged. A sequence of score s is then
+true with odds
 
     true sequences per score / false sequences per score = (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t)
 
-with n sequences of the control above s0 and their mean excess t. The method is ours.
+with n false sequences above s0 and their mean excess t. This is expectation maximisation (Dempster, Laird and
+Rubin 1977) of a mixture, one step whenever odds are asked for.
 
-How well raw odometry foretold a place among all others, for every possible calibration of the odometry.
-
-A heading bias or an error of the turns bends a long path so much that no linearisation holds. So the path is
-dead reckoned anew for each point of a grid of both. Its covariance is that of the odometry's noise alone,
-summed over the steps between two keyframes. The method is ours.
+**The vote** on the calibration of the odometry is held before any sequence is accepted. Each is true with
+some odds, and if it is true it favours the heading biases and turn errors with which odometry leads to its
+place. A false sequence favours none that others favour as well. Nothing is linearised: a heading bias or an
+error of the turns bends a long path so much that no linearisation holds. So the path is dead reckoned anew
+for each point of a grid of both. Its covariance is that of the odometry's noise alone, summed over the steps
+between two keyframes.
 """
 
 from __future__ import annotations
@@ -32,8 +27,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
-from ratslam.core.backend import Evidence
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.acceptance import Acceptance, believe
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
@@ -42,8 +37,7 @@ from ratslam.keyframes.map_solution import MapSolution, cheapest_map, solved_map
 from ratslam.keyframes.odometry_breaks import break_odometry
 from ratslam.keyframes.optimizer import CalibrationPrior
 from ratslam.keyframes.piece_joining import spans_beginnings, spans_pieces
-from ratslam.keyframes.verification import continues_sequence, judge_by_map
-from ratslam.recall.mirror import MIRROR
+from ratslam.keyframes.verification import judge_by_map
 
 MIN_LOG_ODDS = 2.3
 """Least log odds of an accepted sequence: 10 to 1."""
@@ -144,30 +138,14 @@ class Ballot(NamedTuple):
 
 
 class AcceptByOdds(Acceptance):
-    """Learns the null from the control's sequences, and judges all open sequences."""
+    """Judges all open sequences."""
 
     VALUES = ("_views_prior",)
-    PARTS = ("_control",)
 
     def __init__(self, graph: KeyframeGraph) -> None:
-        self._control = ClosureLog()
         self._scan = OdometryScan(graph)
         self._log_ratio = GrowableArray((len(self._scan.grid),), np.float64)  # by calibration
         self._views_prior = graph.prior
-
-    def observe(self, graph: KeyframeGraph, evidence: Evidence) -> None:
-        """Logs a candidate of the control."""
-        posterior = float(evidence.mirror_posterior)
-        if int(evidence.mirror_match) < 0 or posterior <= graph.config.candidate_posterior:
-            return
-        candidate = Candidate(
-            graph.count - 1,
-            int(evidence.mirror_match),
-            int(evidence.mirror_shift),
-            posterior,
-            float(evidence.mirror_log_ratio),
-        )
-        self._control.add(candidate, continues_sequence(graph, self._control, candidate, MIRROR))
 
     def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
         self._views_prior = prior
@@ -219,9 +197,9 @@ class AcceptByOdds(Acceptance):
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
         confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
-        false = ~finds_true_places(self._control, log, graph.config.max_gap)
-        null = estimate_null(self._control.scores()[false], graph.count)
-        score_odds = log_odds(log.scores()[sequences], null, float(confirmed.sum()))
+        false = 1 - expit(np.nan_to_num(log.log_odds(), nan=-np.inf))
+        null = estimate_null(log.scores(), false, graph.count)
+        score_odds = log_odds(log.scores(), null, float(confirmed.sum()))[sequences]
         least = graph.config.bias_least / graph.cell
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
         return Ballot(sequences, score_odds, vote(grid, self._views_prior, ratios, score_odds, least))
@@ -278,29 +256,12 @@ def is_round(length: int) -> bool:
     return length == length >> (low := max(length.bit_length() - 3, 0)) << low
 
 
-def finds_true_places(control: ClosureLog, log: ClosureLog, gap: int) -> np.ndarray:
-    """[R] bool, sequences of the control that find what accepted sequences find: the place is its own mirror
-    image, so they do not show that different places are mistaken for each other.
-
-    Args:
-        gap: largest difference between the matches of one keyframe, keyframes.
-    """
-    accepted = log.table()[log.accepted_rows(), :2].astype(int)
-    table = control.table()
-    table = table[table[:, 5] >= 0]
-    frame, match, sequence = table[:, 0].astype(int), table[:, 1].astype(int), table[:, 5].astype(int)
-    found = np.full(max(frame.max(initial=0), accepted[:, 0].max(initial=0)) + 1, -gap - 1)
-    found[accepted[:, 0]] = accepted[:, 1]
-    same = np.abs(match - found[frame]) <= gap
-    return 2 * np.bincount(sequence, same, control.sequences) > control.sizes()
-
-
 LEAST_SCORE = 2.0
-"""Least score, s0, of the sequences of the control that count."""
+"""Least score, s0, of a false sequence that counts."""
 PRIOR_COUNT, PRIOR_EXCESS = 5.0, 7.0
 """The prior of the excess: the number of sequences that it counts as, and their mean excess over s0."""
 PRIOR_SEQUENCES, PRIOR_KEYFRAMES = 3.0, 16.0
-"""The gamma prior of the rate of the control's sequences: as many sequences in as many keyframes."""
+"""The gamma prior of the rate of false sequences: as many sequences in as many keyframes."""
 TRUE_MEAN = 30.0
 """Mean score, m, of true sequences."""
 MIN_TRUE = 5.0
@@ -308,30 +269,36 @@ MIN_TRUE = 5.0
 
 
 class NullModel(NamedTuple):
-    """Number of false sequences above `LEAST_SCORE`, and their mean excess over it."""
+    """Number of false sequences above `LEAST_SCORE`, and their mean excess over it, [R] for each of R
+    sequences."""
 
-    number: float
-    excess: float
-
-
-def estimate_null(scores: np.ndarray, keyframes: int) -> NullModel:
-    """The null from the scores [n] of the control's sequences in a session of so many keyframes."""
-    above = scores[scores >= LEAST_SCORE] - LEAST_SCORE
-    excess = (above.sum() + PRIOR_COUNT * PRIOR_EXCESS) / (len(above) + PRIOR_COUNT)
-    keyframes = max(keyframes, 1)
-    number = keyframes * (PRIOR_SEQUENCES + len(above)) / (PRIOR_KEYFRAMES + keyframes)
-    # A control stronger than true sequences would let evidence lower the odds.
-    return NullModel(number, min(float(excess), TRUE_MEAN))
+    number: np.ndarray
+    excess: np.ndarray
 
 
-def log_odds(score: np.ndarray, null: NullModel, true_count: float) -> np.ndarray:
-    """[n] log odds that sequences with these scores [n] are true, before the map is asked.
+def estimate_null(scores: np.ndarray, false: np.ndarray, keyframes: int) -> NullModel:
+    """The null of each of R sequences in a session of so many keyframes, from the others.
+
+    Args:
+        scores: [R]. false: [R] probabilities that they are false.
+    """
+    counted = np.where(scores >= LEAST_SCORE, false, 0.0)
+    above = counted * (scores - LEAST_SCORE)
+    others, excess = counted.sum() - counted, above.sum() - above
+    mean = (excess + PRIOR_COUNT * PRIOR_EXCESS) / (others + PRIOR_COUNT)
+    number = keyframes * (PRIOR_SEQUENCES + others) / (PRIOR_KEYFRAMES + keyframes)
+    # False sequences stronger than true ones would let evidence lower the odds.
+    return NullModel(number, np.minimum(mean, TRUE_MEAN))
+
+
+def log_odds(scores: np.ndarray, null: NullModel, true_count: float) -> np.ndarray:
+    """[R] log odds that sequences with these scores [R] are true, before the map is asked.
 
     Args:
         true_count: number of true sequences known so far.
     """
-    true = np.log(max(true_count, MIN_TRUE) / TRUE_MEAN) - score / TRUE_MEAN
-    return true - np.log(null.number / null.excess) + (score - LEAST_SCORE) / null.excess
+    true = np.log(max(true_count, MIN_TRUE) / TRUE_MEAN) - scores / TRUE_MEAN
+    return true - np.log(null.number / null.excess) + (scores - LEAST_SCORE) / null.excess
 
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241

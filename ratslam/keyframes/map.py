@@ -246,7 +246,6 @@ class KeyframeMap(Checkpointed, Map):
         change = self._experiences.stay()
         if int(evidence.keyframe) >= 0:
             self._append(observation)
-            self._acceptance.observe(self._graph, evidence)
             self._learn(evidence)
             matched = self._consider(evidence)
             self._select()

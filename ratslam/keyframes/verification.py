@@ -11,8 +11,6 @@ from ratslam.keyframes.loop_closures import Candidate, ClosureLog
 from ratslam.keyframes.optimizer import MapCovariance
 from tactile.base.se2 import between, compose, wrap
 
-UNCHANGED = np.ones(3)
-
 
 class SequenceTest(NamedTuple):
     """Result of a test of a closure sequence against the map.
@@ -47,19 +45,12 @@ def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
     return compose(pose, np.array([0.0, 0.0, angle]))
 
 
-def continues_sequence(
-    graph: KeyframeGraph, log: ClosureLog, candidate: Candidate, factors: np.ndarray = UNCHANGED
-) -> bool:
-    """Whether the candidate moved from the newest one by the same motion in memory as in odometry.
-
-    Args:
-        factors: [3] applied to the motion of the odometry, see `recall.mirror.MIRROR`.
-    """
+def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+    """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
     last, config = log.last(), graph.config
     if last is None or candidate.keyframe - last.keyframe > config.max_gap:
         return False
     remembered, travelled = _motions(graph, last, candidate)
-    travelled = travelled * factors
     apart = np.hypot(*(remembered - travelled)[:2])
     allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
     near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)

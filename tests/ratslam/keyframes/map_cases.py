@@ -1,4 +1,4 @@
-"""A wide circle that a robot drives again and again, with recall and its control written by hand."""
+"""A wide circle that a robot drives again and again, with recall written by hand."""
 
 from __future__ import annotations
 
@@ -31,10 +31,6 @@ class Seen(NamedTuple):
     shift: int
     posterior: float
     log_ratio: float
-    mirror_match: int
-    mirror_shift: int
-    mirror_posterior: float
-    mirror_log_ratio: float
 
 
 class Pose(NamedTuple):
@@ -50,13 +46,13 @@ def new_map(acceptance=AcceptByOdds, find_tie=no_tie, **settings):
     return KeyframeMap(config, CELL, LabelAppearance(), acceptance, find_tie=find_tie)
 
 
-def drive(map, recalled, control=None, first=0, last=LAP + 60, bias=BIAS):
-    """Drives keyframes first to last - 1. recalled, control: match and log ratio by keyframe."""
+def drive(map, recalled, first=0, last=LAP + 60, bias=BIAS):
+    """Drives keyframes first to last - 1. recalled: match and log ratio by keyframe."""
     turn = 2 * np.pi / LAP - bias * STEP
     for k in range(first, last):
-        (match, ratio), (other, false) = recalled.get(k, NOTHING), (control or {}).get(k, NOTHING)
+        match, ratio = recalled.get(k, NOTHING)
         odometry = Odometry(STEP, 0.0, turn, 0.1) if k else Odometry(0.0, 0.0, 0.0, 0.1)
-        seen = Seen(k, match, 0, float(match >= 0), ratio, other, 0, float(other >= 0), false)
+        seen = Seen(k, match, 0, float(match >= 0), ratio)
         map.update(observation(odometry, None, view_shape=(1, 1, 1), label=k), Pose(-1, -1, 0), seen)
     return map
 
