@@ -59,6 +59,8 @@ STRAY = 1.0
 """Distance of a followed pose from odometry, in reaches, from which it is compared with fewer keyframes."""
 CONTROLS = 48
 """Number of keyframes elsewhere with which a view is compared."""
+BOX = 16
+"""Keyframes of a way that are compared with the ground in the box around them."""
 PRIOR_COUNT = 6.0
 """Number of sequences that the usual share of true ones counts as."""
 ROUNDS = 50
@@ -320,8 +322,17 @@ def _pairs(
     """
     capacity, count = 256, 0
     found = np.empty((3, capacity), np.int64)
+    close, around = np.empty(len(ground), np.int64), 0  # those in the box around a part of the path
     for k in range(len(path)):
-        for g in range(len(ground)):
+        if k % BOX == 0:
+            part, around = path[k : k + BOX], 0
+            left, right = part[:, 0].min() - reach, part[:, 0].max() + reach
+            below, above = part[:, 1].min() - reach, part[:, 1].max() + reach
+            for g in range(len(ground)):
+                if left <= ground[g, 0] <= right and below <= ground[g, 1] <= above:
+                    close[around] = g
+                    around += 1
+        for g in close[:around]:
             x, y = ground[g, 0] - path[k, 0], ground[g, 1] - path[k, 1]
             if x * x + y * y >= reach * reach or abs(g - k - lag) <= guard:
                 continue
@@ -432,7 +443,7 @@ def _follow(
             far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
             turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
             best, off, on_way = _look(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
-            closest = _distance_to_ground(pose, near.ground, frame + lag, guard)
+            seen = pose.copy()
             if best > 0:
                 share, again = place / (place + spread[0]), heading / (heading + spread[2])
                 pose[0] += share * off[0]
@@ -441,7 +452,7 @@ def _follow(
                 place, heading = place * (1 - share), heading * (1 - again)
             if on_way:
                 kinds[frame] = np.searchsorted(edges, best)
-            elif closest >= reach * reach:
+            elif _distance_to_ground(seen, near.ground, frame + lag, guard) >= reach * reach:
                 kinds[frame] = len(edges) + 2
             elif best < edges[0] and best > -np.inf:
                 kinds[frame] = 0
