@@ -160,7 +160,7 @@ def test_the_belief_in_rows_that_are_gone_is_novelty_at_once(seed: int) -> None:
     mass[:, :COUNT] = stream.dirichlet(np.ones(2 * COUNT + 1))[:-1].reshape(2, COUNT)
     belief = backend.no_belief(CAPACITY)._replace(mass=mass)
     belief = belief._replace(activity=np.full(belief.activity.shape, mass.sum() / belief.activity.size))
-    state = RecallState(belief, None, memory, np.zeros(3), np.ones(()))
+    state = RecallState(belief, memory, np.zeros(3), np.ones(()))
     after = backend.crop_rows(state, rows).belief
     count = int(inside.sum())
     np.testing.assert_allclose(np.asarray(after.mass)[:, :count], mass[:, :COUNT][:, inside])

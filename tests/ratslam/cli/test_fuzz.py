@@ -264,7 +264,7 @@ TOO_LARGE = {
     "score ids.csv": "ids.csv:11: experience id 1e+20",
     "run bomb.yaml": "anchor",
     f"run {SQUARE} --set session.reserve=4194304": "524288",
-    f"run {SQUARE} --set pose_cells.cells_xy=1001 --set pose_cells.cells_heading=144": "1024 MiB",
+    f"run {SQUARE} --set pose_cells.cells_xy=1001 --set pose_cells.cells_heading=288": "1024 MiB",
     f"run {SQUARE} --set recall.shifts=1000000": "4096",
     f"run {SQUARE} --set keyframes.max_gap=4294967296": "2147483647",
     f"run {SQUARE} --set pose_cells.cell_size=1e-300": "0, or a number of 1e-30 to 1e+15",

@@ -76,9 +76,7 @@ class Drive:
             match = self._recall(int(self.route.recalled[k]))
             self.rows = np.append(self.rows, k)
             x, y, turn = self.route.odometry[k].tolist()
-            seen = Seen(
-                len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k], NONE, 0, 0.0, 0.0
-            )
+            seen = Seen(len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k])
             reading = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=k)
             self.experiences.append(int(self.map.update(reading, Pose(-1, -1, 0), seen).place))
         return self

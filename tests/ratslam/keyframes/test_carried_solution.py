@@ -30,7 +30,7 @@ def driven(jump: int | None = JUMP, **settings) -> KeyframeMap:
         x, y, turn = (step[(at - 1) % LAP] * [SCALE, SCALE, 1.0]).tolist() if k else (0.0, 0.0, 0.0)
         ratio = 3.0 if LAP + 5 <= k < 2 * LAP else 1.7 if k >= COUNT - 8 else 0.0
         match = at % LAP if ratio else -1
-        seen = Seen(k, match, 0, float(match >= 0), ratio, -1, 0, 0.0, 0.0)
+        seen = Seen(k, match, 0, float(match >= 0), ratio)
         view = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=at % LAP)
         map.update(view, Pose(-1, -1, 0), seen)
     return map
