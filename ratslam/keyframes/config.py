@@ -68,7 +68,7 @@ class KeyframeMapConfig(Settings):
     """Least number of candidates of an accepted sequence."""
     min_score: PositiveFloat = 4.0
     """Whiskers: least evidence of an accepted sequence, after subtraction of half its squared Mahalanobis
-    distance from the map and of the log of the number of alternatives that the map allows."""
+    distance from the map."""
     max_distance: PositiveFloat = 12.0
     """Upper limit of that squared Mahalanobis distance."""
     gate_sd: PositiveFloat = 0.7

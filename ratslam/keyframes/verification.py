@@ -64,8 +64,8 @@ def verify_sequence(
     config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
     if length < config.min_length or score < config.min_score:
         return None
-    distance, chance = _distance(graph, log, candidate) if graph.ablation.verify else (0.0, 0.0)
-    fits = distance < config.max_distance and score - distance / 2 - chance >= config.min_score
+    distance = _distance(graph, log, candidate) if graph.ablation.verify else 0.0
+    fits = distance < config.max_distance and score - distance / 2 >= config.min_score
     carried = config.may_be_carried and not config.select_every  # selection places its own cuts
     broken = carried and length >= config.break_length and score >= config.break_score
     return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
@@ -123,33 +123,12 @@ def _agrees_with_whole(graph: KeyframeGraph, log: ClosureLog, candidate: Candida
     return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
 
 
-def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> tuple[float, float]:
-    """Distance of the candidate's claim from the map.
-
-    Returns:
-        the squared Mahalanobis distance, and the log of the number of alternatives (`_alternatives`).
-    """
+def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:
+    """Squared Mahalanobis distance of the candidate's claim from the map."""
     turn = -candidate.shift * graph.sector_angle
     pose = graph.pose.rows
     error = between(turn_on_spot(pose[candidate.match], turn), pose[candidate.keyframe])
     gate = graph.config.gate_sd * graph.cell
-    allowed = graph.map_covariance(log).relative(candidate.match, candidate.keyframe, turn)
     least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
-    allowed = allowed + least
-    alternatives = _alternatives(graph, candidate, turn, allowed[:2, :2], gate)
-    return float(error @ np.linalg.solve(allowed, error)), float(alternatives)
-
-
-def _alternatives(
-    graph: KeyframeGraph, candidate: Candidate, turn: float, allowed: np.ndarray, gate: float
-) -> float:
-    """Log of the ratio of keyframes in the region that the map allows to those around one place."""
-    pose = graph.pose.rows
-    old = pose[: candidate.keyframe - graph.guard]
-    origin = turn_on_spot(pose[candidate.match], turn)
-    centre = between(origin, pose[candidate.keyframe])[:2]
-    frames = between(origin, old)[:, :2]
-    apart = frames - centre
-    inside = np.exp(-np.einsum("na,ab,nb->n", apart, np.linalg.inv(allowed), apart) / 2).sum()
-    around = np.exp(-(frames**2).sum(axis=1) / (2 * gate**2)).sum()
-    return float(np.log(max(inside / max(around, 1.0), 1.0)))
+    allowed = graph.map_covariance(log).relative(candidate.match, candidate.keyframe, turn) + least
+    return float(error @ np.linalg.solve(allowed, error))
