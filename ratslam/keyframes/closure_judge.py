@@ -61,10 +61,6 @@ CONTROLS = 48
 """Number of keyframes elsewhere with which a view is compared."""
 BOX = 16
 """Keyframes of a way that are compared with the ground in the box around them."""
-PRIOR_COUNT = 6.0
-"""Number of sequences that the usual share of true ones counts as."""
-ROUNDS = 50
-"""Iterations of the share of true sequences."""
 
 
 class SequenceEvidence(NamedTuple):
@@ -88,24 +84,20 @@ class SequenceEvidence(NamedTuple):
         )
 
 
-class Weights(NamedTuple):
-    """Weights [2, 3 + 2 KINDS] over the map and over the older pass: a, w+, w-, w1, w2, nat; and the share of
-    true sequences in the sessions that they were fitted on."""
-
-    of: np.ndarray
-    share: float
-
-
 @cache
-def shipped_weights() -> Weights:
-    """The weights of whisker views."""
-    held = json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))
-    return Weights(np.array(held["weights"]), held["share"])
+def shipped_weights() -> np.ndarray:
+    """Weights [2, 3 + 2 KINDS] of whisker views, over the map and over the older pass: a, w+, w-, w1, w2,
+    nat."""
+    return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
 
 
-def log_odds(evidence: SequenceEvidence, weights: Weights) -> np.ndarray:
-    """[n] L; NaN where nothing is said."""
-    ways: np.ndarray = (evidence.features() * weights.of).sum(axis=2)
+def log_odds(evidence: SequenceEvidence, weights: np.ndarray) -> np.ndarray:
+    """[n] L; NaN where nothing is said.
+
+    Args:
+        weights: see `shipped_weights`.
+    """
+    ways: np.ndarray = (evidence.features() * weights).sum(axis=2)
     return ways.mean(axis=1)
 
 
@@ -124,18 +116,16 @@ def judge_sequences(
 
 
 def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
-    """Stores the log-odds of sequences [n] of the present map in the log, with the share of true ones; of
-    those that have lost keyframes by merging the former ones stay."""
+    """Stores the log-odds of sequences [n] of the present map in the log; of those that have lost keyframes
+    by merging the former ones stay."""
     whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
-    odds = judge_sequences(graph, graph.fit(), log, graph.cut, whole)
-    log.rate_anew(whole, odds + session_share(odds[np.isfinite(odds)], shipped_weights().share))
+    log.rate_anew(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
 
 
 def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
-    """Log-odds of a sequence of the present map, with the share of true ones at the last `judge_anew`."""
+    """Log-odds of a sequence of the present map."""
     (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
-    known = log.log_odds()[np.isfinite(log.log_odds())]
-    return float(odds + share_added(known, shipped_weights().share))
+    return float(odds)
 
 
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
@@ -144,21 +134,6 @@ def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: G
     accepted = np.flatnonzero((log.verdicts() == Verdict.ACCEPTED) & (log.left() > 0))
     odds = judge_sequences(graph, fit, log, cut, accepted)
     return float(expit(-np.nansum(odds - UNLIKELY))) if np.isfinite(odds).any() else np.nan
-
-
-def session_share(odds: np.ndarray, usual: float) -> float:
-    """What the share of true sequences in a session adds to their log-odds [n], which are right where it is
-    the usual one (Saerens et al. 2002); at least 0: a young session has few true ones and needs them."""
-    added = 0.0
-    for _ in range(ROUNDS):
-        added = share_added(odds + added, usual)
-    return added
-
-
-def share_added(odds: np.ndarray, usual: float) -> float:
-    """The same from log-odds [n] to which it is added already."""
-    share = (expit(odds).sum() + PRIOR_COUNT * usual) / (len(odds) + PRIOR_COUNT)
-    return max(float(np.log(share / (1 - share)) - np.log(usual / (1 - usual))), 0.0)
 
 
 def sequence_evidence(

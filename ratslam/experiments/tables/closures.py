@@ -31,7 +31,6 @@ from ratslam.keyframes.closure_judge import (
     KINDS,
     WEIGHTS,
     SequenceEvidence,
-    Weights,
     log_odds,
     sequence_evidence,
 )
@@ -79,7 +78,7 @@ class JudgedSession(NamedTuple):
 
 
 def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = None) -> Iterator[str]:
-    """The lines of the table, and the weights and the share of true sequences.
+    """The lines of the table, and the weights.
 
     Args:
         sessions: of each row. folder: gets the weights as a file to ship; None: no file.
@@ -94,8 +93,7 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
         yield _line(row, every[own], fitted[own])
     yield _line("all", every, fitted)
     weights = fit_weights(every)
-    shipped = {"share": round(weights.share, 3), "weights": np.round(weights.of, 3).tolist()}
-    text = json.dumps(shipped, indent=1)
+    text = json.dumps({"weights": np.round(weights, 3).tolist()}, indent=1)
     yield f"\n```json\n{text}\n```"
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -131,15 +129,14 @@ def judge_session(task: TouchTask) -> JudgedSession:
     )
 
 
-def fit_weights(sessions: Sequence[JudgedSession]) -> Weights:
-    """The weights of a logistic regression over the map, and of one over the older pass."""
+def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
+    """The weights [2, 3 + 2 KINDS] of a logistic regression over the map, and of one over the older pass."""
     versions = [(evidence, one.true) for one in sessions for evidence in one.known]
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
     once = 1 / 3  # a sequence counts once, however often it is judged
-    of = np.stack([_regress(features[known, way], true[known], once) for way in (0, 1)])
-    return Weights(of, float(np.clip(true[known].mean(), 0.01, 0.99)))
+    return np.stack([_regress(features[known, way], true[known], once) for way in (0, 1)])
 
 
 def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray:
@@ -174,7 +171,7 @@ def _are_true(
     return np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in sequences.tolist()], bool)
 
 
-def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[Weights]) -> str:
+def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndarray]) -> str:
     """A row of the table; each session with its own weights."""
     true, score, accepted = (np.concatenate([one[k] for one in sessions]) for k in range(3))
     odds, ended = (

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.acceptance import AcceptByEvidence
@@ -16,12 +14,9 @@ from ratslam.keyframes.closure_judge import (
     KINDS,
     doubt_of_closures,
     judge_anew,
-    judge_newest,
     judge_sequences,
     log_odds,
     sequence_evidence,
-    session_share,
-    share_added,
     shipped_weights,
 )
 from ratslam.keyframes.config import KeyframeMapConfig
@@ -148,45 +143,11 @@ def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_
     assert (odds >= AT_ONCE) == accepted or not select_every
 
 
-ODDS = st.lists(st.floats(-8, 8), min_size=1, max_size=60).map(np.array)
-
-
-@given(ODDS, st.floats(0.05, 0.95), st.floats(0.1, 3.0))
-def test_more_likely_sequences_add_to_the_share_and_so_to_all(odds, usual, more):
-    added = session_share(odds, usual)
-    assert np.isfinite(added)
-    assert session_share(odds + more, usual) >= added
-
-
-@given(ODDS, st.floats(0.05, 0.95))
-def test_the_share_is_known_from_log_odds_that_hold_it(odds, usual):
-    added = session_share(odds, usual)
-    assert share_added(odds + added, usual) == pytest.approx(added, abs=1e-3)
-
-
-def test_the_newest_sequence_is_judged_with_the_share_of_the_others(judged):
-    graph, log = judged
-    alone = judge_newest(graph, log, 3)
-    assert alone == pytest.approx(judge_sequences(graph, graph.fit(), log, graph.cut, np.array([3]))[0])
-    log.rate_anew(np.arange(3), np.full(3, 5.0))
-    assert judge_newest(graph, log, 3) > alone
-    log.rate_anew(np.arange(3), np.full(3, -5.0))
-    assert judge_newest(graph, log, 3) == alone  # few true ones make none less likely
-
-
-@given(st.floats(0.05, 0.95))
-def test_the_usual_share_adds_nothing(usual):
-    assert session_share(np.zeros(0), usual) == pytest.approx(0.0, abs=1e-9)
-    share = np.full(1000, np.log(usual / (1 - usual)))
-    assert session_share(share, usual) == pytest.approx(0.0, abs=1e-6)
-
-
 def test_shipped_weights_are_those_of_the_features(judged):
     graph, log = judged
     weights = shipped_weights()
-    assert weights.of.shape == evidence(graph, log, FIRST).features().shape[1:]
-    assert 0 < weights.share < 1
-    assert np.all(weights.of[:, 1:3] >= 0)  # what odometry foretells is never evidence against it
-    within, around = weights.of[:, 3 : 3 + KINDS], weights.of[:, 3 + KINDS :]
+    assert weights.shape == evidence(graph, log, FIRST).features().shape[1:]
+    assert np.all(weights[:, 1:3] >= 0)  # what odometry foretells is never evidence against it
+    within, around = weights[:, 3 : 3 + KINDS], weights[:, 3 + KINDS :]
     assert np.all(within[:, :2] <= 0)
     assert np.all(around[:, :2] <= 0)  # nor are contradictions evidence for it
