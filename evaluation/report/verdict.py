@@ -42,7 +42,7 @@ def judge_map(doubt: float, unjudged: str = NOT_JUDGED) -> Verdict:
         return Verdict("unjudged", "This map is the odometry", reason)
     worse, better = _percent(doubt), _percent(1 - doubt)
     if doubt > DOUBTED:
-        reason = f"It is {worse} likely worse than odometry, so the trajectory given is that of odometry."
+        reason = f"It is {worse} likely worse than odometry, so odometry is given, without closures."
         return Verdict("doubted", "Do not believe this map", reason)
     if doubt > CAUTION:
         reason = f"It is {better} likely no worse than odometry; that leaves {worse} that it is worse."

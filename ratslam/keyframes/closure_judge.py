@@ -37,7 +37,7 @@ from ratslam.alignment.ground import REACH, REACH_HEADING
 from ratslam.core.compiled import compiled
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import UNLIKELY, ClosureLog, Verdict
+from ratslam.keyframes.loop_closures import ClosureLog, Verdict
 from ratslam.keyframes.optimizer import MapFit
 from tactile.base.se2 import correct_heading, integrate, inverse, wrap
 
@@ -130,10 +130,10 @@ def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
 
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
-    1 / (1 + exp(S)), with the sum S of L from `UNLIKELY` on; NaN if nothing is said of any."""
+    1 / (1 + exp(S)), with the sum S of L; NaN if nothing is said of any."""
     accepted = np.flatnonzero((log.verdicts() == Verdict.ACCEPTED) & (log.left() > 0))
     odds = judge_sequences(graph, fit, log, cut, accepted)
-    return float(expit(-np.nansum(odds - UNLIKELY))) if np.isfinite(odds).any() else np.nan
+    return float(expit(-np.nansum(odds))) if np.isfinite(odds).any() else np.nan
 
 
 def sequence_evidence(

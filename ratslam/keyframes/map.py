@@ -35,7 +35,6 @@ from ratslam.keyframes.loop_closures import ClosureLog, Verdict, recalled_candid
 from ratslam.keyframes.map_files import map_files
 from ratslam.keyframes.map_health import DOUBTED, worse_than_odometry
 from ratslam.keyframes.map_solution import MapSolution, selected_solution, solved_map
-from ratslam.keyframes.optimizer import MapFit
 from ratslam.keyframes.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.keyframes.selection_worker import SelectionWorker
 from ratslam.keyframes.step_record import StepRecord, leading_to
@@ -122,7 +121,8 @@ class KeyframeMap(Checkpointed, Map):
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map, or by odometry where that is likely the better estimate."""
-        return self._steps.poses(self._best()) if self.final_doubt() > DOUBTED else self.map_trajectory()
+        given = self._given()
+        return self._steps.poses(given.fit, given.open_pieces(self.keyframes()))
 
     def map_trajectory(self) -> np.ndarray:
         """[T, 3] every step in the final map."""
@@ -152,8 +152,8 @@ class KeyframeMap(Checkpointed, Map):
         return self._steps.poses(fit._replace(poses=self.archive.poses(fit.poses)), open_)
 
     def closures(self) -> np.ndarray:
-        """[M, 2] steps of the keyframes joined by accepted loop closures."""
-        return self.keyframe_steps()[self.solution().log.accepted_pairs()]
+        """[M, 2] steps of the keyframes joined by accepted loop closures; none where odometry is given."""
+        return self.keyframe_steps()[self._given().log.accepted_pairs()]
 
     def judged_closures(self) -> np.ndarray:
         """[n, 3] see `Map`; candidates of merged keyframes are left out."""
@@ -166,11 +166,12 @@ class KeyframeMap(Checkpointed, Map):
 
     def keyframe_pieces(self) -> np.ndarray:
         """[N] the piece of each keyframe; those of odometry where that is given."""
-        return self.solution().pieces(self.keyframes(), doubted=self.final_doubt() > DOUBTED)
+        return self._given().pieces(self.keyframes())
 
     def candidates(self) -> np.ndarray:
-        """[n, 10] all candidates, of recall and then along a retraced map, see `ClosureLog.table`."""
-        return self.solution().log.table()
+        """[n, 10] all candidates, of recall and then along a retraced map, see `ClosureLog.table`; open where
+        odometry is given."""
+        return self._given().log.table()
 
     def covariance(self) -> np.ndarray:
         """[3, 3] covariance of the newest keyframe's pose in the frame of its piece's first (m, m, rad)."""
@@ -198,7 +199,7 @@ class KeyframeMap(Checkpointed, Map):
     def graph(self) -> networkx.DiGraph:
         """See `Experiences.graph`."""
         taken = self._graph.taken.rows
-        return self._experiences.graph(self._best().poses[taken], taken, self.keyframe_pieces()[taken])
+        return self._experiences.graph(self._given().fit.poses[taken], taken, self.keyframe_pieces()[taken])
 
     def edges(self) -> Edges:
         """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with their
@@ -357,11 +358,12 @@ class KeyframeMap(Checkpointed, Map):
         if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
             self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), self.log, graph.cut))
 
-    def _best(self) -> MapFit:
-        """The map's poses, or those of raw odometry where the map is doubted."""
+    def _given(self) -> MapSolution:
+        """The final map, or odometry without closures where that is doubted."""
+        graph, found = self.keyframes(), self.solution()
         if not self.final_doubt() > DOUBTED:
-            return self.solution().fit
-        return MapFit(self.keyframes().dead_reckoned(), 0.0, np.zeros(0))
+            return found
+        return self._by_odometry(found.without_closures(graph), graph)
 
     def _by_odometry(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
         """See `MapSolution.by_odometry`; graph: the keyframes of the solution."""

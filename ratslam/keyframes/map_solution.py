@@ -70,11 +70,16 @@ class MapSolution(NamedTuple):
         poses = graph.placement(self.log).place(self.fit.poses)
         return self._replace(fit=self.fit._replace(poses=poses))
 
-    def pieces(self, graph: KeyframeGraph, *, doubted: bool = False) -> np.ndarray:
-        """[N] the piece of each keyframe of a graph that is not merged; `doubted`: by odometry, without cuts
-        and closures."""
-        if doubted:
-            return number_pieces(graph.begins.rows, np.zeros((0, 2), int))
+    def without_closures(self, graph: KeyframeGraph) -> MapSolution:
+        """Odometry as it was read, without cuts; all accepted sequences are open."""
+        log, cut = self.log.copy(), deepcopy(self.cut)
+        for sequence in np.flatnonzero(log.verdicts() == Verdict.ACCEPTED).tolist():
+            log.judge(sequence, Verdict.OPEN)
+        cut.rows[:] = -1
+        return MapSolution(MapFit(graph.dead_reckoned(), 0.0, np.zeros(0)), log, cut)
+
+    def pieces(self, graph: KeyframeGraph) -> np.ndarray:
+        """[N] the piece of each keyframe of a graph that is not merged."""
         return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
 
     def open_pieces(self, graph: KeyframeGraph) -> np.ndarray:
