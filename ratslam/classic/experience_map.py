@@ -19,7 +19,7 @@ from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action, Estimate
-from ratslam.pose_graph import Edges, geman_mcclure, huber, least_squares, no_kernel
+from ratslam.pose_graph import Edges, GrowingGraph, geman_mcclure, huber, least_squares, no_kernel
 from ratslam.pose_graph.io import write_g2o, write_json
 from tactile.base.config import Settings
 from tactile.base.se2 import between, compose, inverse
@@ -119,6 +119,7 @@ class ExperienceMap(Checkpointed, Map):
         self._odometry = GrowableArray((3,), np.float64)  # of each step, NaN where it is not known
         self._reached = GrowableArray((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
+        self._growing = GrowingGraph()
         self._current = -1
         self._travel = travel_from_node(0.0)
 
@@ -283,9 +284,11 @@ class ExperienceMap(Checkpointed, Map):
                 "huber": huber(solver.scale),
                 "geman_mcclure": geman_mcclure(solver.scale**2),
             }
+            poses, edges = self._pose.rows, self.edges()
             solution = least_squares(
-                self._pose.rows, self.edges(), kernel=kernels[solver.kernel], robust=self._closure.rows
-            )
+                poses, edges, kernel=kernels[solver.kernel], robust=self._closure.rows,
+                equations=self._growing.equations(len(poses), edges),
+            )  # fmt: skip
             self._pose.rows[:] = solution.poses
 
     def _relax(self) -> None:
@@ -307,3 +310,4 @@ class ExperienceMap(Checkpointed, Map):
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._link_of = {(int(a), int(b)): k for k, (a, b) in enumerate(self._ends.rows)}
+        self._growing = GrowingGraph()

@@ -1,11 +1,12 @@
-"""SE(2) pose graphs: linear initialization, robust nonlinear least squares, elimination of odometry chains.
+"""SE(2) pose graphs: robust nonlinear least squares.
 
 Node 0 is fixed. Sources: Kuemmerle et al. 2011 (g2o: the error of an edge), Dellaert & Kaess 2017 (gtsam: the
-logarithmic error), Carlone et al. 2014 (headings first, then positions).
+logarithmic error), Triggs et al. 2000 (the curvature of robust kernels), Davis 2005 (the factorisation).
 """
 
 from ratslam.pose_graph.edges import Edges, ErrorFunction, difference_error, logmap_error
 from ratslam.pose_graph.least_squares import (
+    GrowingGraph,
     Kernel,
     Solution,
     Termination,
@@ -14,11 +15,11 @@ from ratslam.pose_graph.least_squares import (
     least_squares,
     no_kernel,
 )
-from ratslam.pose_graph.linear_init import linear_initialization
 
 __all__ = [
     "Edges",
     "ErrorFunction",
+    "GrowingGraph",
     "Kernel",
     "Solution",
     "Termination",
@@ -26,7 +27,6 @@ __all__ = [
     "geman_mcclure",
     "huber",
     "least_squares",
-    "linear_initialization",
     "logmap_error",
     "no_kernel",
 ]

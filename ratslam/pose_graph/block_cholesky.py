@@ -23,7 +23,8 @@ class BlockPattern:
     """The sparsity pattern of a matrix with a block for each of n nodes and each edge between two of them.
 
     Args:
-        count: n. a, b: [M] nodes of each edge; an edge may occur several times.
+        count: n. a, b: [M] nodes of each edge; an edge may occur several times. place: [n] position of each
+            node in the order of elimination; None: an order of low fill-in is computed.
 
     Attributes:
         place: [n] position of each node in the order of elimination. slot: [M] the block above the diagonal
@@ -31,9 +32,9 @@ class BlockPattern:
             `ratslam.pose_graph.block_kernels`.
     """
 
-    def __init__(self, count: int, a: np.ndarray, b: np.ndarray) -> None:
+    def __init__(self, count: int, a: np.ndarray, b: np.ndarray, place: np.ndarray | None = None) -> None:
         self.count = count
-        self.place = _elimination_order(count, a, b)
+        self.place = elimination_order(count, a, b) if place is None else place
         ends = np.sort(np.stack([self.place[a], self.place[b]], axis=1), axis=1)
         keys, self.slot = np.unique(ends[:, 1] * count + ends[:, 0], return_inverse=True)
         self.row = keys % max(count, 1)
@@ -77,8 +78,9 @@ class BlockFactor:
         return solution
 
 
-def _elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n] the position of each node: SuperLU's minimum-degree order for low fill-in."""
+def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n] the position of each of n nodes with edges from a [M] to b [M]: SuperLU's minimum-degree order for
+    low fill-in."""
     if not count:
         return np.zeros(0, np.int64)
     ones, nodes = np.ones(len(a)), np.arange(count)

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.base.se2 import wrap
+from ratslam.core.compiled import compiled
+
+PI = float(np.pi)
 
 
 class Edges(NamedTuple):
@@ -35,20 +37,26 @@ def difference_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.nd
     Returns:
         errors [E, 3] and their Jacobians [E, 3, 3] by the poses of i and of j.
     """
-    a, b, motion = poses[edges.i], poses[edges.j], edges.motion
-    angle = a[:, 2] + motion[:, 2]
-    c, s = np.cos(angle), np.sin(angle)
-    dx, dy = (b - a)[:, 0], (b - a)[:, 1]
-    cm, sm = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-    error = np.empty((len(a), 3))
-    error[:, 0] = c * dx + s * dy - cm * motion[:, 0] - sm * motion[:, 1]
-    error[:, 1] = c * dy - s * dx - cm * motion[:, 1] + sm * motion[:, 0]
-    error[:, 2] = wrap(b[:, 2] - a[:, 2] - motion[:, 2])
-    by_a, by_b = np.zeros((2, len(a), 3, 3))
-    by_b[:, 0, 0], by_b[:, 0, 1], by_b[:, 1, 0], by_b[:, 1, 1], by_b[:, 2, 2] = c, s, -s, c, 1.0
-    by_a[:] = -by_b
-    by_a[:, 0, 2] = c * dy - s * dx
-    by_a[:, 1, 2] = -c * dx - s * dy
+    return _differences(poses, edges.i, edges.j, edges.motion)
+
+
+@compiled
+def _differences(
+    poses: np.ndarray, i: np.ndarray, j: np.ndarray, motion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See `difference_error`."""
+    error, by_a, by_b = np.empty((len(i), 3)), np.zeros((len(i), 3, 3)), np.zeros((len(i), 3, 3))
+    for e in range(len(i)):
+        a, b, (x, y, turn) = poses[i[e]], poses[j[e]], motion[e]
+        c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
+        cm, sm = np.cos(turn), np.sin(turn)
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        ahead, aside = c * dx + s * dy, c * dy - s * dx
+        error[e, 0], error[e, 1] = ahead - (cm * x + sm * y), aside - (cm * y - sm * x)
+        error[e, 2] = PI - (PI - (b[2] - a[2] - turn)) % (2 * PI)
+        by_b[e, 0, 0], by_b[e, 0, 1], by_b[e, 1, 0], by_b[e, 1, 1], by_b[e, 2, 2] = c, s, -s, c, 1.0
+        by_a[e] = -by_b[e]
+        by_a[e, 0, 2], by_a[e, 1, 2] = aside, -ahead
     return error, by_a, by_b
 
 

@@ -7,205 +7,166 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
-from scipy.sparse.linalg import splu
 
-from ratslam.pose_graph.chains import find_chains
+from ratslam.core.compiled import compiled
+from ratslam.pose_graph.block_cholesky import BlockPattern, elimination_order
 from ratslam.pose_graph.edges import (
     Edges,
     ErrorFunction,
     difference_error,
-    information_diagonals,
     information_matrices,
 )
-from ratslam.pose_graph.sparsity import SparseEquations, component_roots
 from tactile.base.se2 import wrap
 
-ELIMINATE_FROM = 2000
-"""Number of nodes from which chains are eliminated; smaller graphs are solved faster without."""
+GROWN = 1.05
+"""Growth of the number of edges by which the order of elimination is computed anew."""
 INITIAL_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e-12, 1e12
 
 
-class Damping(NamedTuple):
-    """Damping is multiplied by `factor`, to `first` * `factor` at least, when a step fails; divided when it
-    succeeds."""
-
-    first: float
-    factor: float
+FIRST_DAMPING, DAMPING_FACTOR = 1e-6, 10.0
+"""Damping is multiplied by the factor, to the first times the factor at least, when a step fails; divided
+when it succeeds."""
 
 
-class FullEquations:
-    """The normal equations of all nodes; their sparsity pattern is computed once.
+class GraphEquations:
+    """The normal equations of all nodes, by blocks. Damping acts on the change of every node.
 
-    Damping acts on the change of every node.
+    Args:
+        ordered: number of edges, the first ones, by which the nodes are ordered for elimination; nodes that
+            they do not join come last. before: equations of the same graph with fewer edges.
     """
 
-    damping = Damping(first=1e-6, factor=10.0)
+    def __init__(self, count: int, edges: Edges, ordered: int, before: GraphEquations | None = None) -> None:
+        i, j = edges.i - 1, edges.j - 1  # node 0 is fixed
+        tied = (i >= 0) & (j >= 0) & (i != j)
+        self.ordered = ordered
+        if before is not None and before.ordered == ordered:
+            self.order: np.ndarray = before.order
+        else:
+            first = tied[:ordered]
+            a, b = i[:ordered][first], j[:ordered][first]
+            self.order = elimination_order(int(max(a.max(initial=-1), b.max(initial=-1))) + 1, a, b)
+        place = np.concatenate([self.order, np.arange(len(self.order), count - 1)])
+        self.pattern = BlockPattern(count - 1, i[tied], j[tied], place)
+        self.size = count, len(i)
+        position, slot = np.append(place, -1), np.full(len(i), -1)
+        slot[tied] = self.pattern.slot
+        self._ends = position[i], position[j], slot
+        ties = csr_matrix((np.ones(len(i), np.int8), (edges.i, edges.j)), (count, count))
+        nodes, parent = breadth_first_order(ties, 0, directed=False)
+        self._tree = nodes[1:].astype(np.int64), parent[nodes[1:]].astype(np.int64)
 
-    def __init__(self, count: int, edges: Edges) -> None:
-        self.size = 3 * (count - 1)
-        ends = np.stack([edges.i, edges.j], axis=1) - 1  # node 0 is fixed: its rows are omitted
-        row = (3 * ends[:, :, None] + np.arange(3)).reshape(len(ends), 6)
-        free = np.repeat(ends >= 0, 3, axis=1)
-        rows = np.broadcast_to(row[:, :, None], (len(row), 6, 6))
-        columns = np.broadcast_to(row[:, None, :], (len(row), 6, 6))
-        self.used = free[:, :, None] & free[:, None, :]
-        self.row, self.free = row[free], free
-        flat = columns[self.used].astype(np.int64) * self.size + rows[self.used]
-        diagonal = np.arange(self.size, dtype=np.int64) * (self.size + 1)
-        places, slot = np.unique(np.concatenate([flat, diagonal]), return_inverse=True)
-        self.slot, self.diagonal = slot[: len(flat)], slot[len(flat) :]
-        self.count = len(places)
-        self.indices = (places % self.size).astype(np.int32)
-        self.indptr = np.searchsorted(places // self.size, np.arange(self.size + 1)).astype(np.int32)
-
-    def step(self, poses, errors, information, damping) -> np.ndarray | None:
-        """The damped Gauss-Newton step [N, 3], or None if the equations are singular."""
-        residual, by_i, by_j = errors
-        jacobian = np.concatenate([by_i, by_j], axis=2)
-        weighted = np.swapaxes(jacobian, 1, 2) @ information
-        data = np.bincount(self.slot, (weighted @ jacobian)[self.used], self.count)
-        gradient = np.bincount(self.row, (weighted @ residual[:, :, None])[..., 0][self.free], self.size)
-        scale = data[self.diagonal]
-        data[self.diagonal] += damping * np.where(scale > 0, scale, 1.0) + (scale == 0)
-        matrix = csc_matrix((data, self.indices, self.indptr), (self.size, self.size))
-        try:
-            change = splu(matrix, permc_spec="COLAMD").solve(-gradient)
-        except RuntimeError:
+    def step(self, at: Evaluation, information: np.ndarray, damping: float) -> np.ndarray | None:
+        """The damped step of Newton's method [N, 3], or None if the equations are singular."""
+        n = self.pattern.count
+        diagonal, right = np.zeros((n, 3, 3)), np.zeros((n, 3, 1))
+        above = np.zeros((len(self.pattern.row), 3, 3))
+        _add_edges(self._ends, at.errors, information, at.weights, at.curvature, (diagonal, above, right))
+        scale = np.diagonal(diagonal, axis1=1, axis2=2)
+        diagonal[:, range(3), range(3)] += damping * np.where(scale > 0, scale, 1.0) + (scale == 0)
+        factor = self.pattern.factorise(diagonal, above)
+        if factor is None:
             return None
-        if not np.isfinite(change).all():
-            return None
-        return np.concatenate([np.zeros((1, 3)), change.reshape(-1, 3)])
+        change = factor.solve(right)[self.pattern.place, :, 0]
+        return np.concatenate([np.zeros((1, 3)), change]) if np.isfinite(change).all() else None
+
+    def move(self, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The poses after a step [N, 3], taken in the poses of the nodes relative to each other along a tree:
+        where a node turns, the nodes behind it go round it, not along the tangent."""
+        moved = poses + change
+        _move_along_tree(*self._tree, poses, change, moved)
+        moved[:, 2] = wrap(moved[:, 2])
+        return moved
 
 
-class ReducedEquations:
-    """The normal equations of the junctions, chains eliminated; undamped steps equal `FullEquations`.
+@compiled
+def _move_along_tree(
+    nodes: np.ndarray, parents: np.ndarray, poses: np.ndarray, change: np.ndarray, moved: np.ndarray
+) -> None:
+    """Replaces the moved poses of nodes [T], which come after their parents [T]."""
+    for k in range(len(nodes)):
+        n, p = nodes[k], parents[k]
+        x, y, turn = poses[n, 0] - poses[p, 0], poses[n, 1] - poses[p, 1], change[p, 2]
+        x += change[n, 0] - change[p, 0] + turn * y
+        y += change[n, 1] - change[p, 1] - turn * (poses[n, 0] - poses[p, 0])
+        rotated = moved[p, 2] - poses[p, 2]
+        c, s = np.cos(rotated), np.sin(rotated)
+        moved[n, 0], moved[n, 1] = moved[p, 0] + c * x - s * y, moved[p, 1] + s * x + c * y
 
-    As twists about one point of the plane, changes of poses turn the error of an edge into a difference:
-    e = r + t_j - t_i, with weight W. So along a chain the residuals r add up, and so do the covariances W^-1
-    transported to that point: the chain is one edge. All edges of a chain transmit the same wrench.
 
-    Damping acts on the change in shape of the edges of chains and of a spanning tree over the junctions:
-    distant nodes may move far while the map bends little anywhere, which heading noise requires.
+@compiled
+def _add_edges(
+    ends: tuple[np.ndarray, np.ndarray, np.ndarray],
+    errors: tuple[np.ndarray, np.ndarray, np.ndarray],
+    information: np.ndarray,
+    weights: np.ndarray,
+    curvature: np.ndarray,
+    blocks: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Adds edges to the equations: of each the weight [E] times J' W J, less the curvature [E] times
+    (J' W e) (J' W e)', and the weight times -J' W e; see `Kernel`.
+
+    Args:
+        ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above the
+            diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
     """
-
-    damping = Damping(first=1 / 3, factor=3.0)
-
-    def __init__(self, count: int, edges: Edges, robust: np.ndarray) -> None:
-        determined = (information_diagonals(edges.information) > 0).all(axis=1)
-        if edges.information.ndim == 3:  # nearly singular information is not inverted
-            product = information_diagonals(edges.information).prod(axis=1)
-            determined &= np.linalg.det(edges.information) > 1e-6 * product
-        self.count, self.to = count, edges.j
-        self.chains = chains = find_chains(count, edges.i, edges.j, determined & ~robust)
-        size = len(chains.junctions)
-        self.equations = SparseEquations(size, chains.start, chains.end)
-        self.fixed = component_roots(size, chains.start, chains.end)
-        self.stiff = np.zeros(len(edges.i), bool)
-        self.stiff[chains.edge] = True
-        # [M] bool: edges a-b of nodes 0..count - 1 that join the same nodes as an edge of a tree from node 0.
-        ties = csr_matrix((np.ones(len(chains.start), np.int8), (chains.start, chains.end)), (size, size))
-        _, parent = breadth_first_order(ties, 0, directed=False)
-        tree = (parent[chains.start] == chains.end) | (parent[chains.end] == chains.start)
-        self.stiff[chains.direct[tree[len(chains.first) :]]] = True
-
-    def step(self, poses, errors, information, damping) -> np.ndarray | None:
-        """The damped Gauss-Newton step [N, 3], or None if the equations are singular."""
-        chains, (x, y) = self.chains, poses.T[:2]
-        weight, wrench = self._weigh(errors, information, damping)
-
-        # Chains: residuals and covariances as twists about the node at the end, added up.
-        inside, end = chains.edge, chains.junctions[chains.end[chains.chain]]
-        to = self.to[inside]
-        dx, dy = x[to] - x[end], y[to] - y[end]
-        covariance = _inverse(weight[:, :, inside])
-        residual = chains.sign * _transport_twist(_matvec(covariance, wrench[:, inside]), dx, dy)
-        covariance = _transport_twist(_transport_twist(covariance, dx, dy).swapaxes(0, 1), dx, dy)
-        chain_residual, chain_weight = chains.sums(residual), _inverse(chains.sums(covariance))
-
-        # Junctions: one edge for each chain, and the direct edges.
-        a, b = chains.junctions[chains.start], chains.junctions[chains.end]
-        dx, dy = x[a] - x[b], y[a] - y[b]
-        weight = np.concatenate([chain_weight, weight[:, :, chains.direct]], axis=2)
-        wrench = np.concatenate([_matvec(chain_weight, chain_residual), wrench[:, chains.direct]], axis=1)
-        moved = self._solve_junctions(weight, wrench, dx, dy)
-        if moved is None:
-            return None
-
-        # Back to the inner nodes.
-        change = np.zeros((3, self.count))
-        change[:, chains.junctions] = moved.T
-        chained = len(chains.first)
-        start = _transport_twist(moved.T[:, chains.start[:chained]], dx[:chained], dy[:chained])
-        tension = _matvec(chain_weight, chain_residual + moved.T[:, chains.end[:chained]] - start)
-        twist = chains.inner_values(start, _matvec(covariance, tension[:, chains.chain]) - residual)
-        end = end[chains.into]
-        change[:, chains.inner] = _transport_twist(twist, x[end] - x[chains.inner], y[end] - y[chains.inner])
-        return change.T if np.isfinite(change).all() else None
-
-    def _solve_junctions(
-        self, weight: np.ndarray, wrench: np.ndarray, dx: np.ndarray, dy: np.ndarray
-    ) -> np.ndarray | None:
-        """[J, 3] changes of the junctions, from the weights [3, 3, C + L] and wrenches [3, C + L] of the
-        reduced edges, whose starts lie (dx, dy) [C + L] from their ends."""
-        start, end, size = self.chains.start, self.chains.end, len(self.chains.junctions)
-        across = _transport_wrench(weight.swapaxes(0, 1), dx, dy).swapaxes(0, 1)
-        blocks = [_transport_wrench(across, dx, dy), weight, -across.swapaxes(0, 1), -across]
-        right = [
-            np.bincount(start, back, size) - np.bincount(end, on, size)
-            for on, back in zip(wrench, _transport_wrench(wrench, dx, dy), strict=True)
-        ]
-        entries = np.concatenate(blocks, axis=2)
-        return self.equations.solve(entries, self.fixed, np.stack(right, axis=1), reuse_factor=True)
-
-    def _weigh(self, errors, information, damping) -> tuple[np.ndarray, np.ndarray]:
-        """Damped weights [3, 3, E] and wrenches [3, E] (weight times residual), by the pose of j."""
-        residual, _, by_j = errors
-        by_j, information = (np.ascontiguousarray(m.transpose(1, 2, 0)) for m in (by_j, information))
-        back = _matmul(by_j.swapaxes(0, 1), information)
-        # With twice the stiffness and half the residual the wrench is equal and the change half as large.
-        return _matmul(back, by_j) * np.where(self.stiff, 1 + damping, 1.0), _matvec(back, residual.T)
+    (at_i, at_j, slot), (error, by_i, by_j), (diagonal, above, right) = ends, errors, blocks
+    pull, tight = np.empty(3), np.empty((3, 3))
+    for e in range(len(slot)):
+        if at_i[e] == at_j[e]:
+            continue
+        for r in range(3):
+            pull[r] = 0.0
+            for c in range(3):
+                pull[r] += information[e, r, c] * error[e, c]
+        for r in range(3):
+            for c in range(3):
+                tight[r, c] = weights[e] * information[e, r, c] - curvature[e] * pull[r] * pull[c]
+        for at, by in ((at_i[e], by_i[e]), (at_j[e], by_j[e])):
+            if at >= 0:
+                _add_product(by, tight, by, diagonal[at])
+                for p in range(3):
+                    for r in range(3):
+                        right[at, p, 0] -= weights[e] * by[r, p] * pull[r]
+        if slot[e] >= 0 and at_i[e] < at_j[e]:
+            _add_product(by_i[e], tight, by_j[e], above[slot[e]])
+        elif slot[e] >= 0:
+            _add_product(by_j[e], tight, by_i[e], above[slot[e]])
 
 
-def _transport_twist(twist: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Twists [3, ..., E] about points (dx, dy) away, from twists about the original points."""
-    return np.stack([twist[0] + dy * twist[2], twist[1] - dx * twist[2], twist[2]])
+@compiled
+def _add_product(a: np.ndarray, middle: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    """out [3, 3] += a' middle b."""
+    for p in range(3):
+        for c in range(3):
+            pulled = a[0, p] * middle[0, c] + a[1, p] * middle[1, c] + a[2, p] * middle[2, c]
+            for q in range(3):
+                out[p, q] += pulled * b[c, q]
 
 
-def _transport_wrench(force: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """Wrenches [3, ..., E] transported to points (dx, dy) away: the transpose of `_transport_twist`."""
-    return np.stack([force[0], force[1], force[2] + dy * force[0] - dx * force[1]])
-
-
-def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("abe,bce->ace", a, b)
-
-
-def _matvec(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("abe,be->ae", a, b)
-
-
-def _inverse(m: np.ndarray) -> np.ndarray:
-    """Inverses of symmetric positive matrices [3, 3, E], by elimination; cofactors would lose digits."""
-    (a, b, c), (_, d, e), (_, _, f) = m
-    x, y = c / f, e / f
-    a, b, d = a - x * c, b - x * e, d - y * e
-    z = b / a
-    yy = 1 / (d - z * b)
-    xy, xx = -z * yy, 1 / a + z * z * yy
-    xt, yt = -(xx * x + xy * y), -(xy * x + yy * y)
-    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, 1 / f - x * xt - y * yt]])
+@compiled
+def _chi_squares(error: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """[E] squared Mahalanobis errors."""
+    chi2 = np.zeros(len(error))
+    for e in range(len(error)):
+        for r in range(3):
+            for c in range(3):
+                chi2[e] += error[e, r] * information[e, r, c] * error[e, c]
+    return chi2
 
 
 class Kernel(NamedTuple):
-    """A robust kernel: weight and cost of an edge as functions of its squared Mahalanobis error."""
+    """A robust kernel: cost, weight (its slope) and curvature (twice the fall of the slope, at most the
+    weight over the squared error) of an edge as functions of its squared Mahalanobis error."""
 
     weight: Callable[[np.ndarray], np.ndarray]
     loss: Callable[[np.ndarray], np.ndarray]
+    curvature: Callable[[np.ndarray], np.ndarray]
 
 
-no_kernel = Kernel(np.ones_like, lambda chi2: chi2)
+no_kernel = Kernel(np.ones_like, lambda chi2: chi2, np.zeros_like)
 """Plain least squares."""
 
 
@@ -214,12 +175,18 @@ def huber(scale: float) -> Kernel:
     return Kernel(
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
+        lambda chi2: np.where(chi2 <= scale**2, 0.0, scale / np.maximum(chi2, 1e-300) ** 1.5),
     )
 
 
 def geman_mcclure(mu: float) -> Kernel:
     """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman 1985)."""
-    return Kernel(lambda chi2: (mu / (mu + chi2)) ** 2, lambda chi2: mu * chi2 / (mu + chi2))
+
+    def curvature(chi2: np.ndarray) -> np.ndarray:
+        weight = (mu / (mu + chi2)) ** 2
+        return weight * np.minimum(4 / (mu + chi2), 1 / np.maximum(chi2, 1e-300))
+
+    return Kernel(lambda chi2: (mu / (mu + chi2)) ** 2, lambda chi2: mu * chi2 / (mu + chi2), curvature)
 
 
 class Termination(Enum):
@@ -227,7 +194,7 @@ class Termination(Enum):
 
     CONVERGED = "converged"
     ITERATION_LIMIT = "the iteration limit was reached; raise it or start nearer"
-    NO_DECREASE = "no step lowers the cost; start from `linear_initialization`, another basin may be lower"
+    NO_DECREASE = "no step lowers the cost; another start may be better"
     SINGULAR = "the equations are singular; check that every node is connected to node 0"
     NOT_FINITE = "a pose, a measurement or its information is not finite"
 
@@ -251,15 +218,14 @@ def least_squares(
     error: ErrorFunction = difference_error,
     iterations: int = 50,
     tolerance: float = 1e-9,
-    eliminate_chains: bool | None = None,
+    equations: GraphEquations | None = None,
 ) -> Solution:
     """Levenberg-Marquardt from the given poses [N, 3]; node 0 is fixed.
 
     Args:
         kernel: applied to the edges of `robust` [E] bool (None: to all); other edges have weight 1.
-        tolerance: the largest change of a step at convergence, m and rad.
-        eliminate_chains: solve over the junctions only (`ReducedEquations`); None: with `ELIMINATE_FROM`
-            nodes or more. Both ways reach an optimum of the same cost.
+        tolerance: the largest change of a step at convergence, m and rad. equations: of this graph, where
+            they are known.
 
     Returns:
         a solution whose poses are finite if the given poses are; without any improvement, the given poses.
@@ -274,21 +240,36 @@ def least_squares(
     start = problem.evaluate(poses)
     if not np.isfinite(start.cost):
         return Solution(poses, Termination.NOT_FINITE, 0, np.inf, unit)
-    if len(poses) >= ELIMINATE_FROM if eliminate_chains is None else eliminate_chains:
-        equations: _Equations = ReducedEquations(len(poses), edges, robust & (kernel is not no_kernel))
-    else:
-        equations = FullEquations(len(poses), edges)
+    equations = equations or GraphEquations(len(poses), edges, len(edges.i))
     return _minimise(problem, equations, poses, start, iterations, tolerance)
 
 
-_Equations = FullEquations | ReducedEquations
+class GrowingGraph:
+    """What can be kept of the equations of a graph to which nodes and edges are added.
+
+    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges up
+    to a number that follows from their number now: so a graph that was loaded is solved to the same bits.
+    """
+
+    def __init__(self) -> None:
+        self._last: GraphEquations | None = None
+
+    def equations(self, count: int, edges: Edges) -> GraphEquations | None:
+        """Of the graph with `count` nodes; the edges of the last call come first. None without edges."""
+        if not len(edges.i):
+            return None
+        if self._last is None or self._last.size != (count, len(edges.i)):
+            ordered = int(GROWN ** np.floor(np.log(len(edges.i)) / np.log(GROWN) + 1e-9))
+            self._last = GraphEquations(count, edges, ordered, self._last)
+        return self._last
 
 
-class _Evaluation(NamedTuple):
-    """Errors with Jacobians, robust weights [E], and cost at some poses."""
+class Evaluation(NamedTuple):
+    """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
 
     errors: tuple[np.ndarray, np.ndarray, np.ndarray]
     weights: np.ndarray
+    curvature: np.ndarray
     cost: float
 
 
@@ -301,41 +282,45 @@ class _Problem(NamedTuple):
     robust: np.ndarray
     error: ErrorFunction
 
-    def evaluate(self, poses: np.ndarray) -> _Evaluation:
+    def evaluate(self, poses: np.ndarray) -> Evaluation:
         errors = self.error(poses, self.edges)
         with np.errstate(over="ignore", invalid="ignore"):
-            chi2 = np.einsum("ea,eab,eb->e", errors[0], self.information, errors[0])
-            weights = np.where(self.robust, self.kernel.weight(chi2), 1.0)
-            cost = float(np.where(self.robust, self.kernel.loss(chi2), chi2).sum())
-        return _Evaluation(errors, weights, cost)
+            chi2 = _chi_squares(errors[0], self.information)
+            among, weights, curvature = chi2[self.robust], np.ones(len(chi2)), np.zeros(len(chi2))
+            weights[self.robust] = self.kernel.weight(among)
+            curvature[self.robust] = self.kernel.curvature(among)
+            chi2[self.robust] = self.kernel.loss(among)
+        return Evaluation(errors, weights, curvature, float(chi2.sum()))
 
 
 def _minimise(
     problem: _Problem,
-    equations: _Equations,
+    equations: GraphEquations,
     poses: np.ndarray,
-    current: _Evaluation,
+    current: Evaluation,
     iterations: int,
     tolerance: float,
 ) -> Solution:
     """Takes damped steps until one ends the search; damping rises after a step that raises the cost."""
-    damping, taken, schedule = INITIAL_DAMPING, 0, equations.damping
+    damping, taken = INITIAL_DAMPING, 0
     termination = Termination.ITERATION_LIMIT
     while taken < iterations:
-        information = current.weights[:, None, None] * problem.information
-        step = equations.step(poses, current.errors, information, damping)
+        step = equations.step(current, problem.information, damping)
         if step is None:
             termination = Termination.SINGULAR
             break
         moved = poses + step
         moved[:, 2] = wrap(moved[:, 2])
         small, trial = np.abs(step).max() < tolerance, problem.evaluate(moved)
+        if not small and not trial.cost <= current.cost:
+            moved = equations.move(poses, step)
+            trial = problem.evaluate(moved)
         if trial.cost <= current.cost * (1 + 1e-12) + 1e-300:
             taken += 1
             small = small or current.cost - trial.cost <= 1e-12 * current.cost
-            poses, current, damping = moved, trial, max(damping / schedule.factor, LEAST_DAMPING)
+            poses, current, damping = moved, trial, max(damping / DAMPING_FACTOR, LEAST_DAMPING)
         elif not small:
-            damping = max(damping, schedule.first) * schedule.factor
+            damping = max(damping, FIRST_DAMPING) * DAMPING_FACTOR
         if small:
             termination = Termination.CONVERGED
             break
