@@ -80,11 +80,6 @@ def logmap_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarra
     return log, outer @ by_a, outer @ by_b
 
 
-def information_diagonals(information: np.ndarray) -> np.ndarray:
-    """[E, 3] the diagonals of information in either form."""
-    return information if information.ndim == 2 else np.diagonal(information, axis1=1, axis2=2)
-
-
 def information_matrices(information: np.ndarray) -> np.ndarray:
     """[E, 3, 3] information in either form as matrices."""
     return information if information.ndim == 3 else information[:, :, None] * np.eye(3)

@@ -23,8 +23,6 @@ from tactile.base.se2 import wrap
 GROWN = 1.05
 """Growth of the number of edges by which the order of elimination is computed anew."""
 INITIAL_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e-12, 1e12
-
-
 FIRST_DAMPING, DAMPING_FACTOR = 1e-6, 10.0
 """Damping is multiplied by the factor, to the first times the factor at least, when a step fails; divided
 when it succeeds."""
@@ -58,7 +56,7 @@ class GraphEquations:
         nodes, parent = breadth_first_order(ties, 0, directed=False)
         self._tree = nodes[1:].astype(np.int64), parent[nodes[1:]].astype(np.int64)
 
-    def step(self, at: Evaluation, information: np.ndarray, damping: float) -> np.ndarray | None:
+    def step(self, at: _Evaluation, information: np.ndarray, damping: float) -> np.ndarray | None:
         """The damped step of Newton's method [N, 3], or None if the equations are singular."""
         n = self.pattern.count
         diagonal, right = np.zeros((n, 3, 3)), np.zeros((n, 3, 1))
@@ -264,7 +262,7 @@ class GrowingGraph:
         return self._last
 
 
-class Evaluation(NamedTuple):
+class _Evaluation(NamedTuple):
     """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
 
     errors: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -282,7 +280,7 @@ class _Problem(NamedTuple):
     robust: np.ndarray
     error: ErrorFunction
 
-    def evaluate(self, poses: np.ndarray) -> Evaluation:
+    def evaluate(self, poses: np.ndarray) -> _Evaluation:
         errors = self.error(poses, self.edges)
         with np.errstate(over="ignore", invalid="ignore"):
             chi2 = _chi_squares(errors[0], self.information)
@@ -290,14 +288,14 @@ class _Problem(NamedTuple):
             weights[self.robust] = self.kernel.weight(among)
             curvature[self.robust] = self.kernel.curvature(among)
             chi2[self.robust] = self.kernel.loss(among)
-        return Evaluation(errors, weights, curvature, float(chi2.sum()))
+        return _Evaluation(errors, weights, curvature, float(chi2.sum()))
 
 
 def _minimise(
     problem: _Problem,
     equations: GraphEquations,
     poses: np.ndarray,
-    current: Evaluation,
+    current: _Evaluation,
     iterations: int,
     tolerance: float,
 ) -> Solution:

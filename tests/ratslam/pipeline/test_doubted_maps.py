@@ -41,6 +41,7 @@ def test_odometry_is_the_best_estimate_of_a_doubted_map(monkeypatch):
     map = map_log(log)
     assert map.final_doubt() == 0.9
     odometry = integrate(log.motion[:, :3])
+    assert ate(map.trajectory(), odometry) < 1e-9
     start = map.trajectory()[0]
     assert np.allclose(map.trajectory(), compose(compose(start, inverse(odometry[0])), odometry), atol=1e-9)
     assert not len(map.closures())
