@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.compiled import compiled
 from ratslam.core.growable_array import GrowableArray
 
 FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
@@ -107,13 +108,12 @@ class SectorFan(Checkpointed):
         view, and their unshifted difference; 0 for fields of view without a shift."""
         old, now = self._view.rows[-2], self._view.rows[-1]
         size = len(now)
-        shift = np.round(-self._step.rows[-1, 0] / (FIELDS_OF_VIEW / size)).astype(int)
+        shift = np.round(-self._step.rows[-1, 0] / (FIELDS_OF_VIEW / size)).astype(np.int64)
         still = np.abs(now - old).mean()
         moves = (shift != 0) & (np.abs(shift) <= size // 2)
-        gain = [
-            still - _difference(now, old, k) if moved else 0.0 for k, moved in zip(shift, moves, strict=True)
-        ]
-        return np.array(gain), still * moves
+        return np.where(
+            moves, still - shifted_differences(now, old, np.where(moves, shift, 0)), 0.0
+        ), still * moves
 
     def _heading_errors(self, lag: int) -> np.ndarray:
         """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
@@ -128,9 +128,8 @@ class SectorFan(Checkpointed):
         angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
         turn, length = (step[at] - step[at - lag]).T
         view, offset = self._view.rows, SCAN * abs(angle)
-        errors = np.array(
-            [_fractional_difference(view[at], view[at - lag], -(turn + x) / angle) for x in offset]
-        )
+        shift = -(turn + offset[:, None]) / angle
+        errors = fractional_differences(view[at], view[at - lag], shift)
         blind = np.isnan(errors).any(axis=0)
         errors = np.where(blind, 1.0, errors)
         best, row = errors.argmin(axis=0), np.arange(len(at))
@@ -153,23 +152,38 @@ def _no_pairs() -> dict[int, GrowableArray]:
     return {lag: GrowableArray((3,), np.float64) for lag in LAGS}
 
 
-def _difference(now: np.ndarray, old: np.ndarray, shift: int) -> np.ndarray:
-    """[...] mean absolute difference of now[shift:] and old[..., :-shift], or reversed for shift < 0."""
-    size = len(now) - abs(shift)
-    return np.abs(now[max(shift, 0) :][:size] - old[..., max(-shift, 0) :][..., :size]).mean(axis=-1)
+@compiled
+def shifted_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """[F] mean absolute difference of now[k:] and old[:-k], or reversed for k < 0, for each shift k [F]."""
+    found = np.empty(len(shifts))
+    for f in range(len(shifts)):
+        size, first, second = len(now) - abs(shifts[f]), max(shifts[f], 0), max(-shifts[f], 0)
+        total = 0.0
+        for at in range(size):
+            total += abs(now[first + at] - old[second + at])
+        found[f] = total / size
+    return found
 
 
-def _fractional_difference(now: np.ndarray, old: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """[P] `_difference` for fractional shifts [P], by interpolation; NaN with less than half overlap."""
-    size = now.shape[1]
-    at = np.arange(size)[None] - shift[:, None]
-    low = np.floor(at).astype(int)
-    share, inside = at - low, (low >= 0) & (low + 1 < size)
-    first = np.take_along_axis(old, np.clip(low, 0, size - 1), axis=1)
-    second = np.take_along_axis(old, np.clip(low + 1, 0, size - 1), axis=1)
-    apart = np.where(inside, np.abs(now - first * (1 - share) - second * share), 0.0)
-    count = inside.sum(axis=1)
-    return np.where(count >= size // 2, apart.sum(axis=1) / np.maximum(count, 1), np.nan)
+@compiled
+def fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """[F, P] `shifted_differences` of P pairs of views [P, size] for fractional shifts [F, P], by
+    interpolation; NaN with less than half overlap."""
+    pairs, size = now.shape
+    found = np.empty(shifts.shape)
+    for f in range(len(shifts)):
+        for p in range(pairs):
+            total, count = 0.0, 0
+            for k in range(size):
+                at = k - shifts[f, p]
+                low = int(np.floor(at))
+                if low < 0 or low + 1 >= size:
+                    continue
+                share = at - low
+                total += abs(now[p, k] - old[p, low] * (1 - share) - old[p, low + 1] * share)
+                count += 1
+            found[f, p] = total / count if count >= max(size // 2, 1) else np.nan
+    return found
 
 
 def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:

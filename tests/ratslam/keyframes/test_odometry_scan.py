@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.keyframes.appearance import ViewAppearance
-from ratslam.keyframes.closure_odds import (
+from ratslam.keyframes.config import FULL, KeyframeMapConfig
+from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.keyframes.odometry_scan import (
     BIAS_SPAN,
     BIAS_STEPS,
     REACH,
@@ -18,8 +20,6 @@ from ratslam.keyframes.closure_odds import (
     UNLIKELY,
     OdometryScan,
 )
-from ratslam.keyframes.config import FULL, KeyframeMapConfig
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.optimizer import CalibrationPrior
 from tactile.base.se2 import compose, correct_heading, wrap
 
