@@ -282,7 +282,7 @@ def _foretold(graph: KeyframeGraph, drive: Drive, way: Way) -> float:
 
 @compiled
 def _turned(angle: float) -> float:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    return angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
 
 
 @compiled
@@ -300,14 +300,16 @@ def _pairs(
     close, around = np.empty(len(ground), np.int64), 0  # those in the box around a part of the path
     for k in range(len(path)):
         if k % BOX == 0:
-            part, around = path[k : k + BOX], 0
-            left, right = part[:, 0].min() - reach, part[:, 0].max() + reach
-            below, above = part[:, 1].min() - reach, part[:, 1].max() + reach
+            left, right, below, above, around = np.inf, -np.inf, np.inf, -np.inf, 0
+            for at in range(k, min(k + BOX, len(path))):
+                left, right = min(left, path[at, 0] - reach), max(right, path[at, 0] + reach)
+                below, above = min(below, path[at, 1] - reach), max(above, path[at, 1] + reach)
             for g in range(len(ground)):
-                if left <= ground[g, 0] <= right and below <= ground[g, 1] <= above:
-                    close[around] = g
-                    around += 1
-        for g in close[:around]:
+                close[around] = g
+                x, y = ground[g, 0], ground[g, 1]
+                around += int((x >= left) & (x <= right) & (y >= below) & (y <= above))
+        for near in range(around):
+            g = close[near]
             x, y = ground[g, 0] - path[k, 0], ground[g, 1] - path[k, 1]
             if x * x + y * y >= reach * reach or abs(g - k - lag) <= guard:
                 continue
@@ -352,15 +354,14 @@ def _move(pose: np.ndarray, motion: np.ndarray, onwards: bool) -> None:
 
 
 @compiled
-def _distance_to_ground(pose: np.ndarray, ground: np.ndarray, frame: int, guard: int) -> float:
-    """Squared distance to the closest keyframe of the ground but those of nearly the same time as number
-    `frame` of it, m^2."""
-    closest = np.inf
+def _is_apart(pose: np.ndarray, ground: np.ndarray, reach: float, frame: int, guard: int) -> bool:
+    """Whether no keyframe of the ground is within `reach`, m, but those of nearly the same time as number
+    `frame` of it."""
     for g in range(len(ground)):
         x, y = ground[g, 0] - pose[0], ground[g, 1] - pose[1]
-        if abs(g - frame) > guard:
-            closest = min(closest, x * x + y * y)
-    return closest
+        if x * x + y * y < reach * reach and abs(g - frame) > guard:
+            return False
+    return True
 
 
 @compiled
@@ -427,7 +428,7 @@ def _follow(
                 place, heading = place * (1 - share), heading * (1 - again)
             if on_way:
                 kinds[frame] = np.searchsorted(edges, best)
-            elif _distance_to_ground(seen, near.ground, frame + lag, guard) >= reach * reach:
+            elif _is_apart(seen, near.ground, reach, frame + lag, guard):
                 kinds[frame] = len(edges) + 2
             elif best < edges[0] and best > -np.inf:
                 kinds[frame] = 0

@@ -71,20 +71,6 @@ def measurement_errors(
 
 
 @compiled
-def add_to_pose(
-    blocks: Blocks, at: int, by_pose: np.ndarray, by_parameter: np.ndarray, weight: float, error: float
-) -> None:
-    """Adds one row of a measurement, with derivatives by a pose [3] and by the calibration [K]."""
-    for p in range(3):
-        pulled = weight * by_pose[p]
-        blocks.right[at, p, 0] -= pulled * error
-        for k in range(len(by_parameter)):
-            blocks.right[at, p, 1 + k] += pulled * by_parameter[k]
-        for q in range(3):
-            blocks.diagonal[at, p, q] += pulled * by_pose[q]
-
-
-@compiled
 def add_measurements(
     edges: Measurements,
     poses: np.ndarray,
@@ -93,39 +79,78 @@ def add_measurements(
     trust: np.ndarray,
     blocks: Blocks,
 ) -> None:
-    """Adds the measurements, each with its information times `trust` [M], to the equations."""
+    """Adds the measurements, each with its information times `trust` [M], to the equations.
+
+    With c and s of the heading of keyframe i, the errors have the derivatives [-c -s p], [s -c q], [0 0 -1]
+    by the pose of keyframe i, and [c s 0], [-s c 0], [0 0 1] by that of keyframe j. The products are written
+    out, because loops over their many zeros take several times as long.
+    """
+    diagonal, above, right, corner, slope = blocks
     parameters = edges.regressors.shape[1]
-    by_i, by_j, by_parameter = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, parameters))
-    by_j[2, 2] = 1.0
-    by_i[2, 0] = by_i[2, 1] = 0.0
-    by_i[2, 2] = -1.0
     for m in range(len(trust)):
-        heading, at_i, at_j = poses[edges.i[m], 2], edges.at_i[m], edges.at_j[m]
+        heading, at_i, at_j, slot = poses[edges.i[m], 2], edges.at_i[m], edges.at_j[m], edges.slot[m]
         c, s = np.cos(heading), np.sin(heading)
-        by_i[0, 0], by_i[0, 1], by_i[0, 2] = -c, -s, error[m, 1] + measured[m, 1]
-        by_i[1, 0], by_i[1, 1], by_i[1, 2] = s, -c, -error[m, 0] - measured[m, 0]
-        by_j[0, 0], by_j[0, 1], by_j[1, 0], by_j[1, 1] = c, s, -s, c
+        p, q = error[m, 1] + measured[m, 1], -error[m, 0] - measured[m, 0]
+        w0 = edges.information[m, 0] * trust[m]
+        w1 = edges.information[m, 1] * trust[m]
+        w2 = edges.information[m, 2] * trust[m]
+        e0, e1, e2 = w0 * error[m, 0], w1 * error[m, 1], w2 * error[m, 2]
+        xx, xy, yy = w0 * c * c + w1 * s * s, (w0 - w1) * c * s, w0 * s * s + w1 * c * c
+        xh, yh = w1 * s * q - w0 * c * p, -w0 * s * p - w1 * c * q
+        pulled_x, pulled_y = c * e0 - s * e1, s * e0 + c * e1
+        if at_i >= 0:
+            diagonal[at_i, 0, 0] += xx
+            diagonal[at_i, 0, 1] += xy
+            diagonal[at_i, 1, 0] += xy
+            diagonal[at_i, 1, 1] += yy
+            diagonal[at_i, 0, 2] += xh
+            diagonal[at_i, 2, 0] += xh
+            diagonal[at_i, 1, 2] += yh
+            diagonal[at_i, 2, 1] += yh
+            diagonal[at_i, 2, 2] += w0 * p * p + w1 * q * q + w2
+            right[at_i, 0, 0] += pulled_x
+            right[at_i, 1, 0] += pulled_y
+            right[at_i, 2, 0] -= p * e0 + q * e1 - e2
+        if at_j >= 0:
+            diagonal[at_j, 0, 0] += xx
+            diagonal[at_j, 0, 1] += xy
+            diagonal[at_j, 1, 0] += xy
+            diagonal[at_j, 1, 1] += yy
+            diagonal[at_j, 2, 2] += w2
+            right[at_j, 0, 0] -= pulled_x
+            right[at_j, 1, 0] -= pulled_y
+            right[at_j, 2, 0] -= e2
+        if slot >= 0:
+            above[slot, 0, 0] -= xx
+            above[slot, 0, 1] -= xy
+            above[slot, 1, 0] -= xy
+            above[slot, 1, 1] -= yy
+            above[slot, 2, 2] -= w2
+            if at_i < at_j:  # rows of keyframe i, columns of keyframe j
+                above[slot, 2, 0] -= xh
+                above[slot, 2, 1] -= yh
+            else:
+                above[slot, 0, 2] -= xh
+                above[slot, 1, 2] -= yh
         for k in range(parameters):
-            by_parameter[0, k] = measured[m, 1] / 2 * edges.regressors[m, k]
-            by_parameter[1, k] = -measured[m, 0] / 2 * edges.regressors[m, k]
-            by_parameter[2, k] = -edges.regressors[m, k]
-        for row in range(3):
-            weight = edges.information[m, row] * trust[m]
-            off = error[m, row]
+            share = edges.regressors[m, k]
+            if share == 0.0:  # of closures
+                continue
+            d0, d1, d2 = measured[m, 1] / 2 * share, -measured[m, 0] / 2 * share, -share
+            b0, b1, b2 = w0 * d0, w1 * d1, w2 * d2
+            bent_x, bent_y = c * b0 - s * b1, s * b0 + c * b1
             if at_i >= 0:
-                add_to_pose(blocks, at_i, by_i[row], by_parameter[row], weight, off)
+                right[at_i, 0, 1 + k] -= bent_x
+                right[at_i, 1, 1 + k] -= bent_y
+                right[at_i, 2, 1 + k] += p * b0 + q * b1 - b2
             if at_j >= 0:
-                add_to_pose(blocks, at_j, by_j[row], by_parameter[row], weight, off)
-            if edges.slot[m] >= 0:
-                upper, lower = (by_i[row], by_j[row]) if at_i < at_j else (by_j[row], by_i[row])
-                for p in range(3):
-                    for q in range(3):
-                        blocks.above[edges.slot[m], p, q] += weight * upper[p] * lower[q]
-            for k in range(parameters):
-                pulled = weight * by_parameter[row, k]
-                blocks.slope[k] += pulled * off
-                for other in range(parameters):
-                    blocks.corner[k, other] += pulled * by_parameter[row, other]
+                right[at_j, 0, 1 + k] += bent_x
+                right[at_j, 1, 1 + k] += bent_y
+                right[at_j, 2, 1 + k] += b2
+            slope[k] += d0 * e0 + d1 * e1 + d2 * e2
+            for other in range(parameters):
+                share = edges.regressors[m, other]
+                corner[k, other] += (b0 * measured[m, 1] / 2 - b1 * measured[m, 0] / 2 - b2) * share
 
 
 class Equations(NamedTuple):
@@ -160,37 +185,20 @@ class Equations(NamedTuple):
         """Of the information of all unknowns; inf where it is singular."""
         if self.factor is None:
             return float(np.inf)
-        _, schur = self._bent(self.factor)
-        return self.factor.log_determinant + float(np.linalg.slogdet(schur)[1])
+        return self.factor.log_determinant + float(np.linalg.slogdet(self.bent()[1])[1])
 
-    def calibration_covariance(self) -> np.ndarray:
-        """[K, K] of the calibration parameters."""
+    def bent(self) -> tuple[np.ndarray, np.ndarray]:
+        """[n, 3, K] poses per calibration parameter, in the order of elimination, and [K, K] its information
+        with the poses integrated out; infinite and 0 where the equations are singular."""
+        border = np.ascontiguousarray(self.right[:, :, 1:])
         if self.factor is None:
-            return np.full(self.corner.shape, np.inf)
-        return np.linalg.inv(self._bent(self.factor)[1])
-
-    def covariance(self, change: np.ndarray) -> np.ndarray:
-        """[n, n] covariance of quantities with derivatives [N - 1, 3, n] by the free keyframes' poses."""
-        if self.factor is None:
-            return np.full((change.shape[2],) * 2, np.inf)
-        ordered = np.empty_like(change)
-        ordered[self.place] = change
-        spread = self.factor.solve(ordered).reshape(-1, change.shape[2])
-        ordered = ordered.reshape(spread.shape)
-        bent, schur = self._bent(self.factor)
-        pull = ordered.T @ bent
-        return ordered.T @ spread + pull @ np.linalg.solve(schur, pull.T)
+            return np.full(border.shape, np.inf), np.zeros(self.corner.shape)
+        bent = self.factor.solve(border)
+        return bent, self.corner - np.tensordot(border, bent, axes=((0, 1), (0, 1)))
 
     def _border(self) -> np.ndarray:
         """[3 n, K]"""
         return np.ascontiguousarray(self.right[:, :, 1:]).reshape(-1, len(self.slope))
-
-    def _bent(self, factor: BlockFactor) -> tuple[np.ndarray, np.ndarray]:
-        """[3 n, K] poses per calibration parameter, and [K, K] its information with the poses integrated
-        out."""
-        border = self._border()
-        bent = factor.solve(self.right[:, :, 1:]).reshape(border.shape)
-        return bent, self.corner - border.T @ bent
 
 
 def empty_blocks(pattern: BlockPattern, parameters: int) -> Blocks:

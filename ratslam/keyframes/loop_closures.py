@@ -74,6 +74,7 @@ class ClosureLog(Checkpointed):
         self._stood = GrowableArray((), np.int64)  # selections in a row with a confirming weight
         self._merged = GrowableArray((2,), np.float64)  # evidence and number of the merged candidates
         self._lines: np.ndarray | None = None
+        self._begun: list[int] | None = None  # the row of each sequence's first candidate
 
     @property
     def sequences(self) -> int:
@@ -104,6 +105,8 @@ class ClosureLog(Checkpointed):
             self._log_odds.append(np.nan)
             self._stood.append(0)
             self._merged.append((0.0, 0.0))
+            if self._begun is not None:
+                self._begun.append(len(self._candidate.rows))
         self._candidate.append((candidate.keyframe, candidate.match, candidate.shift, self.sequences - 1))
         self._evidence.append((candidate.posterior, candidate.log_ratio))
         self._lines = None
@@ -111,12 +114,23 @@ class ClosureLog(Checkpointed):
 
     def members(self, sequence: int) -> np.ndarray:
         """[n, 4] keyframe, match, shift, sequence of the candidates of one sequence."""
-        return self._candidate.rows[self._candidate.rows[:, 3] == sequence]
+        rows = self._candidate.rows[self._among(sequence)]
+        own = rows[:, 3] == sequence
+        return rows.copy() if own.all() else rows[own]
 
     def score(self, sequence: int) -> float:
         """Evidence of a sequence: the sum of the log-likelihood ratios of its candidates."""
-        own = self._evidence.rows[self._candidate.rows[:, 3] == sequence, 1].sum()
+        among = self._among(sequence)
+        own = self._evidence.rows[among, 1][self._candidate.rows[among, 3] == sequence].sum()
         return float(own + self._merged.rows[sequence, 0])
+
+    def _among(self, sequence: int) -> slice:
+        """The rows from the first candidate of a sequence to before that of the next one."""
+        if self._begun is None:
+            newest = np.maximum.accumulate(self._candidate.rows[:, 3])
+            self._begun = np.searchsorted(newest, np.arange(self.sequences)).tolist()
+        following = self._begun[sequence + 1 : sequence + 2]
+        return slice(self._begun[sequence], following[0] if following else None)
 
     def scores(self) -> np.ndarray:
         """[R] evidence of every sequence, merged candidates included."""
@@ -172,7 +186,7 @@ class ClosureLog(Checkpointed):
         moved = np.column_stack([onto[rows[:, 0]], onto[rows[:, 1]], shift, rows[:, 3]])
         self._candidate.replace(moved[~lost])
         self._evidence.replace(evidence[~lost].copy())
-        self._lines = None
+        self._lines = self._begun = None
 
     def take(self, number: np.ndarray) -> np.ndarray:
         """Reduces the log to candidates of keyframes that remain, and to sequences that have some.
@@ -194,7 +208,7 @@ class ClosureLog(Checkpointed):
         for array in self._growable_arrays().values():
             if array is not self._candidate and array is not self._evidence:
                 array.replace(array.rows[sequences])
-        self._lines = None
+        self._lines = self._begun = None
         return sequences
 
     def take_verdicts(self, other: ClosureLog, sequences: np.ndarray) -> None:
@@ -352,7 +366,7 @@ class ClosureLog(Checkpointed):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
-        self._lines = None
+        self._lines = self._begun = None
 
 
 def write_closures(path: Path, table: np.ndarray, first_step: np.ndarray) -> None:

@@ -167,22 +167,34 @@ class MapCovariance:
 
     def __init__(self, fit: MapFit, problem: MapProblem) -> None:
         self._poses, self._equations = fit.poses, System(problem).linearise(fit)
+        self._bent, self._calibrated = self._equations.bent()
 
     def calibration_sd(self) -> tuple[float, float]:
         """Standard deviations of heading bias, rad/m, and turn error, rad/rad (0 where it is fixed)."""
-        sd = np.sqrt(np.diag(self._equations.calibration_covariance()))
+        if self._equations.factor is None:
+            return np.inf, np.inf if len(self._calibrated) > 1 else 0.0
+        sd = np.sqrt(np.diag(np.linalg.inv(self._calibrated)))
         return float(sd[0]), float(sd[1]) if len(sd) > 1 else 0.0
 
     def relative(self, i: int, j: int, turn: float) -> np.ndarray:
         """[3, 3] covariance of keyframe j in the frame of keyframe i turned by `turn`."""
+        factor = self._equations.factor
+        if factor is None:
+            return np.full((3, 3), np.inf)
         a, b = self._poses[i], self._poses[j]
         c, s = np.cos(a[2] + turn), np.sin(a[2] + turn)
         dx, dy = (b - a)[:2]
         by_i = np.array([[-c, -s, c * dy - s * dx], [s, -c, -c * dx - s * dy], [0, 0, -1.0]])
         by_j = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-        change = np.zeros((len(self._poses), 3, 3))
-        change[i], change[j] = by_i.T, by_j.T
-        return self._equations.covariance(change[1:])
+        free = [(self._equations.place[k - 1], by) for k, by in ((i, by_i), (j, by_j)) if k > 0]
+        right = np.zeros((len(self._bent), 3, 3))
+        for at, by in free:
+            right[at] += by.T
+        spread, none = factor.solve(right), np.zeros((3, 3))
+        pull = sum((by @ self._bent[at] for at, by in free), none[:, : len(self._calibrated)])
+        return sum((by @ spread[at] for at, by in free), none) + pull @ np.linalg.solve(
+            self._calibrated, pull.T
+        )
 
 
 def _mean_costs(

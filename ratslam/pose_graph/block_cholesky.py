@@ -83,13 +83,55 @@ def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     low fill-in."""
     if not count:
         return np.zeros(0, np.int64)
-    ones, nodes = np.ones(len(a)), np.arange(count)
+    start, row = neighbours(count, a, b)
+    column = np.repeat(np.arange(count), np.diff(start))
     # Only the sparsity pattern matters; the diagonal makes the matrix regular.
-    edges = csc_matrix((ones, (a, b)), (count, count))
-    degree = csc_matrix((np.full(count, 4.0 * len(a) + 1), (nodes, nodes)), (count, count))
+    values = np.where(row == column, 4.0 * len(a) + 1, 1.0)
+    matrix = csc_matrix((values, row, start), (count, count))
     options = {"SymmetricMode": True}
-    factor = splu(edges + edges.T + degree, "MMD_AT_PLUS_A", options=options, diag_pivot_thresh=0.0)
+    factor = splu(matrix, "MMD_AT_PLUS_A", options=options, diag_pivot_thresh=0.0)
     return factor.perm_c.astype(np.int64)
+
+
+@compiled
+def neighbours(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the column of each of n nodes begins [n + 1], and the rows of the columns, ascending: the node
+    itself and those that an edge from a [M] to b [M] joins it to."""
+    start = np.zeros(count + 1, np.int32)
+    for m in range(len(a)):
+        start[a[m] + 1] += 1
+        start[b[m] + 1] += 1
+    for k in range(count):
+        start[k + 1] += start[k] + 1
+    rows, end = np.empty(start[count], np.int32), start[:count].copy()
+    for k in range(count):
+        insert(rows, start[k], end, k, k)
+    for m in range(len(a)):
+        insert(rows, start[a[m]], end, a[m], b[m])
+        insert(rows, start[b[m]], end, b[m], a[m])
+    kept = 0
+    for k in range(count):
+        first, start[k] = start[k], kept
+        for p in range(first, end[k]):
+            rows[kept] = rows[p]
+            kept += 1
+    start[count] = kept
+    return start, rows[:kept]
+
+
+@compiled
+def insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int) -> None:
+    """Puts a row into its place among the ascending `rows` of a column, which begin at `first` and end before
+    end[column], unless it is there."""
+    p = end[column]
+    while p > first and rows[p - 1] > row:
+        p -= 1
+    if p > first and rows[p - 1] == row:
+        return
+    for q in range(end[column], p, -1):
+        rows[q] = rows[q - 1]
+    rows[p] = row
+    end[column] += 1
 
 
 @compiled
@@ -111,17 +153,9 @@ def count_factor(start: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 @compiled
-def subtract_product(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """out [3, 3] -= a b."""
-    for r in range(3):
-        a0, a1, a2 = a[r, 0], a[r, 1], a[r, 2]
-        for c in range(3):
-            out[r, c] -= a0 * b[0, c] + a1 * b[1, c] + a2 * b[2, c]
-
-
-@compiled
-def invert(a: np.ndarray, out: np.ndarray) -> float:
-    """out = the inverse of the symmetric a [3, 3]; returns its determinant, or 0 if it is not positive."""
+def invert(a: np.ndarray, inverse: np.ndarray, k: int) -> float:
+    """inverse[k] = the inverse of the symmetric a [3, 3]; returns its determinant, or 0 if it is not
+    positive."""
     m00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
     m01 = a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]
     m02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
@@ -131,26 +165,30 @@ def invert(a: np.ndarray, out: np.ndarray) -> float:
     determinant = a[0, 0] * m00 + a[1, 0] * m01 + a[2, 0] * m02
     if not (a[0, 0] > 0 and m22 > 0 and determinant > 0):
         return 0.0
-    out[0, 0], out[1, 1], out[2, 2] = m00 / determinant, m11 / determinant, m22 / determinant
-    out[0, 1] = out[1, 0] = m01 / determinant
-    out[0, 2] = out[2, 0] = m02 / determinant
-    out[1, 2] = out[2, 1] = m12 / determinant
+    inverse[k, 0, 0] = m00 / determinant
+    inverse[k, 1, 1] = m11 / determinant
+    inverse[k, 2, 2] = m22 / determinant
+    inverse[k, 0, 1] = inverse[k, 1, 0] = m01 / determinant
+    inverse[k, 0, 2] = inverse[k, 2, 0] = m02 / determinant
+    inverse[k, 1, 2] = inverse[k, 2, 1] = m12 / determinant
     return determinant
 
 
 @compiled
-def find_row(k: int, above: np.ndarray, parent: np.ndarray, seen: np.ndarray, pattern: np.ndarray) -> int:
+def find_row(
+    k: int, start: np.ndarray, row: np.ndarray, parent: np.ndarray, seen: np.ndarray, pattern: np.ndarray
+) -> int:
     """Writes the columns of row k of L, in an order in which they can be eliminated, to the end of `pattern`
     [n]; returns where they begin there.
 
     Args:
-        above: [m] rows of the blocks above the diagonal in column k. parent: [n] elimination tree.
-        seen: [n] the last row in which each column was found.
+        start, row: the blocks above the diagonal, by columns. parent: [n] elimination tree. seen: [n] the
+            last row in which each column was found.
     """
     top = len(pattern)
     seen[k] = k
-    for i in above:
-        length = 0
+    for p in range(start[k], start[k + 1]):
+        i, length = row[p], 0
         while seen[i] != k:
             pattern[length] = i
             length += 1
@@ -182,15 +220,20 @@ def factorise(
     logarithm = 0.0
     for k in range(n):
         for p in range(start[k], start[k + 1]):
-            column[row[p]] += above[p]
-        top = find_row(k, row[start[k] : start[k + 1]], parent, seen, pattern)
-        pivot[:] = diagonal[k]
+            i = row[p]
+            for r in range(3):
+                for c in range(3):
+                    column[i, r, c] += above[p, r, c]
+        top = find_row(k, start, row, parent, seen, pattern)
+        for r in range(3):
+            for c in range(3):
+                pivot[r, c] = diagonal[k, r, c]
         for t in range(top, n):
             i = pattern[t]
-            y, end = column[i], filled[i]
-            y00, y01, y02 = y[0, 0], y[0, 1], y[0, 2]
-            y10, y11, y12 = y[1, 0], y[1, 1], y[1, 2]
-            y20, y21, y22 = y[2, 0], y[2, 1], y[2, 2]
+            end = filled[i]
+            y00, y01, y02 = column[i, 0, 0], column[i, 0, 1], column[i, 0, 2]
+            y10, y11, y12 = column[i, 1, 0], column[i, 1, 1], column[i, 1, 2]
+            y20, y21, y22 = column[i, 2, 0], column[i, 2, 1], column[i, 2, 2]
             for p in range(first[i], end):
                 j = rows[p]
                 for r in range(3):
@@ -199,15 +242,20 @@ def factorise(
                     column[j, r, 1] -= b0 * y01 + b1 * y11 + b2 * y21
                     column[j, r, 2] -= b0 * y02 + b1 * y12 + b2 * y22
             for r in range(3):  # the block (k, i) of L is y^T D^-1
+                x0, x1, x2 = column[i, 0, r], column[i, 1, r], column[i, 2, r]
+                b0 = x0 * inverse[i, 0, 0] + x1 * inverse[i, 1, 0] + x2 * inverse[i, 2, 0]
+                b1 = x0 * inverse[i, 0, 1] + x1 * inverse[i, 1, 1] + x2 * inverse[i, 2, 1]
+                b2 = x0 * inverse[i, 0, 2] + x1 * inverse[i, 1, 2] + x2 * inverse[i, 2, 2]
+                blocks[end, r, 0], blocks[end, r, 1], blocks[end, r, 2] = b0, b1, b2
+                pivot[r, 0] -= b0 * y00 + b1 * y10 + b2 * y20
+                pivot[r, 1] -= b0 * y01 + b1 * y11 + b2 * y21
+                pivot[r, 2] -= b0 * y02 + b1 * y12 + b2 * y22
+            for r in range(3):
                 for c in range(3):
-                    blocks[end, r, c] = (
-                        y[0, r] * inverse[i, 0, c] + y[1, r] * inverse[i, 1, c] + y[2, r] * inverse[i, 2, c]
-                    )
-            subtract_product(blocks[end], y, pivot)
+                    column[i, r, c] = 0.0
             rows[end] = k
             filled[i] = end + 1
-            y[:] = 0.0
-        determinant = invert(pivot, inverse[k])
+        determinant = invert(pivot, inverse, k)
         if determinant == 0.0:
             return False, rows, blocks, inverse, -np.inf
         logarithm += np.log(determinant)
@@ -222,19 +270,19 @@ def solve_in_place(
     n, columns = len(right), right.shape[2]
     for k in range(n):
         for p in range(first[k], first[k + 1]):
-            block, j = blocks[p], rows[p]
+            j = rows[p]
             for c in range(columns):
                 x, y, z = right[k, 0, c], right[k, 1, c], right[k, 2, c]
                 for r in range(3):
-                    right[j, r, c] -= block[r, 0] * x + block[r, 1] * y + block[r, 2] * z
+                    right[j, r, c] -= blocks[p, r, 0] * x + blocks[p, r, 1] * y + blocks[p, r, 2] * z
     for k in range(n - 1, -1, -1):
-        d = inverse[k]
         for c in range(columns):
             x, y, z = right[k, 0, c], right[k, 1, c], right[k, 2, c]
             for r in range(3):
-                right[k, r, c] = d[r, 0] * x + d[r, 1] * y + d[r, 2] * z
-            for p in range(first[k], first[k + 1]):
-                block, j = blocks[p], rows[p]
+                right[k, r, c] = inverse[k, r, 0] * x + inverse[k, r, 1] * y + inverse[k, r, 2] * z
+        for p in range(first[k], first[k + 1]):
+            j = rows[p]
+            for c in range(columns):
                 x, y, z = right[j, 0, c], right[j, 1, c], right[j, 2, c]
                 for r in range(3):
-                    right[k, r, c] -= block[0, r] * x + block[1, r] * y + block[2, r] * z
+                    right[k, r, c] -= blocks[p, 0, r] * x + blocks[p, 1, r] * y + blocks[p, 2, r] * z
