@@ -131,7 +131,7 @@ class RecallBackend(Backend):
         self.cell = config.pose_cells.cell_size
         noise = self.recall.excite, self.recall.excite_heading
         self.network = Network(config.pose_cells, *noise, self.recall.miss, self.recall.leak)
-        self._anchor = jax.jit(self._anchored)
+        self._anchor, self._follow = jax.jit(self._anchored), jax.jit(self.follow_map)
 
     def init(self, key: Array, capacity: int) -> RecallState:
         """All is novelty, and no keyframes. `key` is not used: nothing is random."""
@@ -167,8 +167,11 @@ class RecallBackend(Backend):
     def apply_map_feedback(self, state: RecallState, feedback: MapFeedback) -> RecallState:
         """View cells take over the poses, bias and scales of the map, and pose cells follow them: what the
         last view said of each keyframe is driven again at its new pose."""
-        memory = recall_memory.apply_map_feedback(state.memory, feedback)
-        return state._replace(memory=memory, belief=self._anchor(memory, state.belief))
+        if not len(feedback.poses):
+            return state
+        memory = state.memory
+        memory, belief = self._follow(memory, state.belief, recall_memory.pack_feedback(memory, feedback))
+        return state._replace(memory=memory, belief=belief)
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
@@ -202,6 +205,13 @@ class RecallBackend(Backend):
     def no_belief(self, capacity: int) -> Belief:
         """All is novelty, with view cells for so many keyframes."""
         return pose_cells.start(self.network, (len(sector_shifts(self.recall)), capacity))
+
+    def follow_map(
+        self, memory: Memory, belief: Belief, feedback: recall_memory.PackedFeedback
+    ) -> tuple[Memory, Belief]:
+        """Memory and belief of a map that has moved; pure."""
+        memory = recall_memory.take_feedback(memory, feedback)
+        return memory, self._anchored(memory, belief)
 
     def _anchored(self, memory: Memory, belief: Belief) -> Belief:
         cells = filter.view_cells(self.recall, memory)

@@ -233,14 +233,17 @@ class Session:
         if sides != self._sides:
             self.state, self._sides = self.backend.cover(self.state, sides), sides
 
+    def follow_map(self, merged: Any, feedback: Any) -> None:
+        """Lets the state follow the map, at the start of each chunk: `Map.merge` and `Map.feedback`."""
+        self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
+        self._cover(feedback)
+        if merged is not None:
+            self.state = self.backend.merge_rows(self.state, merged)
+        self.state = self.backend.apply_map_feedback(self.state, feedback)
+
     def _advance(self, observations: list[Observation]) -> list[Step]:
         if self.steps % CHUNK == 0:
-            merged, feedback = self.map.merge(), self.map.feedback()
-            self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
-            self._cover(feedback)
-            if merged is not None:
-                self.state = self.backend.merge_rows(self.state, merged)
-            self.state = self.backend.apply_map_feedback(self.state, feedback)
+            self.follow_map(self.map.merge(), self.map.feedback())
         count = len(observations)
         self._layout = self._layout or layout_of(observations[0])
         chunk = allocate(self._layout, CHUNK)

@@ -142,25 +142,47 @@ def begin_piece(memory: Memory) -> Memory:
     )
 
 
-def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
-    """The memory with the map's current poses and view metric; copies, because the map changes its arrays in
-    place."""
+class PackedFeedback(NamedTuple):
+    """`MapFeedback` in arrays of fixed shapes.
+
+    Attributes:
+        rows: [5, C] x, y, heading, its cosine and sine of all keyframes, 0 after the last. values: [8] pose
+            of the newest keyframe, bias, turn error, distance, angle, scale. likeness: see `MapFeedback`.
+    """
+
+    rows: Array
+    values: Array
+    likeness: Array
+
+
+def pack_feedback(memory: Memory, feedback: MapFeedback) -> PackedFeedback:
+    """The feedback of a map of a keyframe or more, for a memory; copied, because the map changes its arrays
+    in place."""
     dtype, count = memory.x.dtype, len(feedback.poses)
-    if not count:
-        return memory
     newest = feedback.poses[-1] if feedback.start is None else feedback.start
-    full = np.zeros((5, memory.x.shape[0]))
+    rows = np.zeros((5, memory.x.shape[0]), dtype)
     x, y, heading = feedback.poses.T
-    full[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
-    x, y, heading, cosine, sine = (jnp.asarray(row, dtype) for row in full)
-    values = (feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale)
-    bias, turn_error, since, angle, scale = (jnp.asarray(value, dtype) for value in values)
-    if feedback.likeness.size:
-        memory = memory._replace(likeness=jnp.array(feedback.likeness, dtype))
+    rows[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
+    rest = feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale
+    likeness = np.array(feedback.likeness, dtype) if feedback.likeness.size else memory.likeness
+    return PackedFeedback(rows, np.array([*newest, *rest], dtype), likeness)
+
+
+def take_feedback(memory: Memory, feedback: PackedFeedback) -> Memory:
+    """The memory with the map's current poses and view metric."""
+    x, y, heading, cosine, sine = feedback.rows
+    bias, turn_error, since, angle, scale = feedback.values[3:]
     return memory._replace(
-        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=jnp.array(newest, dtype),
-        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale,
+        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=feedback.values[:3],
+        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=feedback.likeness,
     )  # fmt: skip
+
+
+def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
+    """The memory with the feedback of a map, of an empty one as it is."""
+    if not len(feedback.poses):
+        return memory
+    return take_feedback(memory, PackedFeedback(*map(jnp.asarray, pack_feedback(memory, feedback))))
 
 
 def merge_rows(memory: Memory, merged: MergedRows) -> Memory:

@@ -20,6 +20,11 @@ def wrap(angle: Array) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """[..., 3] the motion a followed by b, which is given in the frame of a."""
+    if _is_single(a) and _is_single(b):
+        x, y, heading = a.tolist()
+        dx, dy, turn = b.tolist()
+        c, s = float(np.cos(heading)), float(np.sin(heading))
+        return np.array([x + c * dx - s * dy, y + s * dx + c * dy, wrap(heading + turn)])
     xp, a, b = _arrays(a, b)
     c, s = xp.cos(a[..., 2]), xp.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
@@ -29,6 +34,11 @@ def compose(a: Array, b: Array) -> Array:
 
 def between(a: Array, b: Array) -> Array:
     """[..., 3] b in the frame of a, so that compose(a, between(a, b)) == b."""
+    if _is_single(a) and _is_single(b):
+        x, y, heading = a.tolist()
+        to_x, to_y, to_heading = b.tolist()
+        c, s, dx, dy = float(np.cos(heading)), float(np.sin(heading)), to_x - x, to_y - y
+        return np.array([c * dx + s * dy, c * dy - s * dx, wrap(to_heading - heading)])
     xp, a, b = _arrays(a, b)
     c, s = xp.cos(a[..., 2]), xp.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
@@ -48,16 +58,29 @@ def correct_heading(motion: Array, length: Array, bias: Array, turn_error: Array
         length: [...] distance travelled in each motion, m. bias: correction, rad/m. turn_error: correction as
             a share of the turn of each motion, rad/rad.
     """
+    if _is_single(motion):
+        return bend_motion(motion, bias * length + turn_error * motion[2])
     xp, motion = _arrays(motion)
     return bend_motion(motion, bias * xp.asarray(length) + turn_error * motion[..., 2])
 
 
 def bend_motion(motion: Array, turn: Array) -> Array:
     """Motions [..., 3] turned by [...] rad that grow evenly along each motion."""
+    if _is_single(motion) and np.ndim(turn) == 0:
+        x, y, heading = motion.tolist()
+        turn = float(turn)
+        c, s = float(np.cos(turn / 2)), float(np.sin(turn / 2))
+        return np.array([c * x - s * y, s * x + c * y, wrap(heading + turn)])
     xp, motion, turn = _arrays(motion, turn)
     c, s = xp.cos(turn / 2), xp.sin(turn / 2)
     x, y = motion[..., 0], motion[..., 1]
     return xp.stack([c * x - s * y, s * x + c * y, wrap(motion[..., 2] + turn)], axis=-1)
+
+
+def _is_single(pose: Array) -> bool:
+    """Whether this is one pose [3] of NumPy in double precision: such are computed as numbers, with the same
+    bits and a third of the time."""
+    return type(pose) is np.ndarray and pose.shape == (3,) and pose.dtype == np.float64
 
 
 def _arrays(*values: Array) -> tuple[Any, ...]:
