@@ -306,6 +306,11 @@ def add_tables(tables: Commands) -> None:
     cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
     add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
+    batches = add("batches", _batch_lines, "many sets or sessions in one call, on a GPU too", "--steps 160")
+    add_count(batches, "--sets", 1000, "parameter sets in one call")
+    add_count(batches, "--sessions", 256, "sessions in one call")
+    add_count(batches, "--steps", 1600, "steps of a session")
+    add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
     precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
     add_count(precision, "--seeds", 20, "sessions per method")
     precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
@@ -409,6 +414,15 @@ def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
         from ratslam.experiments.tables.cycles import cycle_table
 
         yield from cycle_table(arguments.rows, arguments.rounds)
+
+
+def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.metrics.resources import one_core
+
+    with one_core():
+        from ratslam.experiments.tables.batches import batch_table
+
+        yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
 
 
 def _precision_lines(arguments: argparse.Namespace) -> Iterator[str]:

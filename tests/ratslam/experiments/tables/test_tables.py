@@ -10,7 +10,7 @@ import pytest
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
 from ratslam.config.run_config import load_config
-from ratslam.experiments.tables import buildings, grid, laser, recordings, touch
+from ratslam.experiments.tables import batches, buildings, grid, laser, recordings, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from tactile.base.errors import InputError
@@ -250,3 +250,16 @@ def write_building(folder, name, turned=0.0):
 def test_the_command_refuses_unknown_rows(capsys):
     assert main(["reproduce", "tables", "touch", "--rows", "mian"]) == 2
     assert "main; clean" in capsys.readouterr().err
+
+
+def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
+    for name, value in {"SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
+        monkeypatch.setattr(batches, name, value)
+    lines = list(batches.batch_table(sets=10, sessions=3, steps=40, rounds=1, folder=ROOT))
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
+    assert [what.split(",")[0] for what, _, _ in rows] == [
+        "one network of 11 cells a side", "one network of 11 cells a side", "2 sets of 21 cells",
+        "2 sets of 21 cells", "2 sets of 21 cells", "2 sessions of 40 steps", "2 sessions of 40 steps",
+    ]  # fmt: skip
+    assert all(device == "one core" and float(us) > 0 for _, device, us in rows)
+    assert float(rows[5][0].rsplit(" ", 1)[1]) < 1e-9
