@@ -116,8 +116,11 @@ class KeyframeMapConfig(Settings):
     are not merged."""
     merge_newest: PositiveInt = 1000
     """Number of newest keyframes that are not merged."""
-    solve_every: PositiveInt = 1
-    """Keyframes between two optimisations while a sequence goes on."""
+    solve_every: PositiveInt = 20
+    """Most keyframes between two optimisations while a sequence goes on."""
+    solve_strayed: NonNegativeFloat = 0.1
+    """Sum of the corrections of the newest keyframe by closures, in their standard deviations, after which
+    the map is optimised earlier: a closure that fits changes nothing. 0: never earlier."""
     iterations: PositiveInt = 4
     """Solver iterations when a loop closes."""
     settling: PositiveInt = 15

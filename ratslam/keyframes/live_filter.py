@@ -22,13 +22,14 @@ class LiveFilter(Checkpointed):
     """Covariance of the newest keyframe's pose against the keyframes that it was matched to.
 
     Attributes:
-        covariance: [3, 3] in the frame of the map, m, m, rad.
+        covariance: [3, 3] in the frame of the map, m, m, rad. strayed: sum of the corrections since the last
+            optimisation, standard deviations of a closure.
     """
 
-    VALUES = ("covariance",)
+    VALUES = ("covariance", "strayed")
 
     def __init__(self) -> None:
-        self.covariance = np.zeros((3, 3))
+        self.covariance, self.strayed = np.zeros((3, 3)), 0.0
 
     def advance(self, graph: KeyframeGraph) -> None:
         """Adds the noise of the odometry into the newest keyframe of `graph`; all is forgotten where a piece
@@ -54,6 +55,12 @@ class LiveFilter(Checkpointed):
         noise = np.diag(graph.closure_variance()) / max(weight, LEAST_WEIGHT)
         gain = np.linalg.solve(self.covariance + noise, self.covariance).T
         self.covariance = self.covariance - gain @ self.covariance
-        corrected: np.ndarray = graph.pose.rows[candidate.keyframe] + gain @ error
+        moved: np.ndarray = gain @ error
+        self.strayed += float(np.sqrt((moved**2 / graph.closure_variance()).sum()))
+        corrected: np.ndarray = graph.pose.rows[candidate.keyframe] + moved
         corrected[2] = wrap(corrected[2])
         return corrected
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`; in earlier map files nothing has strayed."""
+        super().restore({"strayed/0": np.array(0.0)} | arrays)

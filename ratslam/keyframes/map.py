@@ -335,7 +335,9 @@ class KeyframeMap(Checkpointed, Map):
         """Whether the map is optimised for one more member of an accepted sequence."""
         if self.log.verdict(sequence) != Verdict.ACCEPTED:
             return False
-        return sequence != self._solved[0] or self._graph.ever - self._solved[1] >= self.config.solve_every
+        strayed = self.config.solve_strayed and self._live.strayed > self.config.solve_strayed
+        long_ago = self._graph.ever - self._solved[1] >= self.config.solve_every
+        return sequence != self._solved[0] or long_ago or bool(strayed)
 
     def _is_pose_reliable(self) -> bool:
         """Whether the drift since the last closure is small enough to find a known experience by pose."""
@@ -374,6 +376,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def _optimise(self) -> None:
         self._graph.optimise(self.log)
+        self._live.strayed = 0.0
         self._forget_solution()
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
