@@ -306,6 +306,7 @@ def add_tables(tables: Commands) -> None:
     cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
     add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
+    cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
     batches = add("batches", _batch_lines, "many sets or sessions in one call, on a GPU too", "--steps 160")
     add_count(batches, "--sets", 1000, "parameter sets in one call")
     add_count(batches, "--sessions", 256, "sessions in one call")
@@ -411,9 +412,12 @@ def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from evaluation.metrics.resources import one_core
 
     with one_core():
-        from ratslam.experiments.tables.cycles import cycle_table
+        from ratslam.experiments.tables.cycles import cycle_table, profile_table
 
-        yield from cycle_table(arguments.rows, arguments.rounds)
+        if arguments.profile:
+            yield from profile_table(arguments.rows)
+        else:
+            yield from cycle_table(arguments.rows, arguments.rounds)
 
 
 def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:

@@ -152,18 +152,19 @@ def compute_log_ratios(
             into each keyframe between. turned: by which the match is turned, rad. old: number of keyframes
             that could be recalled. gate: variance of position and heading added. ratios: [G].
     """
-    apart = np.empty(old)
+    apart, share = np.empty(old), 1 / TURN
+    measured, driven, net = total[:old, 0].copy(), total[:old, 1].copy(), total[:old, 2].copy()
     for g in points:
         x, y, bias, turn_error = path[g, 0], path[g, 1], grid[g, 0], grid[g, 1]
         end_x, end_y = np.float64(x[j]), np.float64(y[j])
         xx, xy, yy, xh, yh, hh = invert_covariance(x, y, variance, i, end_x, end_y, gate)
         heading = total[j, 0] + total[j, 1] * bias + total[j, 2] * turn_error + turned
+        xy, xh, yh = 2 * xy, 2 * xh, 2 * yh
         for k in range(old):
             dx, dy = x[k] - end_x, y[k] - end_y
-            turn = total[k, 0] + total[k, 1] * bias + total[k, 2] * turn_error - heading
-            turn -= TURN * np.rint(turn / TURN)
-            across = 2 * (xy * dx * dy + turn * (xh * dx + yh * dy))
-            apart[k] = xx * dx * dx + yy * dy * dy + hh * turn * turn + across
+            turn = measured[k] + driven[k] * bias + net[k] * turn_error - heading
+            turn -= TURN * np.floor(turn * share + 0.5)
+            apart[k] = dx * (xx * dx + xy * dy + xh * turn) + dy * (yy * dy + yh * turn) + hh * turn * turn
         density = 0.0
         for k in range(old):
             if apart[k] < FAR:
