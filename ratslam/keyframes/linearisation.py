@@ -19,14 +19,16 @@ class Measurements(NamedTuple):
     """M relative poses of keyframes and what is known of them.
 
     Attributes:
-        i, j: [M] keyframes. information: [M, 3] of keyframe j in the frame of keyframe i. regressors: [M, K]
-            distance (m) and turn (rad) by which the K calibration parameters turn each measurement.
+        i, j: [M] keyframes. motion: [M, 3] measured pose of keyframe j in the frame of keyframe i (m, m,
+            rad). information: [M, 3] of it. regressors: [M, 2] distance (m) and turn (rad) by which heading
+            bias and turn error bend each measurement, 0 for closures.
         at_i, at_j: [M] position of the keyframes in the order of elimination, -1 for keyframe 0.
         slot: [M] block above the diagonal, -1 for edges of keyframe 0.
     """
 
     i: np.ndarray
     j: np.ndarray
+    motion: np.ndarray
     information: np.ndarray
     regressors: np.ndarray
     at_i: np.ndarray
@@ -51,23 +53,59 @@ class Blocks(NamedTuple):
 
 @compiled
 def measurement_errors(
-    poses: np.ndarray, i: np.ndarray, j: np.ndarray, measured: np.ndarray, information: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Errors [M, 3] (m, m, rad) of measured relative poses [M, 3], and their chi-squares [M]."""
-    error, chi2 = np.empty((len(i), 3)), np.empty(len(i))
-    for m in range(len(i)):
-        a, b = i[m], j[m]
+    edges: Measurements, poses: np.ndarray, bias: float, turn_error: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The measurements [M, 3] without the systematic errors of the odometry, their errors [M, 3] (m, m, rad),
+    and their chi-squares [M]."""
+    count = len(edges.i)
+    measured, error, chi2 = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    for m in range(count):
+        a, b = edges.i[m], edges.j[m]
+        turn = bias * edges.regressors[m, 0] + turn_error * edges.regressors[m, 1]
+        c, s = np.cos(turn / 2), np.sin(turn / 2)
+        x, y, heading = edges.motion[m, 0], edges.motion[m, 1], edges.motion[m, 2]
+        measured[m, 0], measured[m, 1] = c * x - s * y, s * x + c * y
+        measured[m, 2] = PI - (PI - heading - turn) % (2 * PI)
         c, s = np.cos(poses[a, 2]), np.sin(poses[a, 2])
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         error[m, 0] = c * dx + s * dy - measured[m, 0]
         error[m, 1] = c * dy - s * dx - measured[m, 1]
-        turn = poses[b, 2] - poses[a, 2] - measured[m, 2]
-        error[m, 2] = PI - (PI - turn) % (2 * PI)
+        turned = poses[b, 2] - poses[a, 2] - measured[m, 2]
+        error[m, 2] = PI - (PI - turned) % (2 * PI)
         total = 0.0
         for r in range(3):
-            total += error[m, r] ** 2 * information[m, r]
+            total += error[m, r] ** 2 * edges.information[m, r]
         chi2[m] = total
-    return error, chi2
+    return measured, error, chi2
+
+
+@compiled
+def weigh_closures(
+    chi2: np.ndarray, first: int, sequence: np.ndarray, scale: np.ndarray, limit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What measurements with chi-squares [M] are trusted, the closures from number `first` on by sequence.
+
+    Args:
+        sequence: [M - first]. scale, limit: [R] of each sequence, see `LoopClosures`. The chi-square of one
+            closure is limited, so that one that is wrong does not cost its whole sequence.
+
+    Returns:
+        trust [M], 1 for odometry; weight [R] and mean limited chi-square [R] of each sequence.
+    """
+    trust, mean, members = np.ones(len(chi2)), np.zeros(len(scale)), np.zeros(len(scale))
+    for k in range(len(sequence)):
+        cost, most = chi2[first + k], limit[sequence[k]]
+        if most < np.inf:
+            share = most / (most + cost)
+            trust[first + k] = share**2
+            cost *= share
+        mean[sequence[k]] += cost
+        members[sequence[k]] += 1
+    mean /= np.maximum(members, 1)
+    weight = (scale / (scale + mean)) ** 2
+    for k in range(len(sequence)):
+        trust[first + k] *= weight[sequence[k]]
+    return trust, weight, mean
 
 
 @compiled
@@ -86,7 +124,7 @@ def add_measurements(
     out, because loops over their many zeros take several times as long.
     """
     diagonal, above, right, corner, slope = blocks
-    parameters = edges.regressors.shape[1]
+    parameters = len(slope)
     for m in range(len(trust)):
         heading, at_i, at_j, slot = poses[edges.i[m], 2], edges.at_i[m], edges.at_j[m], edges.slot[m]
         c, s = np.cos(heading), np.sin(heading)

@@ -19,6 +19,7 @@ from ratslam.keyframes.linearisation import (
     add_measurements,
     empty_blocks,
     measurement_errors,
+    weigh_closures,
 )
 from ratslam.pose_graph.block_cholesky import BlockPattern
 from tactile.base.se2 import bend_motion, correct_heading, wrap
@@ -197,19 +198,6 @@ class MapCovariance:
         )
 
 
-def _mean_costs(
-    chi2: np.ndarray, closures: LoopClosures, members: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weights [M] of single closures that limit the chi-square [M] of each to `cost_limit`, so that one wrong
-    closure does not cost its whole sequence; and the mean limited chi-square [R] of each sequence."""
-    limit = np.broadcast_to(closures.cost_limit, closures.scale.shape)[closures.sequence]
-    weights = np.ones_like(chi2)
-    if np.isfinite(limit).all():
-        share = limit / (limit + chi2)
-        weights, chi2 = share**2, share * chi2
-    return weights, np.bincount(closures.sequence, chi2, len(members)) / np.maximum(members, 1)
-
-
 class System:
     """The linear equations of a problem; their sparsity pattern is computed once.
 
@@ -240,12 +228,15 @@ class System:
         none = np.zeros(len(closures.i))
         lengths = np.concatenate([chain.length, links.length, none])
         turns = np.concatenate([chain.motion[:, 2], links.turn, none])
-        regressors = np.column_stack([lengths, turns])[:, : 1 + int(prior.turn_error_sd > 0)]
+        turned = np.column_stack([none, none, closures.turn])
+        motion = np.concatenate([chain.motion, links.motion, turned])
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         information = 1 / np.concatenate([chain.variance, links.variance, spread])
-        turned = np.column_stack([none, none, closures.turn])
-        self._edges = Measurements(i, j, information, np.ascontiguousarray(regressors), at_i, at_j, slot)
-        self._problem, self._turned = problem, turned
+        regressors = np.column_stack([lengths, turns])
+        self._edges = Measurements(i, j, motion, information, regressors, at_i, at_j, slot)
+        limit = np.broadcast_to(np.asarray(closures.cost_limit, float), closures.scale.shape)
+        self._closures = len(chain.length) + len(links.length), closures.sequence, closures.scale, limit
+        self._parameters, self._problem = 1 + int(prior.turn_error_sd > 0), problem
 
     def solve(self, start: MapFit, iterations: int, tolerance: float = 1e-4) -> MapFit:
         """See `solve`."""
@@ -282,10 +273,10 @@ class System:
     def robust_cost(self, fit: MapFit) -> float:
         """The cost that `solve` minimises: chi-square of odometry and calibration and robust cost of
         closures."""
-        _, chi2, chained, _ = self._errors(fit)
-        closures, members = self._problem.closures, self._members
-        _, mean = _mean_costs(chi2[chained:], closures, members)
-        lost = members * closures.scale * mean / (closures.scale + mean)
+        scale, chained = self._problem.closures.scale, self._closures[0]
+        _, _, chi2 = self._errors(fit)
+        _, _, mean = weigh_closures(chi2, *self._closures)
+        lost = self._members * scale * mean / (scale + mean)
         off, tight = _calibration(fit, self._problem.prior)
         return float(chi2[:chained].sum() + lost.sum() + (tight * off**2).sum())
 
@@ -299,15 +290,12 @@ class System:
         return -0.5 * (self.robust_cost(fit) + information + spread)
 
     def linearise(self, fit: MapFit) -> Equations:
-        _, closures, prior, _ = self._problem
-        edges, poses = self._edges, np.ascontiguousarray(fit.poses)
-        error, chi2, chained, measured = self._errors(fit)
-        keep, mean = _mean_costs(chi2[chained:], closures, self._members)
-        weights = (closures.scale / (closures.scale + mean)) ** 2
-        trust = np.concatenate([np.ones(chained), keep * weights[closures.sequence]])
-        blocks = empty_blocks(self._pattern, edges.regressors.shape[1])
-        add_measurements(edges, poses, measured, error, trust, blocks)
-        off, tight = _calibration(fit, prior)
+        poses = np.ascontiguousarray(fit.poses)
+        measured, error, chi2 = self._errors(fit)
+        trust, weights, _ = weigh_closures(chi2, *self._closures)
+        blocks = empty_blocks(self._pattern, self._parameters)
+        add_measurements(self._edges, poses, measured, error, trust, blocks)
+        off, tight = _calibration(fit, self._problem.prior)
         return Equations(
             self._pattern.factorise(blocks.diagonal, blocks.above),
             self._pattern.place,
@@ -317,11 +305,7 @@ class System:
             weights,
         )
 
-    def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-        """Errors [M, 3] and chi-squares [M] of all measurements, the number of those of the odometry, and the
-        measurements [M, 3]."""
-        chain, links, edges = self._problem.chain, self._problem.links, self._edges
-        measured = np.concatenate([fit.corrected(chain), fit.corrected_links(links), self._turned])
+    def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `measurement_errors`."""
         poses = np.ascontiguousarray(fit.poses)
-        error, chi2 = measurement_errors(poses, edges.i, edges.j, measured, edges.information)
-        return error, chi2, len(chain.length) + len(links.length), measured
+        return measurement_errors(self._edges, poses, float(fit.bias), float(fit.turn_error))
