@@ -12,6 +12,8 @@ with start[k] <= p < start[k + 1] stands at (row[p], k). Source: the up-looking 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
@@ -39,7 +41,7 @@ class BlockPattern:
         keys, self.slot = np.unique(ends[:, 1] * count + ends[:, 0], return_inverse=True)
         self.row = keys % max(count, 1)
         self.start = np.searchsorted(keys, np.arange(count + 1) * count)
-        self._parent, self._first = count_factor(self.start, self.row)
+        self._layout = lay_out_factor(self.start, self.row)
 
     def factorise(self, diagonal: np.ndarray, above: np.ndarray) -> BlockFactor | None:
         """The factor of a matrix; None if it is not positive definite.
@@ -47,10 +49,9 @@ class BlockPattern:
         Args:
             diagonal: [n, 3, 3] blocks in the order of elimination. above: [B, 3, 3] blocks above it.
         """
-        regular, rows, blocks, inverse, logarithm = factorise(
-            self.start, self.row, diagonal, above, self._parent, self._first
-        )
-        return BlockFactor(self._first, rows, blocks, inverse, float(logarithm)) if regular else None
+        layout = self._layout
+        regular, blocks, inverse, logarithm = factorise(self.start, self.row, diagonal, above, layout)
+        return BlockFactor(layout.first, layout.rows, blocks, inverse, float(logarithm)) if regular else None
 
 
 class BlockFactor:
@@ -89,7 +90,8 @@ def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     values = np.where(row == column, 4.0 * len(a) + 1, 1.0)
     matrix = csc_matrix((values, row, start), (count, count))
     options = {"SymmetricMode": True}
-    factor = splu(matrix, "MMD_AT_PLUS_A", options=options, diag_pivot_thresh=0.0)
+    # One column at a time, because there is little fill-in.
+    factor = splu(matrix, "MMD_AT_PLUS_A", relax=1, panel_size=1, options=options, diag_pivot_thresh=0.0)
     return factor.perm_c.astype(np.int64)
 
 
@@ -134,11 +136,29 @@ def insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int)
     end[column] += 1
 
 
+class FactorLayout(NamedTuple):
+    """Where the m blocks of L stand.
+
+    Attributes:
+        first: [n + 1] where each column begins. rows: [m] of the blocks, by columns. begin: [n + 1] where
+            each row begins in `columns` and `slots`. columns: [m] of each row, in an order in which they can
+            be eliminated. slots: [m] place of these blocks among those by columns.
+    """
+
+    first: np.ndarray
+    rows: np.ndarray
+    begin: np.ndarray
+    columns: np.ndarray
+    slots: np.ndarray
+
+
 @compiled
-def count_factor(start: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The elimination tree [n] (-1: root), and where each column of L begins [n + 1]."""
+def lay_out_factor(start: np.ndarray, row: np.ndarray) -> FactorLayout:
+    """The layout of the factor of a matrix with blocks above the diagonal at `row` [B] of the columns that
+    begin at `start` [n + 1]."""
     n = len(start) - 1
-    parent, seen, filled = np.full(n, -1), np.full(n, -1), np.zeros(n + 1, np.int64)
+    parent, seen = np.full(n, -1), np.full(n, -1)  # of the elimination tree; the last row it was found in
+    first, begin = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.int64)
     for k in range(n):
         seen[k] = k
         for p in range(start[k], start[k + 1]):
@@ -146,10 +166,34 @@ def count_factor(start: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.nda
             while seen[i] != k:
                 if parent[i] == -1:
                     parent[i] = k
-                filled[i + 1] += 1
+                first[i + 1] += 1
+                begin[k + 1] += 1
                 seen[i] = k
                 i = parent[i]
-    return parent, np.cumsum(filled)
+    first, begin = np.cumsum(first), np.cumsum(begin)
+    rows, columns, slots = np.empty((3, first[n]), np.int64)
+    filled, path = first[:n].copy(), np.empty(n, np.int64)
+    seen[:] = -1
+    for k in range(n):
+        seen[k] = k
+        top = begin[k + 1]
+        for p in range(start[k], start[k + 1]):
+            i, length = row[p], 0
+            while seen[i] != k:
+                path[length] = i
+                length += 1
+                seen[i] = k
+                i = parent[i]
+            while length > 0:
+                length -= 1
+                top -= 1
+                columns[top] = path[length]
+        for t in range(top, begin[k + 1]):
+            i = columns[t]
+            slots[t] = filled[i]
+            rows[filled[i]] = k
+            filled[i] += 1
+    return FactorLayout(first, rows, begin, columns, slots)
 
 
 @compiled
@@ -175,48 +219,14 @@ def invert(a: np.ndarray, inverse: np.ndarray, k: int) -> float:
 
 
 @compiled
-def find_row(
-    k: int, start: np.ndarray, row: np.ndarray, parent: np.ndarray, seen: np.ndarray, pattern: np.ndarray
-) -> int:
-    """Writes the columns of row k of L, in an order in which they can be eliminated, to the end of `pattern`
-    [n]; returns where they begin there.
-
-    Args:
-        start, row: the blocks above the diagonal, by columns. parent: [n] elimination tree. seen: [n] the
-            last row in which each column was found.
-    """
-    top = len(pattern)
-    seen[k] = k
-    for p in range(start[k], start[k + 1]):
-        i, length = row[p], 0
-        while seen[i] != k:
-            pattern[length] = i
-            length += 1
-            seen[i] = k
-            i = parent[i]
-        while length > 0:
-            length -= 1
-            top -= 1
-            pattern[top] = pattern[length]
-    return top
-
-
-@compiled
 def factorise(
-    start: np.ndarray,
-    row: np.ndarray,
-    diagonal: np.ndarray,
-    above: np.ndarray,
-    parent: np.ndarray,
-    first: np.ndarray,
-) -> tuple[bool, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Whether the matrix is positive definite; the rows [m] and blocks [m, 3, 3] of L by columns that begin
-    at `first`; the inverse blocks [n, 3, 3] of D; the logarithm of the determinant."""
-    n = len(diagonal)
-    rows, blocks = np.empty(first[n], np.int64), np.empty((first[n], 3, 3))
-    inverse = np.empty((n, 3, 3))
+    start: np.ndarray, row: np.ndarray, diagonal: np.ndarray, above: np.ndarray, layout: FactorLayout
+) -> tuple[bool, np.ndarray, np.ndarray, float]:
+    """Whether the matrix is positive definite; the blocks [m, 3, 3] of L by columns; the inverse blocks
+    [n, 3, 3] of D; the logarithm of the determinant."""
+    n, first, rows = len(diagonal), layout.first, layout.rows
+    blocks, inverse = np.empty((first[n], 3, 3)), np.empty((n, 3, 3))
     column, pivot = np.zeros((n, 3, 3)), np.empty((3, 3))
-    pattern, seen, filled = np.empty(n, np.int64), np.full(n, -1), first[:n].copy()
     logarithm = 0.0
     for k in range(n):
         for p in range(start[k], start[k + 1]):
@@ -224,13 +234,11 @@ def factorise(
             for r in range(3):
                 for c in range(3):
                     column[i, r, c] += above[p, r, c]
-        top = find_row(k, start, row, parent, seen, pattern)
         for r in range(3):
             for c in range(3):
                 pivot[r, c] = diagonal[k, r, c]
-        for t in range(top, n):
-            i = pattern[t]
-            end = filled[i]
+        for t in range(layout.begin[k], layout.begin[k + 1]):
+            i, end = layout.columns[t], layout.slots[t]
             y00, y01, y02 = column[i, 0, 0], column[i, 0, 1], column[i, 0, 2]
             y10, y11, y12 = column[i, 1, 0], column[i, 1, 1], column[i, 1, 2]
             y20, y21, y22 = column[i, 2, 0], column[i, 2, 1], column[i, 2, 2]
@@ -253,13 +261,11 @@ def factorise(
             for r in range(3):
                 for c in range(3):
                     column[i, r, c] = 0.0
-            rows[end] = k
-            filled[i] = end + 1
         determinant = invert(pivot, inverse, k)
         if determinant == 0.0:
-            return False, rows, blocks, inverse, -np.inf
+            return False, blocks, inverse, -np.inf
         logarithm += np.log(determinant)
-    return True, rows, blocks, inverse, logarithm
+    return True, blocks, inverse, logarithm
 
 
 @compiled
