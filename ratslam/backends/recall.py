@@ -353,11 +353,34 @@ class RecallBackend(Backend):
         return pixel_levels(flat, alive.astype(self.dtype)).astype(jnp.int32)
 
     def _recall(self, state: RecallState, view: Array, label: Array) -> tuple[RecallState, RecallResult]:
-        """Recognises and stores a view."""
+        """Recognises and stores a view. While no sectors are known to be ordered, only unshifted views are
+        compared and only their view cells computed."""
+        shifts = sector_shifts(self.recall)
+        if self.pixels is not None or len(shifts) == 1:
+            return self._recognise(self.recall, state, view, label)
+        plain, row = self.recall.model_copy(update={"shifts": 0}), len(shifts) // 2
+
+        def unshifted(state: RecallState) -> tuple[RecallState, RecallResult]:
+            mass = state.belief.mass
+            alone = state._replace(belief=state.belief._replace(mass=mass[row : row + 1]))
+            after, result = self._recognise(plain, alone, view, label)
+            mass = jnp.zeros_like(mass).at[row].set(after.belief.mass[0])
+            return after._replace(belief=after.belief._replace(mass=mass)), result
+
+        def shifted(state: RecallState) -> tuple[RecallState, RecallResult]:
+            return self._recognise(self.recall, state, view, label)
+
+        if self.labels:
+            return unshifted(state)
+        return lax.cond(state.memory.angle == 0, unshifted, shifted, state)
+
+    def _recognise(
+        self, config: RecallConfig, state: RecallState, view: Array, label: Array
+    ) -> tuple[RecallState, RecallResult]:
         motion = recall_memory.corrected_motion(state.memory)
-        memory, likelihood = self.likelihood(self.recall, state.memory, view, label)
+        memory, likelihood = self.likelihood(config, state.memory, view, label)
         belief, result = filter.recognise(
-            self.recall, self.network, memory, state.belief, motion, likelihood, self.recall.local
+            config, self.network, memory, state.belief, motion, likelihood, self.recall.local
         )
         memory = recall_memory.store_keyframe(memory, view, label)
         return state._replace(belief=belief, memory=memory), result

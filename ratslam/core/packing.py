@@ -63,10 +63,16 @@ class PackedRecords:
         Raises:
             ValueError: the record has another shape.
         """
-        for leaf, value in zip(self.layout.leaves, jax.tree.leaves(record), strict=True):
-            if np.shape(value) != leaf.shape:
-                raise ValueError(f"record with an array of shape {np.shape(value)}, expected {leaf.shape}")
-            self.arrays[leaf.array][k, leaf.first : leaf.last] = np.reshape(value, -1)
+        rows = [array[k] for array in self.arrays]
+        for (array, first, last, shape), value in zip(
+            self.layout.leaves, jax.tree.leaves(record), strict=True
+        ):
+            if np.shape(value) != shape:
+                raise ValueError(f"record with an array of shape {np.shape(value)}, expected {shape}")
+            if shape:
+                rows[array][first:last] = np.ravel(value)
+            else:
+                rows[array][first] = value
 
     def records(self, count: int) -> Iterator[Any]:
         """The first `count` records, host NumPy."""
