@@ -28,7 +28,12 @@ class GrowableArray:
 
     def extend(self, rows: np.ndarray) -> None:
         """Appends rows [n, ...]."""
-        self.replace(np.concatenate([self.rows, rows]))
+        end = self._count + len(rows)
+        if end > len(self._buffer):
+            self.replace(np.concatenate([self.rows, rows]))
+        else:
+            self._buffer[self._count : end] = rows
+            self._count = end
 
     def replace(self, rows: np.ndarray) -> None:
         """Replaces all rows."""

@@ -193,8 +193,8 @@ class ViewAppearance(Appearance):
         return self._view.rows[frames], np.full(len(frames), -1)
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
-        for error in np.asarray(evidence.background)[np.isfinite(evidence.background)]:
-            self._background.append(error)
+        errors = np.asarray(evidence.background)
+        self._background.extend(errors[np.isfinite(errors)])
         self._rescale()
         count = len(self._view.rows) - 1
         if self._fan is None or count % BIAS_INTERVAL or count < MIN_KEYFRAMES:

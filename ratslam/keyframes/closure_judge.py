@@ -298,6 +298,8 @@ def _pairs(
     capacity, count = 256, 0
     found = np.empty((3, capacity), np.int64)
     close, around = np.empty(len(ground), np.int64), 0  # those in the box around a part of the path
+    close_x, close_y = np.empty(len(ground)), np.empty(len(ground))
+    apart = np.empty(len(ground))
     for k in range(len(path)):
         if k % BOX == 0:
             left, right, below, above, around = np.inf, -np.inf, np.inf, -np.inf, 0
@@ -305,13 +307,14 @@ def _pairs(
                 left, right = min(left, path[at, 0] - reach), max(right, path[at, 0] + reach)
                 below, above = min(below, path[at, 1] - reach), max(above, path[at, 1] + reach)
             for g in range(len(ground)):
-                close[around] = g
                 x, y = ground[g, 0], ground[g, 1]
+                close[around], close_x[around], close_y[around] = g, x, y
                 around += int((x >= left) & (x <= right) & (y >= below) & (y <= above))
         for near in range(around):
+            apart[near] = (close_x[near] - path[k, 0]) ** 2 + (close_y[near] - path[k, 1]) ** 2
+        for near in range(around):
             g = close[near]
-            x, y = ground[g, 0] - path[k, 0], ground[g, 1] - path[k, 1]
-            if x * x + y * y >= reach * reach or abs(g - k - lag) <= guard:
+            if apart[near] >= reach * reach or abs(g - k - lag) <= guard:
                 continue
             for s in range(len(turns)):
                 if abs(_turned(ground[g, 2] + turns[s] - path[k, 2])) < turn:

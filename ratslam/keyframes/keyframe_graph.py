@@ -10,7 +10,7 @@ the map. Once accepted closures join it, it is moved to where they claim.
 from __future__ import annotations
 
 from copy import copy, deepcopy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -260,7 +260,7 @@ class KeyframeGraph(Checkpointed):
         """[3] variance of the odometry into the newest keyframe."""
         if self.begins.rows[-1]:
             return self._loose_variance()
-        return self.odometry_variance(self.length.rows[-1:], self.turn.rows[-1:])[0]
+        return np.array(self._odometry_variance(float(self.length.rows[-1]), float(self.turn.rows[-1])))
 
     def closure_variance(self) -> np.ndarray:
         """[3] variance of a closure, m^2, m^2, rad^2."""
@@ -358,10 +358,13 @@ class KeyframeGraph(Checkpointed):
 
     def odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """[n, 3] variances of odometry over these distances [n], m, and sums of absolute turns [n], rad."""
+        return np.stack(self._odometry_variance(length, turn), axis=1)
+
+    def _odometry_variance(self, length: Any, turn: Any) -> tuple[Any, Any, Any]:
         noise, cell = self.config.noise, self.cell
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
         least = noise.least_heading**2 * self.heading_noise.factor
-        return np.stack([along, along, self.heading_variance(length, turn) + least], axis=1)
+        return along, along, self.heading_variance(length, turn) + least
 
 
 APART = 1000.0

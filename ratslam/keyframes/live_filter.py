@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.compiled import compiled
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate
 from tactile.base.se2 import compose, wrap
@@ -40,10 +41,7 @@ class LiveFilter(Checkpointed):
             self.covariance = np.diag(graph.newest_variance())
             return
         before, after = graph.pose.rows[-2:]
-        dx, dy = (after - before)[:2]
-        by_pose = np.array([[1, 0, -dy], [0, 1, dx], [0, 0, 1.0]])
-        noise = np.diag(graph.newest_variance())  # position has the same in all directions
-        self.covariance = by_pose @ self.covariance @ by_pose.T + noise
+        self.covariance = moved_covariance(self.covariance, before, after, graph.newest_variance())
 
     def correct(self, graph: KeyframeGraph, candidate: Candidate, weight: float) -> np.ndarray:
         """[3] the newest keyframe's pose corrected by a closure of a sequence with this robust weight. The
@@ -64,3 +62,21 @@ class LiveFilter(Checkpointed):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`; in earlier map files nothing has strayed."""
         super().restore({"strayed/0": np.array(0.0)} | arrays)
+
+
+@compiled
+def moved_covariance(
+    covariance: np.ndarray, before: np.ndarray, after: np.ndarray, variance: np.ndarray
+) -> np.ndarray:
+    """[3, 3] covariance of a pose after a motion from `before` to `after` [3] with variances [3]; position
+    has the same in all directions."""
+    x, y = before[1] - after[1], after[0] - before[0]
+    moved = covariance.copy()
+    for k in range(3):
+        moved[0, k] += x * moved[2, k]
+        moved[1, k] += y * moved[2, k]
+    for k in range(3):
+        moved[k, 0] += x * moved[k, 2]
+        moved[k, 1] += y * moved[k, 2]
+        moved[k, k] += variance[k]
+    return moved

@@ -106,14 +106,8 @@ class SectorFan(Checkpointed):
     def _gains(self) -> tuple[np.ndarray, np.ndarray]:
         """[F] decrease of the difference between the newest two views when they are shifted for each field of
         view, and their unshifted difference; 0 for fields of view without a shift."""
-        old, now = self._view.rows[-2], self._view.rows[-1]
-        size = len(now)
-        shift = np.round(-self._step.rows[-1, 0] / (FIELDS_OF_VIEW / size)).astype(np.int64)
-        still = np.abs(now - old).mean()
-        moves = (shift != 0) & (np.abs(shift) <= size // 2)
-        return np.where(
-            moves, still - shifted_differences(now, old, np.where(moves, shift, 0)), 0.0
-        ), still * moves
+        old, now = self._view.rows[-2:]
+        return field_gains(now, old, self._step.rows[-1, 0], FIELDS_OF_VIEW)
 
     def _heading_errors(self, lag: int) -> np.ndarray:
         """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
@@ -153,21 +147,27 @@ def _no_pairs() -> dict[int, GrowableArray]:
 
 
 @compiled
-def shifted_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """[F] mean absolute difference of now[k:] and old[:-k], or reversed for k < 0, for each shift k [F]."""
-    found = np.empty(len(shifts))
-    for f in range(len(shifts)):
-        size, first, second = len(now) - abs(shifts[f]), max(shifts[f], 0), max(-shifts[f], 0)
-        total = 0.0
-        for at in range(size):
+def field_gains(
+    now: np.ndarray, old: np.ndarray, turn: float, fields: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """[F] decrease of the mean absolute difference of two views when they are shifted by a turn, rad, for
+    each field of view [F], rad, and [F] their unshifted difference; 0 without a shift."""
+    gain, still, size = np.zeros(len(fields)), np.zeros(len(fields)), len(now)
+    unshifted = np.abs(now - old).mean()
+    for f in range(len(fields)):
+        shift = int(np.rint(-turn / (fields[f] / size)))
+        if shift == 0 or abs(shift) > size // 2:
+            continue
+        first, second, total = max(shift, 0), max(-shift, 0), 0.0
+        for at in range(size - abs(shift)):
             total += abs(now[first + at] - old[second + at])
-        found[f] = total / size
-    return found
+        gain[f], still[f] = unshifted - total / (size - abs(shift)), unshifted
+    return gain, still
 
 
 @compiled
 def fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """[F, P] `shifted_differences` of P pairs of views [P, size] for fractional shifts [F, P], by
+    """[F, P] mean absolute differences of P pairs of views [P, size] for fractional shifts [F, P], by
     interpolation; NaN with less than half overlap."""
     pairs, size = now.shape
     found = np.empty(shifts.shape)
