@@ -10,7 +10,7 @@ import pytest
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
 from ratslam.config.run_config import load_config
-from ratslam.experiments.tables import batches, buildings, grid, laser, recordings, touch
+from ratslam.experiments.tables import batches, buildings, cycles, grid, laser, recordings, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from tactile.base.errors import InputError
@@ -263,3 +263,37 @@ def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
     ]  # fmt: skip
     assert all(device == "one core" and float(us) > 0 for _, device, us in rows)
     assert float(rows[5][0].rsplit(" ", 1)[1]) < 1e-9
+
+
+def test_the_cycle_table_times_replayed_and_live_steps(monkeypatch):
+    monkeypatch.setattr(cycles, "BACKENDS", ("classic",))
+    _, *lines = cycles.cycle_table(["square"], rounds=1, folder=ROOT)
+    for line, dtype in zip(lines, ("float64", "float32"), strict=True):
+        name, backend, precision, steps, *times = [cell.strip() for cell in line.split("|")[1:-1]]
+        assert (name, backend, precision, steps) == ("square", "classic", dtype, "349")
+        mean, median, percentile, _, clock = map(float, times)
+        assert 0 < median <= percentile <= 1e3 * clock
+        assert mean > 0
+
+
+def test_the_parts_of_a_cycle_add_up_to_its_time():
+    header, *lines = cycles.profile_table(["square"], folder=ROOT)
+    assert "square, recall" in header
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert [name for name, *_ in rows] == [*cycles.VERBS, "all"]
+    parts = {name: float(recall) for name, recall, _ in rows}
+    whole = parts.pop("all")
+    assert sum(parts.values()) == pytest.approx(whole, abs=len(parts))
+    assert all(parts[name] > 0 for name in ("views and belief (compiled kernel)", "closures", "solver"))
+    assert parts["judge"] == 0  # of whiskers only
+
+
+def test_the_time_of_library_functions_counts_for_those_that_call_them():
+    own, wrapper, builtin = ("/a/ratslam/x.py", 1, "f"), ("/lib/w.py", 1, "w"), ("~", 0, "b")
+    root = ("/lib/main.py", 1, "main")
+    stats = {
+        own: (1, 1, 2.0, 7.0, {root: (1, 1, 2.0, 7.0)}),
+        wrapper: (1, 1, 1.0, 4.0, {own: (1, 1, 1.0, 4.0)}),
+        builtin: (2, 2, 4.0, 4.0, {wrapper: (1, 1, 3.0, 3.0), own: (1, 1, 1.0, 1.0)}),
+    }
+    assert cycles.own_times(stats)[own] == pytest.approx(7.0)
