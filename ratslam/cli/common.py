@@ -178,15 +178,8 @@ def prepare_jax(keep_compiled: bool = True) -> None:
     os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    settings = {
-        "jax_compilation_cache_dir": str(Path(home) / "ratslam" / "jax"),
-        # The defaults do not cache kernels that compile as fast as ours do on a CPU.
-        "jax_persistent_cache_min_compile_time_secs": 0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    os.environ.update({name.upper(): str(value) for name, value in settings.items()})  # for child processes
-    import jax
+    from ratslam.core.kernel_cache import cache_settings, keep_kernels
 
-    for name, value in settings.items():
-        jax.config.update(name, value)
+    for name, value in cache_settings().items():
+        os.environ.setdefault(name.upper(), str(value))  # for child processes
+    keep_kernels()

@@ -22,6 +22,7 @@ from evaluation.metrics.scorecard import Scorecard, render_health, render_warnin
 from evaluation.plots.run_plots import run_plots
 from evaluation.report.verdict import describe_score, judge_map
 from ratslam.config.run_config import RunConfig
+from ratslam.core.kernel_cache import keep_kernels
 from ratslam.pipeline.estimate import Health
 from ratslam.pipeline.report import NAME, write_report
 from ratslam.pipeline.run import run as write_run
@@ -54,6 +55,7 @@ def run(
         InputErrors: the configuration has errors.
         InputError: the source, the checkpoint or the run directory cannot be used.
     """
+    keep_kernels()
     name = "run" if isinstance(config, RunConfig) else Path(config).stem
     path = new_directory(name) if directory is None else Path(directory)
     write_run(resolve_config(config), path, resume)

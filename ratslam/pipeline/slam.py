@@ -14,6 +14,7 @@ from ratslam.backends.registry import BACKENDS
 from ratslam.config.completion import complete
 from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Map
+from ratslam.core.kernel_cache import keep_kernels
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, pose_estimate
 from ratslam.pipeline.localise import localising
@@ -66,6 +67,7 @@ class Slam:
         self.session.warm(self._blank)
 
     def _build(self, config: RunConfig, source: Source, warnings: Sequence[str] = ()) -> None:
+        keep_kernels()
         observed = open_touch_source(source, config.touch)
         self.config, self.source = config, describe_readings(observed)
         self.warnings = tuple(dict.fromkeys(warnings))

@@ -242,7 +242,7 @@ def test_the_map_follows_an_accepted_sequence_between_two_optimisations():
 
 
 def test_corrections_that_add_up_lead_to_an_optimisation():
-    """With sequences that fit none is due before `solve_every`; with closures that claim a step more one is."""
+    """None is due before `solve_every` where sequences fit; one is where closures claim a step more."""
     fits = sequence(LAP + 2, 2, 16, 4.0)
     strays = sequence(LAP + 2, 2, 8, 4.0) | sequence(LAP + 10, 11, 8, 4.0)
     counts = {}

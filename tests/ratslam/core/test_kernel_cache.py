@@ -1,0 +1,67 @@
+"""Kernels are kept on disk, by kind of processor, for the command line and from Python alike."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+from ratslam.core import kernel_cache
+from ratslam.core.kernel_cache import FOLDER, cache_settings, keep_kernels, processor_name
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def settings():
+    """JAX's settings of the cache, put back at the end."""
+    before = {name: getattr(jax.config, name) for name in cache_settings()}
+    yield before
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_another_processor_has_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [processor_name()]
+    for text in ("flags : sse avx\n", "flags : sse\n", "Features : neon\n", ""):
+        monkeypatch.setattr(kernel_cache, "CPUINFO", tmp_path / f"cpuinfo{len(names)}")
+        kernel_cache.CPUINFO.write_text(f"model : one\n{text}processor : 1\n")
+        names.append(processor_name())
+        assert processor_name() == names[-1]
+    assert len(set(names)) == len(names)
+    monkeypatch.setattr(kernel_cache, "CPUINFO", tmp_path / "none")
+    assert processor_name() == names[-1]  # where the system does not tell
+
+
+def test_a_program_keeps_its_own_folder(settings) -> None:
+    jax.config.update(FOLDER, "/nowhere/of/the/program")
+    keep_kernels()
+    assert getattr(jax.config, FOLDER) == "/nowhere/of/the/program"
+
+
+def test_without_one_kernels_are_kept_in_the_users_cache(settings, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    jax.config.update(FOLDER, None)
+    keep_kernels()
+    assert Path(getattr(jax.config, FOLDER)).parent == tmp_path / "ratslam" / "jax"
+
+
+def test_a_loop_in_python_finds_its_kernels_again(tmp_path: Path) -> None:
+    """The second process compiles none: it adds no file to the cache."""
+    code = "import ratslam; ratslam.Slam('configs/square.yaml')"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    found = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        found.append(sorted(path.name for path in tmp_path.rglob("*-cache")))
+    assert len(found[0]) > 0
+    assert found[0] == found[1]
