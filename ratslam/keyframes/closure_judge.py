@@ -38,8 +38,9 @@ from ratslam.core.compiled import compiled
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import ClosureLog, Verdict
+from ratslam.keyframes.odometry_scan import log_ratio
 from ratslam.keyframes.optimizer import MapFit
-from tactile.base.se2 import correct_heading, integrate, inverse, wrap
+from tactile.base.se2 import correct_heading, integrate, inverse
 
 AT_ONCE = 1.0
 """Least log-odds of a sequence that is accepted before it is weighed against the others."""
@@ -265,19 +266,12 @@ def _views_on(graph: KeyframeGraph, drive: Drive, way: Way, ground: np.ndarray, 
 
 def _foretold(graph: KeyframeGraph, drive: Drive, way: Way) -> float:
     """R of a claim."""
-    reckoned, variance, (j, i, turn) = drive.reckoned, drive.variance, way[:3]
-    x, y = reckoned[j, :2, None] - reckoned[i + 1 : j + 1, :2].T
-    along, heading = variance[i + 1 : j + 1, 1].sum(), variance[i + 1 : j + 1, 2]
-    gate = (graph.config.gate_sd * graph.cell) ** 2 + along
-    xx, yy, xy = heading @ y**2 + gate, heading @ x**2 + gate, -(heading @ (x * y))
-    xa, ya, aa = -(heading @ y), heading @ x, heading.sum() + graph.config.gate_heading**2
-    information = np.linalg.inv(np.array([[xx, xy, xa], [xy, yy, ya], [xa, ya, aa]]))
-    old = max(j - graph.guard, 1)
-    error = reckoned[:old] + [0.0, 0.0, turn] - reckoned[j]
-    error[:, 2] = wrap(error[:, 2])
-    distance = ((error @ information) * error).sum(axis=1)
-    ratio = np.log(old) - distance[min(i, old - 1)] / 2 - np.log(max(np.exp(-distance / 2).sum(), 1.0))
-    return float(np.clip(ratio, LEAST, MOST))
+    config, (j, i, turn) = graph.config, way[:3]
+    x, y, heading = drive.reckoned[: j + 1].T.copy()
+    variance = np.ascontiguousarray(drive.variance[i + 1 : j + 1, 1:])
+    gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
+    apart = np.empty(max(j - graph.guard, 1))
+    return float(np.clip(log_ratio(x, y, heading, variance, i, j, -turn, gate, apart), LEAST, MOST))
 
 
 @compiled

@@ -152,25 +152,46 @@ def compute_log_ratios(
             into each keyframe between. turned: by which the match is turned, rad. old: number of keyframes
             that could be recalled. gate: variance of position and heading added. ratios: [G].
     """
-    apart, share = np.empty(old), 1 / TURN
-    measured, driven, net = total[:old, 0].copy(), total[:old, 1].copy(), total[:old, 2].copy()
+    heading, apart = np.empty(j + 1), np.empty(old)
+    measured, driven, net = total[: j + 1, 0].copy(), total[: j + 1, 1].copy(), total[: j + 1, 2].copy()
     for g in points:
-        x, y, bias, turn_error = path[g, 0], path[g, 1], grid[g, 0], grid[g, 1]
-        end_x, end_y = np.float64(x[j]), np.float64(y[j])
-        xx, xy, yy, xh, yh, hh = invert_covariance(x, y, variance, i, end_x, end_y, gate)
-        heading = total[j, 0] + total[j, 1] * bias + total[j, 2] * turn_error + turned
-        xy, xh, yh = 2 * xy, 2 * xh, 2 * yh
-        for k in range(old):
-            dx, dy = x[k] - end_x, y[k] - end_y
-            turn = measured[k] + driven[k] * bias + net[k] * turn_error - heading
-            turn -= TURN * np.floor(turn * share + 0.5)
-            apart[k] = dx * (xx * dx + xy * dy + xh * turn) + dy * (yy * dy + yh * turn) + hh * turn * turn
-        density = 0.0
-        for k in range(old):
-            if apart[k] < FAR:
-                density += np.exp(-apart[k] / 2)
-        ratio = np.log(old) - apart[i] / 2 - np.log(max(density, 1.0))
+        bias, turn_error = grid[g, 0], grid[g, 1]
+        for k in range(j + 1):
+            heading[k] = measured[k] + driven[k] * bias + net[k] * turn_error
+        ratio = log_ratio(path[g, 0], path[g, 1], heading, variance, i, j, turned, gate, apart)
         ratios[g] = max(ratio, UNLIKELY)
+
+
+@compiled
+def log_ratio(
+    x: np.ndarray,
+    y: np.ndarray,
+    heading: np.ndarray,
+    variance: np.ndarray,
+    i: int,
+    j: int,
+    turned: float,
+    gate: tuple[float, float],
+    apart: np.ndarray,
+) -> float:
+    """The log ratio of a closure of keyframe j with keyframe i along one path, see `OdometryScan.log_ratios`.
+
+    Args:
+        x, y, heading: of the path, m, m, rad. apart: [old] for the squared distances of the keyframes that
+            could be recalled. The others: see `compute_log_ratios`.
+    """
+    end_x, end_y, end = np.float64(x[j]), np.float64(y[j]), heading[j] + turned
+    xx, xy, yy, xh, yh, hh = invert_covariance(x, y, variance, i, end_x, end_y, gate)
+    xy, xh, yh, share, old = 2 * xy, 2 * xh, 2 * yh, 1 / TURN, len(apart)
+    for k in range(old):
+        dx, dy, turn = x[k] - end_x, y[k] - end_y, heading[k] - end
+        turn -= TURN * np.floor(turn * share + 0.5)
+        apart[k] = dx * (xx * dx + xy * dy + xh * turn) + dy * (yy * dy + yh * turn) + hh * turn * turn
+    density = 0.0
+    for k in range(old):
+        if apart[k] < FAR:
+            density += np.exp(-apart[k] / 2)
+    return np.log(old) - apart[min(i, old - 1)] / 2 - np.log(max(density, 1.0))
 
 
 @compiled
