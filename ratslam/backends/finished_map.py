@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from ratslam.backends.config import LocaliseConfig
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import fill_odometry, with_prefix
+from ratslam.core.checkpoint import fill_missing, with_prefix
 from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.npz import SPOILT, read_arrays
@@ -46,7 +46,7 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
             names = [name for name in archive.namelist() if name.startswith("map/")]
             arrays = read_arrays(archive, names, str(path))
         known = dict(zip([name.removesuffix(".npy") for name in names], arrays, strict=True))
-        fill_odometry(known)
+        fill_missing(known)
         made.restore(with_prefix(known, "map/"))
     if not len(made.trajectory()):
         raise InputError(str(path), "a map without steps", "a map in which a session can be found")

@@ -86,7 +86,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "select_score": 5.0,
             "select_length": 2,
             "sequence_cost": 3.0,
-            "solve_strayed": 0.0,
             "max_turn": 0.6,
             "place_radius": 1.3,
             "place_heading": 0.17,

@@ -78,8 +78,11 @@ def _convert(value: np.ndarray, like: Any) -> Any:
     return np.array(value)
 
 
-def fill_odometry(arrays: dict[str, np.ndarray]) -> None:
-    """Adds the odometry of the steps, NaN: unknown, to the arrays of a map file written without it."""
+def fill_missing(arrays: dict[str, np.ndarray]) -> None:
+    """Adds to the arrays of a map file what one of an earlier version lacks: the odometry of the steps, NaN:
+    unknown; and that no closure has moved the newest keyframe since the last optimisation."""
     for name, like in (("map/steps/odometry", "map/steps/frame"), ("map/odometry", "map/step_node")):
         if like in arrays:
             arrays.setdefault(name, np.full((len(arrays[like]), 3), np.nan))
+    if "map/live/covariance/0" in arrays:
+        arrays.setdefault("map/live/strayed/0", np.array(0.0))

@@ -118,9 +118,10 @@ class KeyframeMapConfig(Settings):
     """Number of newest keyframes that are not merged."""
     solve_every: PositiveInt = 20
     """Most keyframes between two optimisations while a sequence goes on."""
-    solve_strayed: NonNegativeFloat = 0.1
+    solve_strayed: PositiveFloat = 0.1
     """Sum of the corrections of the newest keyframe by closures, in their standard deviations, after which
-    the map is optimised earlier: a closure that fits changes nothing. 0: never earlier."""
+    the map is optimised earlier: a closure that fits changes nothing. With `select_every` never earlier, as
+    selections optimise it too."""
     iterations: PositiveInt = 4
     """Solver iterations when a loop closes."""
     settling: PositiveInt = 15

@@ -59,10 +59,6 @@ class LiveFilter(Checkpointed):
         corrected[2] = wrap(corrected[2])
         return corrected
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`; in earlier map files nothing has strayed."""
-        super().restore({"strayed/0": np.array(0.0)} | arrays)
-
 
 @compiled
 def moved_covariance(

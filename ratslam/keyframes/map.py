@@ -335,9 +335,10 @@ class KeyframeMap(Checkpointed, Map):
         """Whether the map is optimised for one more member of an accepted sequence."""
         if self.log.verdict(sequence) != Verdict.ACCEPTED:
             return False
-        strayed = self.config.solve_strayed and self._live.strayed > self.config.solve_strayed
-        long_ago = self._graph.ever - self._solved[1] >= self.config.solve_every
-        return sequence != self._solved[0] or long_ago or bool(strayed)
+        config = self.config
+        strayed = not config.select_every and self._live.strayed > config.solve_strayed
+        long_ago = self._graph.ever - self._solved[1] >= config.solve_every
+        return sequence != self._solved[0] or long_ago or strayed
 
     def _is_pose_reliable(self) -> bool:
         """Whether the drift since the last closure is small enough to find a known experience by pose."""

@@ -18,7 +18,7 @@ from ratslam.config.other_files import MAP, kind_of
 from ratslam.config.renamed_keys import with_moved_settings
 from ratslam.config.run_config import LoopConfig, RunConfig, load_config
 from ratslam.config.strict_yaml import dump, parse, validate
-from ratslam.core.checkpoint import fill_odometry, with_prefix
+from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.estimate import START, PoseEstimate, estimate_arrays, read_estimate
@@ -229,7 +229,7 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
         raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
     own = {name: value for name, value in arrays.items() if name not in TEXTS}
     session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
-    fill_odometry(session)
+    fill_missing(session)
     if texts["format"] != FORMAT:
         _drop_former_state(session, config.backend)
     return SavedMap(

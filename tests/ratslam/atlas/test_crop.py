@@ -21,7 +21,7 @@ from tests.ratslam.recall.test_merged_rows import CAPACITY, COUNT, SIZE, TOUCH, 
 END = LAP + 60
 ROUND, LAPS = 80, 4
 """Keyframes of a lap, and laps, of the merged map."""
-MERGED = {"select_every": 30, "merge_stood": 2, "merge_newest": 60}
+MERGED = {"select_every": 30, "merge_stood": 2, "merge_newest": 60, "solve_every": 1}
 TRUE = {k: (k - LAP, 4.0) for k in range(LAP, END)}
 """Recall of the first keyframes in the second lap."""
 
