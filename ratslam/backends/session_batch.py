@@ -52,7 +52,6 @@ class RecordingSession(Session):
     def record(self, observations: Sequence[Observation]) -> Recording:
         """Runs the session from its start."""
         self.restart()
-        self._followed: list[tuple[MergedRows | None, MapFeedback, tuple[int, ...]]] = []
         parts = [observations[k : k + CHUNK] for k in range(0, len(observations), CHUNK)]
         records = [allocate(layout_of(observations[0]), CHUNK) for _ in parts]
         for rows, part in zip(records, parts, strict=True):
@@ -64,6 +63,10 @@ class RecordingSession(Session):
             for followed, rows, part in zip(self._followed, records, parts, strict=True)
         ]
         return Recording(chunks, self._capacity, jax.tree.map(np.asarray, self.state))
+
+    def restart(self, seed: int = 0) -> None:
+        super().restart(seed)
+        self._followed: list[tuple[MergedRows | None, MapFeedback, tuple[int, ...]]] = []
 
     def follow_map(self, merged: Any, feedback: Any) -> None:
         super().follow_map(merged, feedback)

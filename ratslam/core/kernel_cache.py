@@ -1,5 +1,4 @@
-"""The cache of compiled kernels on disk: a later process loads in a tenth of a second what it would compile
-in seconds."""
+"""The cache of compiled kernels on disk: a later process loads what it would compile again."""
 
 from __future__ import annotations
 

@@ -16,10 +16,7 @@ Rubin 1977) of a mixture, one step whenever odds are asked for.
 
 **The vote** on the calibration of the odometry is held before any sequence is accepted. Each is true with
 some odds, and if it is true it favours the heading biases and turn errors with which odometry leads to its
-place. A false sequence favours none that others favour as well. Nothing is linearised: a heading bias or an
-error of the turns bends a long path so much that no linearisation holds. So the path is dead reckoned anew
-for each point of a grid of both. Its covariance is that of the odometry's noise alone, summed over the steps
-between two keyframes.
+place (`ratslam.keyframes.odometry_scan`). A false sequence favours none that others favour as well.
 """
 
 from __future__ import annotations

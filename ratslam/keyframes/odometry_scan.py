@@ -1,7 +1,8 @@
 """Where raw odometry leads with each of many calibrations, and how likely that makes a closure.
 
-Nothing is linearised: the path is dead reckoned anew for each point of a grid of heading biases and turn
-errors. Its covariance is that of the odometry's noise alone, summed over the steps between two keyframes.
+Nothing is linearised: a heading bias or an error of the turns bends a long path so much that no
+linearisation holds. So the path is dead reckoned anew for each point of a grid of both. Its covariance is
+that of the odometry's noise alone, summed over the steps between two keyframes.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ class BlockPattern:
     Attributes:
         place: [n] position of each node in the order of elimination. slot: [M] the block above the diagonal
             that each edge adds to. start [n + 1], row [B]: these blocks by columns, see
-            `ratslam.pose_graph.block_kernels`.
+            `factorise`.
     """
 
     def __init__(self, count: int, a: np.ndarray, b: np.ndarray, place: np.ndarray | None = None) -> None:

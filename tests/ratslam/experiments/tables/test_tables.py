@@ -271,8 +271,9 @@ def test_the_cycle_table_times_replayed_and_live_steps(monkeypatch):
     for line, dtype in zip(lines, ("float64", "float32"), strict=True):
         name, backend, precision, steps, *times = [cell.strip() for cell in line.split("|")[1:-1]]
         assert (name, backend, precision, steps) == ("square", "classic", dtype, "349")
-        mean, median, percentile, _, clock = map(float, times)
-        assert 0 < median <= percentile <= 1e3 * clock
+        mean, median, percentile, slowest, clock = map(float, times)
+        assert 0 < median <= percentile <= 1e3 * slowest + 50
+        assert slowest <= clock + 0.1
         assert mean > 0
 
 
