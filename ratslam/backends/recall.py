@@ -20,6 +20,7 @@ from ratslam.core.finite_values import finite_values
 from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.keyframes.acceptance import Acceptance, AcceptByEvidence
 from ratslam.keyframes.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
+from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.closure_odds import AcceptByOdds
 from ratslam.keyframes.config import FULL, Ablation
 from ratslam.keyframes.keyframe_graph import KeyframeGraph, piece_start
@@ -295,20 +296,16 @@ class RecallBackend(Backend):
         return PoseCellActivity(cells.sum(axis=0), cells.sum(axis=(1, 2)), packets)
 
     def new_map(self) -> KeyframeMap:
-        """An empty keyframe map; keyframes of views and given ids are not merged, because their sequences are
-        judged by keyframe."""
-        keyframes = self.config.keyframes
-        if self.pixels is None:
-            keyframes = keyframes.model_copy(update={"merge_stood": 0})
+        """An empty keyframe map."""
         return KeyframeMap(
-            keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
+            self.config.keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
             closures=self.config.experience.closures, ablation=self.ablation, find_tie=PieceTies(self),
         )  # fmt: skip
 
-    def _acceptance(self) -> Callable[[KeyframeGraph], Acceptance]:
+    def _acceptance(self) -> Callable[[KeyframeGraph, Archive], Acceptance]:
         """By odds for views and given ids; with whiskers, sequences are selected against each other."""
         views = self.pixels is None and self.ablation.verify
-        return AcceptByOdds if views else lambda graph: AcceptByEvidence()
+        return AcceptByOdds if views else lambda graph, archive: AcceptByEvidence()
 
     def _appearance(self) -> Appearance:
         if self.labels:

@@ -28,6 +28,7 @@ from scipy.special import expit
 
 from ratslam.core.growable_array import GrowableArray
 from ratslam.keyframes.acceptance import Acceptance, believe
+from ratslam.keyframes.archive import Archive
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.keyframes.map_solution import MapSolution, cheapest_map, solved_map
@@ -136,12 +137,13 @@ class Ballot(NamedTuple):
 
 
 class AcceptByOdds(Acceptance):
-    """Judges all open sequences."""
+    """Judges all open sequences. Odometry is compared on the keyframes as they were taken, of `archive` once
+    some are merged."""
 
     VALUES = ("_views_prior",)
 
-    def __init__(self, graph: KeyframeGraph) -> None:
-        self._scan = OdometryScan(graph)
+    def __init__(self, graph: KeyframeGraph, archive: Archive) -> None:
+        self._archive, self._scan = archive, OdometryScan(graph)
         self._log_ratio = GrowableArray((len(self._scan.grid),), np.float64)  # by calibration
         self._views_prior = graph.prior
 
@@ -151,17 +153,17 @@ class AcceptByOdds(Acceptance):
         ratios = self._log_ratio.rows
         uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
         for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
-            self._rate(log, sequence)
+            self._rate(graph, log, sequence)
         believe(graph, log, self._vote(graph, log).result.belief)
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         while len(self._log_ratio.rows) < log.sequences:
             self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
-        length, accepted = len(log.members(sequence)), log.verdict(sequence) == Verdict.ACCEPTED
+        length, accepted = log.size(sequence), log.verdict(sequence) == Verdict.ACCEPTED
         if length < graph.config.min_length:
             return False
         if is_round(length) or length == graph.config.min_length:
-            self._rate(log, sequence)
+            self._rate(graph, log, sequence)
         due = candidate.keyframe % REVIEW_EVERY == 0
         if accepted and not due:
             return False
@@ -208,7 +210,9 @@ class AcceptByOdds(Acceptance):
         whether there was any."""
         sequences, score_odds, result = ballot
         odds, open_ = result.odds, log.verdicts()[sequences] == Verdict.OPEN
-        open_ &= np.isin(sequences, among) & ~spans_pieces(graph, log)[sequences]
+        open_ &= (
+            np.isin(sequences, among) & (log.left() > 0)[sequences] & ~spans_pieces(graph, log)[sequences]
+        )
         # Odometry foretells nothing where a piece begins: there only the map can.
         accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph.begins.rows, log)[sequences]
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
@@ -232,21 +236,24 @@ class AcceptByOdds(Acceptance):
     def _break(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
         """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
         config = graph.config
-        long = len(log.members(sequence)) >= config.break_length and log.score(sequence) >= config.break_score
+        long = log.size(sequence) >= config.break_length and log.score(sequence) >= config.break_score
         apart = bool(spans_pieces(graph, log)[sequence])
         if not (config.may_be_carried and long) or apart or log.verdict(sequence) != Verdict.OPEN:
             return False
         break_odometry(graph, log, sequence)
         for other in np.flatnonzero(np.isfinite(self._log_ratio.rows).any(axis=1)).tolist():
-            self._rate(log, other)
+            self._rate(graph, log, other)
         return True
 
-    def _rate(self, log: ClosureLog, sequence: int) -> None:
+    def _rate(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None:
         """Compares a sequence, by its middle member, with raw odometry."""
+        if self._archive.begun:
+            self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
+            graph, log = self._archive.graph, self._archive.log
         members = log.members(sequence)
         if len(members):
             near = self._scan.near(self._views_prior, WIDE)
-            self._log_ratio.rows[sequence] = self._scan.log_ratios(members[len(members) // 2], near)
+            self._log_ratio.rows[sequence] = self._scan.log_ratios(graph, members[len(members) // 2], near)
 
 
 def is_round(length: int) -> bool:

@@ -110,10 +110,10 @@ class KeyframeMapConfig(Settings):
     """Evidence that a sequence to select from needs before it may strain the map."""
     closure_cost_limit: PositiveFloat = 6.0
     """Largest chi-square of a single closure in the selection."""
-    merge_stood: NonNegativeInt = 0
-    """Whiskers: number of selections in a row that a sequence must stand before the keyframes it confirms are
-    merged with older ones at the same pose; 0, without whiskers, and with `select_every` up to 10: keyframes
-    are not merged."""
+    merge_stood: NonNegativeInt = 4
+    """Number of selections in a row that a sequence must stand before the keyframes it confirms are merged
+    with older ones at the same pose; without selections, that it must stand accepted, every 50 keyframes. 0,
+    and with `select_every` of 1 to 10: keyframes are not merged."""
     merge_newest: PositiveInt = 1000
     """Number of newest keyframes that are not merged."""
     solve_every: PositiveInt = 20

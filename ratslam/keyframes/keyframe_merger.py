@@ -37,7 +37,7 @@ class KeyframeMerger(Checkpointed):
 
     def select(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection on the unmerged keyframes if it is due."""
-        if self._archive.begun and is_due(graph.ever):
+        if self._archive.begun and graph.config.select_every and is_due(graph.ever):
             self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
             self.archive_selection.begin(self._archive)
 

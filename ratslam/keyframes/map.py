@@ -74,7 +74,7 @@ class KeyframeMap(Checkpointed, Map):
         config: KeyframeMapConfig,
         cell: float,
         appearance: Appearance,
-        acceptance: Callable[[KeyframeGraph], Acceptance],
+        acceptance: Callable[[KeyframeGraph, Archive], Acceptance],
         *,
         guard: int = 20,
         closures: bool = True,
@@ -88,7 +88,7 @@ class KeyframeMap(Checkpointed, Map):
         self.archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
         self.merger = KeyframeMerger(self.archive)
         self.selection = SelectionWorker(config.select_every)
-        self._acceptance, self._find_tie = acceptance(self._graph), find_tie
+        self._acceptance, self._find_tie = acceptance(self._graph, self.archive), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
         self._travel = HALT
@@ -356,10 +356,13 @@ class KeyframeMap(Checkpointed, Map):
         self.merger.select(self._graph, self.log)
 
     def _judge(self) -> None:
-        """Every `DOUBT_EVERY` keyframes, judges the present map."""
+        """Every `DOUBT_EVERY` keyframes, judges the present map. Without selections, sequences stand this."""
         graph = self._graph
         if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
             self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), self.log, graph.cut))
+            if not self.config.select_every:
+                self.log.count_selection()
+                self.merger.note_selection(graph)
 
     def _given(self) -> MapSolution:
         """The final map, or odometry without closures where that is doubted."""

@@ -29,15 +29,14 @@ TURN = 2 * float(np.pi)
 
 
 class OdometryScan:
-    """Dead-reckoned paths of a keyframe graph for all calibrations of the grid. Holds nothing that does not
-    follow from the graph, so a checkpoint leaves it out.
+    """Dead-reckoned paths of the keyframes of a graph, none merged, for all calibrations of the grid. Holds
+    nothing that does not follow from the graph, so a checkpoint leaves it out.
 
     Attributes:
         grid: [G, 2] heading biases, rad/m, and turn errors, rad/rad.
     """
 
     def __init__(self, graph: KeyframeGraph) -> None:
-        self._graph = graph
         prior, spans = graph.prior, np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS)
         self._biases = prior.bias + np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / graph.cell
         turn = prior.turn_error + (spans * prior.turn_error_sd if prior.turn_error_sd > 0 else np.zeros(1))
@@ -70,16 +69,17 @@ class OdometryScan:
             apart = np.hypot(apart, turn_error / (reach * prior.turn_error_sd))
         return np.flatnonzero(apart <= 1)
 
-    def log_ratios(self, member: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def log_ratios(self, graph: KeyframeGraph, member: np.ndarray, near: np.ndarray) -> np.ndarray:
         """[G] log of the probability density that odometry gave to the place of a closure, over its mean
         density at all keyframes that could be recalled.
 
         Args:
-            member: keyframe, match and shift of the closure. near: points of the grid to compute; elsewhere
+            graph: of all keyframes so far, which grow from call to call. member: keyframe, match and
+                shift of the closure. near: points of the grid to compute; elsewhere
                 NaN.
         """
-        self._extend()
-        graph, config = self._graph, self._graph.config
+        self._extend(graph)
+        config = graph.config
         j, i, shift = (int(value) for value in member[:3])
         variance = np.ascontiguousarray(graph.variances(graph.cut)[i + 1 : j + 1, 1:])
         gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
@@ -90,10 +90,9 @@ class OdometryScan:
         )
         return ratios
 
-    def _extend(self) -> None:
+    def _extend(self, graph: KeyframeGraph) -> None:
         """Dead reckons the keyframes added since the last call, one at a time, so that every path has the
         same bits whenever it is computed."""
-        graph = self._graph
         self._reserve(graph.count)
         motion, length = graph.motion.rows, graph.length.rows
         extend_paths(self._path, self._total, self.grid, motion, length, self._count, self._end)

@@ -88,7 +88,7 @@ def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.nda
     gate = config.gate_sd * graph.cell
     allowed = own + np.diag([gate**2, gate**2, config.gate_heading**2])
     origin = turn_on_spot(poses[i], turn)
-    claims = between(origin, compose(poses[: max(j - graph.guard, 1)], np.array([0.0, 0.0, turn])))
+    claims = between(origin, compose(poses[: max(j - graph.guard, i + 1)], np.array([0.0, 0.0, turn])))
     error = claims - between(origin, poses[j])
     error[:, 2] = wrap(error[:, 2])
     distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)

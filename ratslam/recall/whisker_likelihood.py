@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.compiled import compiled
 from tactile.base.types import Array, Observation
 
 LEVELS = 32
@@ -99,16 +100,20 @@ class Background(NamedTuple):
 
 def estimate_background(images: np.ndarray, group: np.ndarray) -> Background:
     """The distribution in images [N, D] of levels, with pixels in groups [D]."""
-    groups = int(group.max()) + 1
-    touching, heights = np.zeros(groups), np.zeros((groups, HEIGHTS))
-    for g in range(groups):
-        level = images[:, group == g]
-        level = level[level != DEAD]
-        contact = level[level > 0]
-        touching[g] = (len(contact) + 1.0) / (len(level) + 4.0)
-        count = np.bincount(contact - 1, minlength=HEIGHTS) + 1.0
-        heights[g] = count / count.sum()
-    return Background(touching, heights)
+    count = _count_levels(images, group, int(group.max()) + 1)
+    silent, contact = count[:, 0], count[:, 1:DEAD]
+    touching = (contact.sum(axis=1) + 1.0) / (silent + contact.sum(axis=1) + 4.0)
+    return Background(touching, (contact + 1.0) / (contact + 1.0).sum(axis=1, keepdims=True))
+
+
+@compiled
+def _count_levels(images: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
+    """[groups, LEVELS] number of pixels of images [N, D] by group [D] and level."""
+    count = np.zeros((groups, LEVELS), np.int64)
+    for n in range(len(images)):
+        for d in range(len(group)):
+            count[group[d], images[n, d]] += 1
+    return count
 
 
 def estimate_variation(now: np.ndarray, then: np.ndarray) -> Variation:

@@ -1,8 +1,9 @@
 """Perturbed copies of a recording, to test the robustness of results.
 
 Each copy is drawn from one seed: `perturb` changes start, noise, views and place labels a little, as another
-drive would; `miscalibrate` gives the odometry errors that last; `lose_labels`, `mistake_labels` and
-`rename_labels` spoil a third of the given place labels and nothing else.
+drive would, and `repeat_course` makes one long drive of it; `miscalibrate` gives the odometry errors that
+last; `lose_labels`, `mistake_labels` and `rename_labels` spoil a third of the given place labels and nothing
+else.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from robot.sources.in_memory import InMemorySource, select_rows
-from tactile.base.se2 import compose
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, compose
 
 VIEW_NOISE = 0.01
 """Standard deviation of the noise added to view values."""
@@ -49,19 +51,42 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     The digest of the copy is that of the original followed by the seed.
     """
     stream = np.random.default_rng(seed)
-    looks = _looks(log)
-    first = _draw_start(looks, stream)
-    between = max(float(np.diff(looks).mean()), 1.0) if len(looks) > 1 else 1.0
+    first = _draw_start(_looks(log), stream)
+    changed = replace(_add_noise(log, stream), digest=f"{log.digest}+{seed}")
+    return _cut(changed, first, _draw_rows(log, first, DROPPED, stream))
 
+
+def repeat_course(log: InMemorySource, length: int, seed: int) -> InMemorySource:
+    """The course of a recording driven again and again, for `length` rows; each has noise of its own, as in
+    `perturb`. From its last row the robot gets to the first one by their true motion.
+
+    Raises:
+        InputError: the true pose of the first or of the last row is unknown.
+    """
+    if log.truth is None or not np.isfinite(log.truth[[0, -1]]).all():
+        raise InputError(log.name, "no true pose of its first and last row", "a course that can be repeated")
+    number, row = np.divmod(np.arange(length), log.length)
+    step = float(log.time[-1] - log.time[0]) / max(log.length - 1, 1)
+    long = select_rows(log, row)
+    again = (row == 0) & (number > 0)
+    long.motion[again] = *between(log.truth[-1], log.truth[0]), step
+    long.moved[again] = True
+    time = long.time + number * (float(log.time[-1] - log.time[0]) + step)
+    digest = f"{log.digest}*{length}+{seed}"
+    return replace(_add_noise(long, np.random.default_rng(seed)), time=time, digest=digest)
+
+
+def _add_noise(log: InMemorySource, stream: np.random.Generator) -> InMemorySource:
+    """The recording with noise of motions, views and place labels."""
+    looks = _looks(log)
+    apart = max(float(np.diff(looks).mean()), 1.0) if len(looks) > 1 else 1.0
     motion = log.motion.copy()
     motion[:, :2] *= 1 + LENGTH_NOISE * stream.standard_normal((len(motion), 1))
     moving = log.motion[:, :3].any(axis=1)
-    motion[:, 2] += moving * TURN_NOISE / np.sqrt(between) * stream.standard_normal(len(motion))
+    motion[:, 2] += moving * TURN_NOISE / np.sqrt(apart) * stream.standard_normal(len(motion))
     noise = VIEW_NOISE * stream.standard_normal(log.views.shape)
     views = np.where(log.seen[:, None, None, None], np.clip(log.views + noise, 0, 1), log.views)
-    label = corrupt_labels(log.label, stream)
-    changed = replace(log, digest=f"{log.digest}+{seed}", motion=motion, views=views, label=label)
-    return _cut(changed, first, _draw_rows(log, first, DROPPED, stream))
+    return replace(log, motion=motion, views=views, label=corrupt_labels(log.label, stream))
 
 
 def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:

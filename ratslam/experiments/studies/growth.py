@@ -1,4 +1,7 @@
-"""A growth study: a long session on known ground and one on new ground, measured at growing lengths."""
+"""A growth study: a long session on known ground and one on new ground, measured at growing lengths.
+
+A simulation of whiskers gives both. Another session whose true poses are known, a recording of views or ids,
+gives known ground: its course again and again, with noise of its own each time."""
 
 from __future__ import annotations
 
@@ -35,6 +38,7 @@ class GrowthPlan(Settings):
     first: PositiveInt = 400  # least length to measure at, steps; each further one is twice as long
     known_ground: Length = 3200  # greatest length of the session on known ground, steps; 0: no such session
     new_ground: Length = 3200  # greatest length of the session on new ground, steps; 0: no such session
+    window: Length = 0  # steps before each length whose times are measured; 0: all since the length before
 
     def lengths(self, ground: Ground) -> list[int]:
         """The lengths to measure a session at, in increasing order."""
@@ -50,8 +54,9 @@ class GrowthTask(NamedTuple):
     """One session of a growth study."""
 
     ground: Ground
-    config: RunConfig  # of a simulation that is at least as long as the greatest length
+    config: RunConfig  # a simulation of whiskers is at least as long as the greatest length
     lengths: list[int]  # to measure at, increasing, steps
+    window: int = 0  # see `GrowthPlan`
 
 
 class GrowthStudy(NamedTuple):
@@ -68,21 +73,20 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> GrowthStudy:
         overrides: each `a.b=value`: a key of `GrowthPlan` where it is one, else of the configuration.
 
     Raises:
-        InputError: the configuration is invalid or simulates no whisker head, or the ground is too small.
+        InputError: the configuration is invalid, or the ground is too small.
     """
     own = [text for text in overrides if text.partition("=")[0] in GrowthPlan.model_fields]
     empty = Document({}, {(): Place("--preset growth", "--preset growth")})
     plan = validate(override(empty, own), GrowthPlan)
     document = override(load(path), [text for text in overrides if text not in own])
     config = validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
-    if config.simulation is None:
-        expected = "a scene to simulate"
-        raise InputError("simulation", "missing", expected, "`simulation: {}` is a whole session")
+    whiskers = config.simulation is not None
     tasks = []
     if lengths := plan.lengths("known ground"):
-        tasks.append(GrowthTask("known ground", _with_laps(config, lengths[-1]), lengths))
-    if lengths := plan.lengths("new ground"):
-        tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths))
+        known = _with_laps(config, lengths[-1]) if whiskers else config
+        tasks.append(GrowthTask("known ground", known, lengths, plan.window))
+    if whiskers and (lengths := plan.lengths("new ground")):
+        tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
     if not tasks:
         raise InputError("--preset growth", "no session", "known_ground or new_ground above 0 steps")
     return GrowthStudy(f"{path.stem}-growth", tasks)

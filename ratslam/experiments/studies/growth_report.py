@@ -41,10 +41,11 @@ COLUMNS = {
 """Fields of a row by their column in the table."""
 NOTE = """\
 mean, median, 99 %, largest: processor time of a step on the session's thread, over the steps since the length
-before, without those that compiled code. all threads: the mean with other threads. longest: wall time of a
-step, with waits for the selection of closures, as steps follow one another without pause. memory: peak since
-the length before. EM and ATE: of the online map so far. end: processor time of the final optimisation if the
-session ended here. final, closures, false: of the map after it; closures of places more than 0.1 m apart."""
+before or the window, without those that compiled code. all threads: the mean with other threads. longest:
+wall time of a step, with waits for the selection of closures, as steps follow one another without pause.
+memory: peak since the length before. EM and ATE: of the online map so far. end: processor time of the final
+optimisation if the session ended here. final, closures, false: of the map after it; closures of places more
+than 0.1 m apart."""
 
 
 def run_growth(study: GrowthStudy, folder: Path) -> None:

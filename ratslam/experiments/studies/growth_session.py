@@ -18,17 +18,21 @@ from ratslam.experiments.studies.growth import Ground, GrowthTask
 from ratslam.experiments.studies.machine import Machine, compilations, machine
 from ratslam.pipeline.build_session import build_session
 from ratslam.pipeline.source import open_observations, read_observations
+from robot.sources.in_memory import load_into_memory
+from robot.sources.perturbation import repeat_course
 from tactile.base.config import Settings
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
 
+SEED = 0
+"""Seed of the noise of a course that is repeated."""
 TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
 """Fields of a row that need a step that compiled nothing."""
 
 
 class GrowthRow(Settings):
-    """A session at one length. Times are of the steps since the length before, without those that compiled
-    code; None if all did. Errors are of all steps so far."""
+    """A session at one length. Times are of the steps since the length before, or of the window of
+    `GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
 
     ground: Ground
     steps: int  # length of the session
@@ -69,7 +73,7 @@ class _StepClock:
 
     def __init__(self) -> None:
         self._compiled = compilations()
-        self._restart()
+        self.restart()
 
     def take(self, step: Callable[[], object]) -> None:
         """Takes and times a step."""
@@ -83,11 +87,11 @@ class _StepClock:
             self._others += own - process  # threads that compile are no cost of a step
 
     def read(self) -> dict[str, float | None]:
-        """The times of `GrowthRow` since the last call."""
+        """The times of `GrowthRow` since the last call or restart."""
         now = _Clocks.now()
         others = self._others + (now.process - self._began.process) - (now.own - self._began.own)
         steps, compiling = self._steps, self._compiling
-        self._restart()
+        self.restart()
         if not steps:
             return {"compiling": compiling} | dict.fromkeys(TIMES)
         own, wall = 1e6 * np.array(steps).T
@@ -97,7 +101,8 @@ class _StepClock:
         times: dict[str, float | None] = {"compiling": compiling}
         return times | dict(zip(TIMES, map(float, found), strict=True))
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Forgets the steps so far."""
         self._steps: list[tuple[float, float]] = []
         self._compiling, self._others, self._began = 0.0, 0.0, _Clocks.now()
 
@@ -112,13 +117,18 @@ def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) 
         # Rows reserved for the greatest length would cost from the first step on.
         reserve = config.session.reserve or 1
         kept = config.session.model_copy(update={"reserve": reserve})
+        if config.simulation is None:
+            source = repeat_course(load_into_memory(source), task.lengths[-1], SEED)
         session = build_session(config.model_copy(update={"session": kept}), source)
         rows, clock = read_observations(source), _StepClock()
         truth, motion = list[np.ndarray](), list[np.ndarray]()
         for before, length in pairwise([0, *task.lengths]):
             load = watch_load()
             reset_peak_memory()
-            for sample, observation in islice(rows, length - before):
+            window = min(task.window or length, length - before)
+            for step, (sample, observation) in enumerate(islice(rows, length - before)):
+                if step == length - before - window:
+                    clock.restart()
                 clock.take(_step(session, observation))
                 assert sample.truth is not None
                 truth.append(sample.truth)

@@ -56,9 +56,10 @@ class Drive:
     """A map with the keyframe that each of its rows is, as a kernel keeps them, and the experience of each
     keyframe."""
 
-    def __init__(self, route, **settings):
+    def __init__(self, route, acceptance=lambda *_: AcceptByEvidence(), **settings):
+        self.acceptance = acceptance
         config, looks = KeyframeMapConfig.model_validate(settings), LookAppearance(route.look)
-        self.map = KeyframeMap(config, CELL, looks, lambda graph: AcceptByEvidence(), guard=GUARD)
+        self.map = KeyframeMap(config, CELL, looks, acceptance, guard=GUARD)
         self.route, self.settings, self.rows = route, settings, np.zeros(0, int)
         self.experiences: list[int] = []
 
@@ -83,7 +84,7 @@ class Drive:
 
     def restored(self):
         """The same continued from a checkpoint."""
-        other = Drive(self.route, **self.settings)
+        other = Drive(self.route, self.acceptance, **self.settings)
         other.map.restore(self.map.arrays())
         other.rows, other.experiences = self.rows.copy(), list(self.experiences)
         return other

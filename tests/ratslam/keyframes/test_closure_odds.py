@@ -17,7 +17,7 @@ from tactile.base.se2 import correct_heading, integrate
 from tests.ratslam.keyframes.map_cases import CELL, LAP, TRUE, drive, new_map, sequence
 
 
-def by_evidence(graph):
+def by_evidence(graph, archive):
     return AcceptByEvidence()
 
 

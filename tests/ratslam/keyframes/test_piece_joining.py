@@ -19,7 +19,7 @@ from tests.ratslam.keyframes.map_cases import BIAS, CELL, LAP, STEP, drive, new_
 
 BEGIN = LAP
 RULES = pytest.mark.parametrize(
-    "rule", [lambda graph: AcceptByEvidence(), AcceptByOdds], ids=["evidence", "odds"]
+    "rule", [lambda *_: AcceptByEvidence(), AcceptByOdds], ids=["evidence", "odds"]
 )
 
 

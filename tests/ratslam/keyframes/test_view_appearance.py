@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from ratslam.backends.config import RecallBackendConfig
-from ratslam.backends.recall import RecallBackend
 from ratslam.keyframes.appearance import MIN_ERRORS, ViewAppearance
 from tests.ratslam.keyframes.appearance_cases import SHAPE, SIZE, alone, seeds, seen, viewed
 
@@ -53,8 +51,3 @@ def test_only_ordered_sectors_have_an_angle():
     assert viewed(views, fan=0.0).metric().angle == 0
     assert viewed(views, fan=3.6).metric().angle == pytest.approx(0.2)
     assert viewed(views).metric().likeness.size == 0
-
-
-def test_keyframes_of_views_are_not_merged():
-    config = RecallBackendConfig.model_validate({"keyframes": {"merge_stood": 4}})
-    assert RecallBackend(config, SHAPE).new_map().config.merge_stood == 0

@@ -10,7 +10,8 @@ import pytest
 
 from robot.recordings.npz_trace import read_trace
 from robot.sources import perturbation
-from robot.sources.perturbation import perturb
+from robot.sources.perturbation import perturb, repeat_course
+from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 
 ROOT = Path(__file__).parents[3]
@@ -42,6 +43,27 @@ def test_dropped_rows_leave_the_path_unchanged(log, monkeypatch):
     assert np.array_equal(copy.views, log.views[rows])
     assert np.array_equal(copy.truth, log.truth[rows])
     assert copy.motion[1:, 3].sum() == pytest.approx(copy.time[-1] - copy.time[0])
+
+
+def test_a_course_is_repeated_with_noise_of_its_own(log):
+    rows = len(log.time)
+    long = repeat_course(log, 2 * rows + 5, 1)
+    assert long.length == 2 * rows + 5
+    assert (np.diff(long.time) > 0).all()
+    assert np.array_equal(long.truth[rows : 2 * rows], log.truth)
+    step = between(log.truth[-1], log.truth[0])
+    assert long.motion[rows, :3] == pytest.approx(
+        step, abs=6 * max(perturbation.TURN_NOISE, np.hypot(*step[:2]))
+    )
+    first, second = long.views[:rows], long.views[rows : 2 * rows]
+    assert 0 < np.abs(first - second).max() < 20 * perturbation.VIEW_NOISE
+    assert np.array_equal(long.motion, repeat_course(log, 2 * rows + 5, 1).motion)
+    assert len({long.digest, repeat_course(log, 2 * rows, 1).digest, log.digest}) == 3
+
+
+def test_a_course_without_truth_cannot_be_repeated(log):
+    with pytest.raises(InputError, match="no true pose of its first and last row"):
+        repeat_course(replace(log, truth=None), 100, 0)
 
 
 def test_some_labels_are_replaced_by_new_or_wrong_ones():

@@ -64,6 +64,19 @@ def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(confi
     assert len(np.unique(entered, axis=0)) > 0.9 * len(entered)
 
 
+def test_the_course_of_a_recording_is_known_ground():
+    settings = ["first=150", "known_ground=300", "window=40"]
+    (task,) = growth_study(ROOT / "configs" / "square.yaml", settings).tasks
+    assert (task.ground, task.lengths, task.window) == ("known ground", [150, 300], 40)
+    rows, done = [], []
+    for row in measure_growth(task, lambda: done.append(len(rows))):
+        rows.append(row)
+    assert [row.steps for row in rows] == [150, 300]
+    assert len(done) == 300
+    assert 0 < rows[0].closures < rows[1].closures
+    assert rows[1].median <= rows[1].largest
+
+
 @pytest.mark.soak
 def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
     output = tmp_path / "out"
@@ -90,7 +103,7 @@ def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
 
 def test_a_measurement_on_the_way_changes_nothing(config):
     study = growth_study(config, ["first=32", "known_ground=96", "new_ground=0"])
-    ground, settings, lengths = study.tasks[0]
+    ground, settings, lengths, _ = study.tasks[0]
     steps = []
     rows = list(measure_growth(GrowthTask(ground, settings, lengths), lambda: steps.append(1)))
     assert [row.steps for row in rows] == lengths == [32, 64, 96]
@@ -155,8 +168,8 @@ def test_bad_input_is_refused_before_anything_runs(config, tmp_path, capsys, mor
     assert not output.exists()
 
 
-def test_a_configuration_without_a_scene_is_refused(tmp_path, capsys):
+def test_a_recording_that_is_missing_is_named(tmp_path, capsys):
     path = tmp_path / "recorded.yaml"
     path.write_text("recording: {file: a.npz}\n")
     assert main(["study", "--preset", "growth", str(path), "-o", str(tmp_path / "out")]) == 2
-    assert "a scene to simulate" in capsys.readouterr().err
+    assert "a.npz: no such file" in capsys.readouterr().err
