@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.compiled import compiled, wrapped
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.types import Action
-from tactile.base.se2 import between, compose, wrap
+from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
     import networkx
@@ -141,9 +142,8 @@ class Experiences(Checkpointed):
         """The current experience if in reach, else the nearest in reach if the pose is reliable, or -1."""
         if not len(self._frame.rows):
             return -1
-        apart = self._poses(poses) - poses[frame]
-        turned = wrap(apart[:, 2])
-        far = np.hypot(np.hypot(apart[:, 0], apart[:, 1]) / self.radius, turned / self.heading)
+        held, offset = self._frame.rows, self._offset.rows
+        far = measure_distances(poses, held, offset, frame, self.radius, self.heading)
         if self._current >= 0 and far[self._current] <= 1:
             return self._current
         best = int(np.argmin(far))
@@ -153,3 +153,21 @@ class Experiences(Checkpointed):
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._link_of = {(a, b): k for k, (a, b, _) in enumerate(self._link.rows.tolist())}
+
+
+@compiled
+def measure_distances(
+    poses: np.ndarray, held: np.ndarray, offset: np.ndarray, frame: int, radius: float, turn: float
+) -> np.ndarray:
+    """[E] distances of a keyframe from the experiences at `offset` [E, 3] in the frames of keyframes `held`
+    [E], 1 where they are `radius` (m) or `turn` (rad) away."""
+    far = np.empty(len(held))
+    x, y, heading = poses[frame]
+    for e in range(len(held)):
+        x0, y0, heading0 = poses[held[e]]
+        c, s = np.cos(heading0), np.sin(heading0)
+        dx = x0 + c * offset[e, 0] - s * offset[e, 1] - x
+        dy = y0 + s * offset[e, 0] + c * offset[e, 1] - y
+        turned = wrapped(heading0 + offset[e, 2] - heading)
+        far[e] = np.hypot(np.hypot(dx, dy) / radius, turned / turn)
+    return far

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compiled import compiled
+from ratslam.core.compiled import compiled, wrapped
 from ratslam.keyframes.keyframe_graph import KeyframeGraph
 from ratslam.keyframes.loop_closures import Candidate
-from tactile.base.se2 import compose, wrap
 
 LEAST_WEIGHT = 0.05
 """Least robust weight of a sequence in the filter."""
@@ -46,18 +45,32 @@ class LiveFilter(Checkpointed):
     def correct(self, graph: KeyframeGraph, candidate: Candidate, weight: float) -> np.ndarray:
         """[3] the newest keyframe's pose corrected by a closure of a sequence with this robust weight. The
         covariance takes over the closure."""
-        turn = np.array([0.0, 0.0, -candidate.shift * graph.sector_angle])
-        claimed = compose(graph.pose.rows[candidate.match], turn)
-        error = claimed - graph.pose.rows[candidate.keyframe]
-        error[2] = wrap(error[2])
-        noise = np.diag(graph.closure_variance()) / max(weight, LEAST_WEIGHT)
-        gain = np.linalg.solve(self.covariance + noise, self.covariance).T
-        self.covariance = self.covariance - gain @ self.covariance
-        moved: np.ndarray = gain @ error
-        self.strayed += float(np.sqrt((moved**2 / graph.closure_variance()).sum()))
-        corrected: np.ndarray = graph.pose.rows[candidate.keyframe] + moved
-        corrected[2] = wrap(corrected[2])
+        claimed, pose = graph.pose.rows[candidate.match], graph.pose.rows[candidate.keyframe]
+        variance, turn = graph.closure_variance(), -candidate.shift * graph.sector_angle
+        noise = variance / max(weight, LEAST_WEIGHT)
+        corrected, self.covariance, moved = corrected_pose(self.covariance, pose, claimed, turn, noise)
+        self.strayed += float(np.sqrt((moved**2 / variance).sum()))
         return corrected
+
+
+@compiled
+def corrected_pose(
+    covariance: np.ndarray, pose: np.ndarray, claimed: np.ndarray, turn: float, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A pose [3] with a covariance [3, 3] after a measurement of it with variances `noise` [3]: the pose
+    `claimed` [3], turned on the spot. Returns pose, covariance, and the correction [3]."""
+    error = claimed - pose
+    error[2] = wrapped(error[2] + turn)
+    gain = np.linalg.solve(covariance + np.diag(noise), covariance).T
+    moved, after = np.zeros(3), covariance.copy()
+    for i in range(3):
+        for j in range(3):
+            moved[i] += gain[i, j] * error[j]
+            for k in range(3):
+                after[i, j] -= gain[i, k] * covariance[k, j]
+    corrected = pose + moved
+    corrected[2] = wrapped(corrected[2])
+    return corrected, after, moved
 
 
 @compiled
