@@ -9,7 +9,7 @@ from setuptools import Command, setup
 from setuptools.command.build import build
 
 FILES = ("configs/*.yaml", "tests/golden/a_square3.npz", "CITATION.cff")
-FOLDER = "ratslam/packaged"  # see ratslam/config/packaged.py
+FOLDER = "ratslam/packaged"  # see ratslam/runs/settings/packaged.py
 
 
 class BuildConfigurations(Command):

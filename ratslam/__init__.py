@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from evaluation.metrics.metric import Finding, Metric
     from evaluation.metrics.registry import METRICS, MetricEntry
-    from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors
-    from ratslam.config.run_config import RunConfig, load_config
     from ratslam.core.backend import Backend, Map
     from ratslam.core.path_map import PathMap
     from ratslam.core.session import Session
     from ratslam.core.types import Action, Estimate
-    from ratslam.pipeline.estimate import Health, PoseEstimate
-    from ratslam.pipeline.result import Result, run
-    from ratslam.pipeline.slam import Slam
-    from ratslam.pipeline.source import open_source
+    from ratslam.methods.registry import BACKENDS, BackendEntry, Sensors
+    from ratslam.runs.estimate import Health, PoseEstimate
+    from ratslam.runs.result import Result, run
+    from ratslam.runs.settings.run_config import RunConfig, load_config
+    from ratslam.runs.slam import Slam
+    from ratslam.runs.source import open_source
     from robot.sources.description import SourceDescription
     from robot.sources.registry import SOURCES, SourceEntry
     from robot.sources.source import Sample, Source
@@ -32,12 +32,12 @@ RATSLAM_PACKAGE = "ratslam"  # see tactile/__init__.py
 
 _MODULES = {
     "Action": "ratslam.core.types",
-    "BACKENDS": "ratslam.backends.registry",
+    "BACKENDS": "ratslam.methods.registry",
     "Backend": "ratslam.core.backend",
-    "BackendEntry": "ratslam.backends.registry",
+    "BackendEntry": "ratslam.methods.registry",
     "Estimate": "ratslam.core.types",
     "Finding": "evaluation.metrics.metric",
-    "Health": "ratslam.pipeline.estimate",
+    "Health": "ratslam.runs.estimate",
     "InputError": "tactile.base.errors",
     "METRICS": "evaluation.metrics.registry",
     "Map": "ratslam.core.backend",
@@ -46,25 +46,25 @@ _MODULES = {
     "Observation": "tactile.base.types",
     "Odometry": "tactile.base.types",
     "PathMap": "ratslam.core.path_map",
-    "PoseEstimate": "ratslam.pipeline.estimate",
-    "Result": "ratslam.pipeline.result",
-    "RunConfig": "ratslam.config.run_config",
+    "PoseEstimate": "ratslam.runs.estimate",
+    "Result": "ratslam.runs.result",
+    "RunConfig": "ratslam.runs.settings.run_config",
     "SOURCES": "robot.sources.registry",
     "Sample": "robot.sources.source",
-    "Sensors": "ratslam.backends.registry",
+    "Sensors": "ratslam.methods.registry",
     "Session": "ratslam.core.session",
     "Settings": "tactile.base.config",
-    "Slam": "ratslam.pipeline.slam",
+    "Slam": "ratslam.runs.slam",
     "Source": "robot.sources.source",
     "SourceDescription": "robot.sources.description",
     "SourceEntry": "robot.sources.registry",
     "SourceInfo": "robot.sources.source_info",
     "TOUCH": "robot.touch_source",
     "TouchEntry": "robot.touch_source",
-    "load_config": "ratslam.config.run_config",
+    "load_config": "ratslam.runs.settings.run_config",
     "observation": "tactile.base.types",
-    "open_source": "ratslam.pipeline.source",
-    "run": "ratslam.pipeline.result",
+    "open_source": "ratslam.runs.source",
+    "run": "ratslam.runs.result",
 }
 __all__ = [
     "BACKENDS",

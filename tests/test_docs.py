@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from ratslam.cli import build_parser, main
-from ratslam.config.packaged import find_config, packaged_configs
-from ratslam.config.run_config import LoopConfig, RunConfig, load_config
-from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.experiments.studies.study import check_study, read_study
+from ratslam.runs.settings.packaged import find_config, packaged_configs
+from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
+from ratslam.runs.settings.strict_yaml import override, parse, validate
 
 ROOT = Path(__file__).parents[1]
 READMES = sorted(
@@ -89,8 +89,8 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 LONG = {
     "docs/cells.md", "ratslam/README.md", "ratslam/classic/README.md", "ratslam/core/README.md",
     "ratslam/experiments/studies/README.md", "ratslam/experiments/trials/README.md",
-    "ratslam/export/README.md", "ratslam/grid/README.md", "ratslam/pipeline/README.md",
-    "ratslam/rats/README.md", "ratslam/viewer/README.md",
+    "ratslam/service/export/README.md", "ratslam/grid/README.md", "ratslam/runs/README.md",
+    "ratslam/service/rats/README.md", "ratslam/service/viewer/README.md",
 }  # fmt: skip
 """READMEs whose blocks take longest, on parts that have tests of their own: for `make soak`."""
 
@@ -231,7 +231,7 @@ def test_the_reference_is_built_without_warnings(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     for page in (
         "index",
-        "ratslam/config/packaged",
+        "ratslam/runs/settings/packaged",
         "tactile/base/types",
         "robot/sources",
         "evaluation/metrics",

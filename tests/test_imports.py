@@ -30,13 +30,13 @@ VIOLATIONS = {
     ],
     "rooms of evaluation": [("evaluation.metrics.trajectory", "evaluation.plots.style")],
     "rooms of ratslam": [
-        ("ratslam.core.session", "ratslam.backends.recall"),
-        ("ratslam.classic.pose_cells", "ratslam.keyframes.map"),
-        ("ratslam.recall.filter", "ratslam.pose_graph"),
-        ("ratslam.pipeline.run", "ratslam.experiments"),
+        ("ratslam.core.session", "ratslam.methods.recall"),
+        ("ratslam.classic.pose_cells", "ratslam.grid.config"),
+        ("ratslam.recall.filter", "ratslam.mapping"),
+        ("ratslam.runs.run", "ratslam.experiments"),
         ("ratslam.live.session", "ratslam.experiments"),
-        ("ratslam.pipeline.run", "ratslam.checks"),
-        ("ratslam.checks.backend", "ratslam.live"),
+        ("ratslam.runs.run", "ratslam.service.checks"),
+        ("ratslam.service.checks.backend", "ratslam.live"),
         ("ratslam.planted", "ratslam.core.types"),
     ],
     "rooms of ratslam.experiments": [
@@ -46,7 +46,7 @@ VIOLATIONS = {
     ],
     "core, methods and backends do not know robot and evaluation": [
         ("ratslam.core.session", "robot"),
-        ("ratslam.backends.classic", "evaluation"),
+        ("ratslam.methods.classic", "evaluation"),
     ],
     "networkx is for maps": [
         ("ratslam.classic.pose_cells", "networkx"),
@@ -54,7 +54,7 @@ VIOLATIONS = {
     ],
     "jax is for the engine": [("robot.planted", "jax.numpy"), ("evaluation.planted", "jax")],
     "the libraries of robots are for drivers and live sessions": [
-        ("ratslam.pipeline.run", "usb.core"),
+        ("ratslam.runs.run", "usb.core"),
         ("tactile.planted", "serial"),
         ("evaluation.planted", "rtde_control"),
     ],
@@ -171,9 +171,9 @@ import json, sys
 from ratslam.cli.common import prepare_jax
 prepare_jax()
 import evaluation.metrics.scorecard
-from ratslam.config.run_config import load_config
-from ratslam.pipeline.run import open_observations
-from ratslam.pipeline.build_session import build_session
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.run import open_observations
+from ratslam.runs.build_session import build_session
 with open_observations(load_config("configs/whisker_maze.yaml")) as (config, source):
     build_session(config, source)
     next(iter(source))

@@ -73,8 +73,8 @@ def test_an_installed_program_finds_its_configurations(site: Path, tmp_path: Pat
     )
     code = (
         "import json\n"
-        "from ratslam.config.packaged import find_config\n"
-        "from ratslam.config.run_config import load_config\n"
+        "from ratslam.runs.settings.packaged import find_config\n"
+        "from ratslam.runs.settings.run_config import load_config\n"
         "file = load_config(find_config('square')).recording.file\n"
         "print(json.dumps([str(find_config('square')), str(file.resolve())]))\n"
     )

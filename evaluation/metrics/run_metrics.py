@@ -87,7 +87,7 @@ RUN_METRICS: tuple[Metric, ...] = (
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
 DOUBTED = 0.7
-"""Probability of being worse than odometry above which a map is doubted (`ratslam.keyframes.map_health`)."""
+"""Probability of being worse than odometry above which a map is doubted (`ratslam.mapping.map_health`)."""
 
 
 def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> RunData:

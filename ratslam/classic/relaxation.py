@@ -1,7 +1,7 @@
 """The relaxation of RatSLAM: every link in turn moves both of its ends towards its measurement.
 
 Source: Ball et al. 2013, section 6 (Gauss-Seidel in order of creation, no fixed node, no weights). For
-comparison: it needs thousands of sweeps for the result of one solve by `ratslam.pose_graph`.
+comparison: it needs thousands of sweeps for the result of one solve by `ratslam.mapping`.
 """
 
 from __future__ import annotations

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import shtab
 
-from ratslam.config.packaged import packaged_configs
 from ratslam.core.xla_flags import add_xla_flags
+from ratslam.runs.settings.packaged import packaged_configs
 from tactile.base.new_file import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
-    from ratslam.config.run_config import RunConfig
+    from ratslam.runs.settings.run_config import RunConfig
 
 INPUT_ERROR = 2
 """Exit code after an error that the user can correct."""
@@ -162,7 +162,7 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
     Raises:
         InputErrors: all errors in it, each with its place.
     """
-    from ratslam.config.run_config import load_config
+    from ratslam.runs.settings.run_config import load_config
 
     return load_config(arguments.config, arguments.set)
 

@@ -11,7 +11,7 @@ from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file
 
 if TYPE_CHECKING:
-    from ratslam.doctor.diagnosis import Diagnosis
+    from ratslam.service.doctor.diagnosis import Diagnosis
 
 FAULTY = 1
 """Exit code if a fault was found."""
@@ -41,20 +41,20 @@ def add_commands(commands: Commands) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from ratslam.doctor.diagnosis import render
+    from ratslam.service.doctor.diagnosis import render
 
     if arguments.set and not arguments.live:
         raise InputError("--set", "settings without --live", "the configuration of a live session")
     if arguments.live:
         # Whether a live session could start.
-        from ratslam.config.run_config import load_config
-        from ratslam.doctor.live_check import diagnose_live
+        from ratslam.runs.settings.run_config import load_config
+        from ratslam.service.doctor.live_check import diagnose_live
 
         prepare_jax()
         config = load_config(arguments.path, arguments.set)
         diagnosis = diagnose_live(config, str(arguments.path), Path("runs"))
     elif (arguments.path / "manifest.json").exists():
-        from ratslam.doctor.run_check import diagnose_run
+        from ratslam.service.doctor.run_check import diagnose_run
 
         diagnosis = diagnose_run(arguments.path)
     else:
@@ -65,13 +65,13 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     """What the recording is; writes its configuration."""
-    from ratslam.config.strict_yaml import dump_data
-    from ratslam.doctor.recording_check import diagnose_recording
+    from ratslam.runs.settings.strict_yaml import dump_data
+    from ratslam.service.doctor.recording_check import diagnose_recording
 
     like = None
     if arguments.like is not None:
-        from ratslam.backends.registry import LOCALISING
-        from ratslam.pipeline.saved_map import read_map
+        from ratslam.methods.registry import LOCALISING
+        from ratslam.runs.saved_map import read_map
 
         like = read_map(arguments.like)
         if like.config.backend in LOCALISING.values() and like.config.localise.map is not None:

@@ -30,8 +30,8 @@ def add_commands(commands: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ratslam.export.formats import export_run
-    from ratslam.rats.spikes import SpikeConfig
+    from ratslam.service.export.formats import export_run
+    from ratslam.service.rats.spikes import SpikeConfig
 
     export_run(
         arguments.run,

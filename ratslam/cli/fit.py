@@ -11,7 +11,7 @@ from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file
 
 if TYPE_CHECKING:
-    from ratslam.config.run_config import RunConfig
+    from ratslam.runs.settings.run_config import RunConfig
 
 
 def add_commands(commands: Commands) -> None:
@@ -35,8 +35,8 @@ def _fit(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
-    from ratslam.fit.record import fit_record
-    from ratslam.fit.rig import render_rig, rig_file
+    from ratslam.service.fit.record import fit_record
+    from ratslam.service.fit.rig import render_rig, rig_file
 
     rig = fit_record(_config_of(arguments), arguments.seed)
     print(render_rig(rig))
@@ -52,10 +52,10 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 def _config_of(arguments: argparse.Namespace) -> RunConfig:
     """The configuration that reads the record: the one given, or that which the doctor finds."""
-    from ratslam.config.packaged import packaged_configs
-    from ratslam.config.run_config import RunConfig, load_config
-    from ratslam.config.strict_yaml import dump_data, override, parse, validate
-    from ratslam.doctor.recording_check import UNREADABLE, diagnose_recording
+    from ratslam.runs.settings.packaged import packaged_configs
+    from ratslam.runs.settings.run_config import RunConfig, load_config
+    from ratslam.runs.settings.strict_yaml import dump_data, override, parse, validate
+    from ratslam.service.doctor.recording_check import UNREADABLE, diagnose_recording
     from robot.sources.input_files import raise_errors
 
     record: Path = arguments.record

@@ -16,7 +16,7 @@ from robot.drivers.process_priority import put_last
 from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
-    from ratslam.config.run_config import RunConfig
+    from ratslam.runs.settings.run_config import RunConfig
     from robot.live.config import LiveConfig
 
 
@@ -62,13 +62,13 @@ def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.summary import summarise
     from ratslam.live.session import run_live_session
-    from ratslam.pipeline.run import catch_interrupt
+    from ratslam.runs.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
     if arguments.localise is not None:
-        from ratslam.pipeline.localise import check_assignments, localising
-        from ratslam.pipeline.saved_map import read_map
+        from ratslam.runs.localise import check_assignments, localising
+        from ratslam.runs.saved_map import read_map
 
         saved = read_map(arguments.localise)
         check_assignments(arguments.set, saved)

@@ -11,8 +11,8 @@ from ratslam.cli.run import add_rerun, open_target
 from tactile.base.errors import tell
 
 if TYPE_CHECKING:
-    from ratslam.config.run_config import RunConfig
-    from ratslam.pipeline.saved_map import SavedMap
+    from ratslam.runs.saved_map import SavedMap
+    from ratslam.runs.settings.run_config import RunConfig
 
 CONFIGURATIONS = (".yaml", ".yml", "")
 """Suffixes of a configuration or its name; other files, and folders, are recordings."""
@@ -40,9 +40,9 @@ def add_commands(commands: Commands) -> None:
 def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.summary import summarise
-    from ratslam.pipeline.localise import localise
-    from ratslam.pipeline.saved_map import read_map
-    from ratslam.viewer.observer import open_viewer
+    from ratslam.runs.localise import localise
+    from ratslam.runs.saved_map import read_map
+    from ratslam.service.viewer.observer import open_viewer
 
     target, saved = open_target(arguments), read_map(arguments.map, tell)
     config = _read_recording(arguments, saved)
@@ -58,8 +58,8 @@ def _localise(arguments: argparse.Namespace) -> int:
 
 
 def _read_recording(arguments: argparse.Namespace, saved: SavedMap) -> RunConfig:
-    from ratslam.config.run_config import load_config
-    from ratslam.pipeline.localise import check_assignments, recorded_alike
+    from ratslam.runs.localise import check_assignments, recorded_alike
+    from ratslam.runs.settings.run_config import load_config
 
     file: Path = arguments.recording
     if file.suffix in CONFIGURATIONS and not file.is_dir():

@@ -127,7 +127,7 @@ def render_scores(path: Path, card: Scorecard) -> str:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from ratslam.pipeline.report import write_report
+    from ratslam.runs.report import write_report
 
     write_report(arguments.runs, arguments.output)
     print(f"{arguments.output}: open it in a browser; it needs no network")

@@ -14,7 +14,7 @@ from ratslam.cli.common import Commands, prepare_jax
 from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
-    from ratslam.pipeline.saved_map import SavedMap
+    from ratslam.runs.saved_map import SavedMap
 
 
 def add_commands(commands: Commands) -> None:
@@ -63,14 +63,14 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
 
 def _read(path: Path) -> SavedMap:
     prepare_jax()
-    from ratslam.pipeline.saved_map import read_map
+    from ratslam.runs.saved_map import read_map
 
     return read_map(path, tell)
 
 
 def _info(arguments: argparse.Namespace) -> int:
     saved = _read(arguments.map)
-    from ratslam.pipeline.map_care import map_info
+    from ratslam.runs.map_care import map_info
 
     info = map_info(saved)
     print(json.dumps(info, indent=2) if arguments.json else render_info(info))
@@ -79,7 +79,7 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _diff(arguments: argparse.Namespace) -> int:
     first, second = _read(arguments.map), _read(arguments.other)
-    from ratslam.pipeline.map_care import map_difference
+    from ratslam.runs.map_care import map_difference
 
     found = map_difference(first, second)
     print(json.dumps(found, indent=2) if arguments.json else render_difference(found))
@@ -89,7 +89,7 @@ def _diff(arguments: argparse.Namespace) -> int:
 def _undo(arguments: argparse.Namespace) -> int:
     output: Path | None = arguments.output
     prepare_jax()
-    from ratslam.pipeline.map_care import finish_undo, replaced_file, undo_sequence
+    from ratslam.runs.map_care import finish_undo, replaced_file, undo_sequence
 
     if output is None:
         output = arguments.map = replaced_file(arguments.map)
@@ -111,8 +111,8 @@ def _crop(arguments: argparse.Namespace) -> int:
     box = None if arguments.box is None else read_box(arguments.box)
     steps = None if arguments.steps is None else read_steps(arguments.steps)
     saved = _read(arguments.map)
-    from ratslam.atlas.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
-    from ratslam.pipeline.map_care import Choose, crop_saved
+    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
+    from ratslam.runs.map_care import Choose, crop_saved
 
     choose: Choose
     if box is not None:

@@ -26,7 +26,7 @@ def add_commands(commands: Commands) -> None:
 
 def _merge(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.pipeline.merge import merge_maps
+    from ratslam.runs.merge import merge_maps
 
     report = merge_maps(arguments.maps, arguments.output, tell)
     print(json.dumps(report.to_json(), indent=2) if arguments.json else report.describe())

@@ -14,7 +14,7 @@ from tactile.base.errors import InputError, tell
 from tactile.base.new_file import require_new_file
 
 if TYPE_CHECKING:
-    from ratslam.atlas.route import Way
+    from ratslam.places.route import Way
 
 Place = tuple[float, float] | int
 """A point x, y (m) or the number of an experience."""
@@ -52,9 +52,9 @@ def _path(arguments: argparse.Namespace) -> int:
     start = None if arguments.start == "here" else read_place(arguments.start, "--from")
     goal = read_place(arguments.goal, "--to")
     prepare_jax()
-    from ratslam.atlas.route import NoWay
-    from ratslam.pipeline.map_way import draw_map_way, find_map_way
-    from ratslam.pipeline.saved_map import read_map
+    from ratslam.places.route import NoWay
+    from ratslam.runs.map_way import draw_map_way, find_map_way
+    from ratslam.runs.saved_map import read_map
 
     saved = read_map(arguments.map, tell)
     made = saved.open_session().map

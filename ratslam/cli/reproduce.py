@@ -20,10 +20,10 @@ from ratslam.cli.common import (
     prepare_jax,
     read_config,
 )
-from ratslam.config.packaged import find_config
 from ratslam.experiments.atlas.registry import ROWS as MAP_ROWS
 from ratslam.experiments.cells.reproduction import NAMES as CELL_ROWS
 from ratslam.experiments.real.reproduction import NAMES as REAL_ROWS
+from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError
 from tactile.base.new_file import require_new_file
 
@@ -172,8 +172,8 @@ def _figure(arguments: argparse.Namespace) -> int:
 
 def _threshold(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from ratslam.config.strict_yaml import load, override
     from ratslam.experiments.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
+    from ratslam.runs.settings.strict_yaml import load, override
 
     path = find_config(arguments.config)
     tuning = tune_threshold(override(load(path), arguments.set), path.parent, arguments.workers)

@@ -60,7 +60,7 @@ def open_target(arguments: argparse.Namespace) -> str | None:
     Raises:
         InputError: it cannot be used.
     """
-    from ratslam.viewer.target import prepare_target
+    from ratslam.service.viewer.target import prepare_target
 
     return None if arguments.rerun is None else prepare_target(arguments.rerun)
 
@@ -73,9 +73,9 @@ def run_directory(arguments: argparse.Namespace) -> Path:
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.summary import summarise
-    from ratslam.pipeline import report
-    from ratslam.pipeline.run import run
-    from ratslam.viewer.observer import open_viewer
+    from ratslam.runs import report
+    from ratslam.runs.run import run
+    from ratslam.service.viewer.observer import open_viewer
 
     if arguments.report:
         report.check_report_libraries("--report")
@@ -95,7 +95,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from ratslam.pipeline.run import simulate
+    from ratslam.runs.run import simulate
 
     if arguments.raw:
         arguments.set.append("simulation.raw=true")

@@ -19,7 +19,7 @@ from ratslam.cli.common import (
     prepare_jax,
     read_config,
 )
-from ratslam.config.packaged import find_config
+from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError, tell
 from tactile.base.new_file import require_new_file, require_own_folder
 
@@ -270,7 +270,6 @@ def _size(arguments: argparse.Namespace) -> int:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
     limit_threads()
     prepare_jax()
-    from ratslam.config.completion import complete
     from ratslam.experiments.sizing.recommendation import (
         changed_settings_yaml,
         recommend,
@@ -279,7 +278,8 @@ def _size(arguments: argparse.Namespace) -> int:
     from ratslam.experiments.sizing.scene_statistics import scene_of
     from ratslam.experiments.sizing.trial_runs import render_trial_runs, try_settings
     from ratslam.experiments.studies.tiers import with_tier
-    from ratslam.pipeline.source import open_source
+    from ratslam.runs.settings.completion import complete
+    from ratslam.runs.source import open_source
 
     path, config = arguments.config, read_config(arguments)
     with open_source(with_tier(config, "kinematic")) as source:

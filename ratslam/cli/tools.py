@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from ratslam.cli.common import Commands
-from ratslam.config import SCHEMA_START
+from ratslam.runs.settings import SCHEMA_START
 from tactile.base.atomic_write import write_text_atomically
 from tactile.base.new_file import make_new_file, require_new_file
 
@@ -71,8 +71,8 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    from ratslam.config.openratslam import convert_parameters
-    from ratslam.config.strict_yaml import dump_data
+    from ratslam.runs.settings.openratslam import convert_parameters
+    from ratslam.runs.settings.strict_yaml import dump_data
 
     output, recording = arguments.output, arguments.recording
     if recording is not None and output is not None and not recording.is_absolute():
@@ -89,8 +89,8 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 
 def _schema(arguments: argparse.Namespace) -> int:
-    from ratslam.config.run_config import RunConfig
-    from ratslam.config.strict_yaml import schema
+    from ratslam.runs.settings.run_config import RunConfig
+    from ratslam.runs.settings.strict_yaml import schema
 
     text = json.dumps(schema(RunConfig), indent=2) + "\n"
     if arguments.output:

@@ -1,7 +1,7 @@
 """JAX's global float64 switch.
 
 Importing ratslam changes no JAX setting. A program calls `prepare_precision` before it makes a `Session`;
-`ratslam.pipeline` does so for every run.
+`ratslam.runs` does so for every run.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from evaluation.cells.rate_map import arena_edges, bin_activity
 from evaluation.plots.cell_plot import draw_cells, map_sums
 from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
-from ratslam.rats.driven_network import DrivenNetwork
+from ratslam.service.rats.driven_network import DrivenNetwork
 from robot.simulation.rat.rat_odometry import RatOdometryConfig
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
 

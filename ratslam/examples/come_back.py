@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, add_legend, metre_grid, new_figure
-from ratslam.atlas.route import Travel, find_way, nearest_experience, travel_graph
+from ratslam.places.route import Travel, find_way, nearest_experience, travel_graph
 from tactile.base.se2 import compose, fit_rigid_motion
 
 MAZE = ["simulation.maze.seed=31001", "simulation.path.circuits=CCA"]

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import ratslam
-from ratslam.backends.registry import BACKENDS, BackendEntry, Sensors
 from ratslam.core.backend import Backend
 from ratslam.core.finite_values import finite_values
 from ratslam.core.path_map import PathMap
 from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.methods.registry import BACKENDS, BackendEntry, Sensors
 from tactile.base.config import Settings
 from tactile.base.se2 import compose
 from tactile.base.types import Observation

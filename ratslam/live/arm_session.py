@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.live.goal_steering import GoalSteering, plan_goals
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.goal_route import GoalRoute
 from robot.live.rig import Rig

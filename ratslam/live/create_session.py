@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.create_loop import MotionReport, run_create_loop
 from robot.live.create_rig import CreateRig

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.trajectory import read_tum
-from ratslam.config.run_config import RunConfig
 from ratslam.live.mapper_process import Mapper
-from ratslam.pipeline.goal_planner import GoalPlanner, contact_map
-from ratslam.pipeline.localise import localising_for_goals
-from ratslam.pipeline.saved_map import read_map
+from ratslam.runs.goal_planner import GoalPlanner, contact_map
+from ratslam.runs.localise import localising_for_goals
+from ratslam.runs.saved_map import read_map
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute

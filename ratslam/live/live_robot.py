@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from evaluation.metrics.run_metrics import DOUBTED
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import CHUNK
 from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.recorder import LiveRecorder
 from robot.recordings.formats import RecordingConfig

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Step
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.process_priority import step_back
 from robot.drivers.withheld_signals import withheld_signals
 from robot.sources.source import Sample
@@ -273,10 +273,10 @@ def run_mapper(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
-    from ratslam.config.completion import complete
-    from ratslam.pipeline.build_session import build_session
-    from ratslam.pipeline.runner import check_finished_map, open_runner
-    from ratslam.viewer.observer import open_viewer
+    from ratslam.runs.build_session import build_session
+    from ratslam.runs.runner import check_finished_map, open_runner
+    from ratslam.runs.settings.completion import complete
+    from ratslam.service.viewer.observer import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 
@@ -313,7 +313,7 @@ def _mapped_sample(
     number: int, observed: Observation, step: Step, touch: TouchConfig, seconds: float
 ) -> MappedSample:
     from ratslam.core.types import Action
-    from ratslam.pipeline.goal_planner import felt_points
+    from ratslam.runs.goal_planner import felt_points
 
     estimate = step.estimate
     action = Action(int(estimate.action)).name.lower()

@@ -14,12 +14,12 @@ from tqdm import tqdm
 
 from evaluation.artifacts.manifest import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.config.run_config import RunConfig
 from ratslam.live.arm_session import prepare_arm_session
 from ratslam.live.create_session import prepare_create_session
 from ratslam.live.live_robot import RECORDING, LiveRobot, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
-from ratslam.pipeline.run import catch_interrupt
+from ratslam.runs.run import catch_interrupt
+from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.process_priority import urgent
 from robot.live.polling import OperatorStop, SessionFault

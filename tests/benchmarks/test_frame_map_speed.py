@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from ratslam.keyframes.optimizer import (
+from ratslam.mapping.optimizer import (
     CalibrationPrior,
     LoopClosures,
     MapCovariance,

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.types import Action, Estimate
-from ratslam.pose_graph import Edges, Termination, least_squares
-from ratslam.pose_graph.least_squares import GraphEquations
+from ratslam.mapping.edges import Edges
+from ratslam.mapping.least_squares import GraphEquations, Termination, least_squares
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Odometry, observation
 

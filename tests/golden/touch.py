@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.experience_metric import experience_metric
-from ratslam.config.run_config import RunConfig
 from ratslam.core.types import Action
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations, read_observations
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ratslam.pose_graph import Edges
-from ratslam.pose_graph.io import UPPER
+from ratslam.mapping.edges import Edges
+from ratslam.mapping.io import UPPER
 
 
 def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:

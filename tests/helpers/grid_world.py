@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.backends.grid import GridBackend, GridEvidence, GridState
 from ratslam.core.packing import allocate, layout_of
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
+from ratslam.methods.grid import GridBackend, GridEvidence, GridState
 from tactile.base.types import MotionKind, Observation, Odometry, observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ratslam.backends.classic import ClassicBackend
-from ratslam.backends.config import ClassicBackendConfig
 from ratslam.core.session import Session
+from ratslam.methods.classic import ClassicBackend
+from ratslam.methods.config import ClassicBackendConfig
 from robot.recordings.formats import RecordingConfig, open_recording
 from tactile.base.errors import InputError
 from tactile.base.types import Observation

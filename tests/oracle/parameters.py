@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ratslam.backends.config import ClassicBackendConfig
+from ratslam.methods.config import ClassicBackendConfig
 
 
 def settings_of(params: dict[str, Any], labels: bool) -> ClassicBackendConfig:

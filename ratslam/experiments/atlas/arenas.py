@@ -17,8 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.localisation import RIGHT, WRONG, MapSteps, is_within, known_steps
-from ratslam.config.completion import complete
-from ratslam.config.run_config import RunConfig
 from ratslam.core.localisation import Localisation
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.localising import Judged, judge
@@ -29,10 +27,12 @@ from ratslam.experiments.studies.machine import code_digest
 from ratslam.experiments.tables.comparison import Record
 from ratslam.experiments.trials.arena_trial import simulate_session
 from ratslam.grid.localiser import GridLocaliser
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.localise import localising
-from ratslam.pipeline.saved_map import describe_readings, read_map, write_map
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.localise import localising
+from ratslam.runs.saved_map import describe_readings, read_map, write_map
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate

@@ -16,18 +16,18 @@ import networkx
 import numpy as np
 
 from evaluation.metrics.localisation import RIGHT, localisation_errors, true_places
-from ratslam.atlas.localiser import Localiser
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask, count, median, spread
 from ratslam.experiments.atlas.scenarios import open_world, ten_circuits
 from ratslam.experiments.atlas.sessions import Recipe
 from ratslam.experiments.atlas.stored_maps import StoredMap
 from ratslam.experiments.tables.comparison import Record
-from ratslam.pipeline.goal_planner import GoalPlanner, contact_map, felt_points
-from ratslam.pipeline.localise import localising_for_goals
-from ratslam.pipeline.saved_map import read_map
-from ratslam.pipeline.slam import Slam
+from ratslam.places.localiser import Localiser
+from ratslam.runs.goal_planner import GoalPlanner, contact_map, felt_points
+from ratslam.runs.localise import localising_for_goals
+from ratslam.runs.saved_map import read_map
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.slam import Slam
 from robot.live.config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive

@@ -19,13 +19,13 @@ from evaluation.metrics.localisation import (
     nearest_steps,
 )
 from evaluation.metrics.trajectory import align
-from ratslam.config.packaged import find_config
-from ratslam.config.run_config import load_config
 from ratslam.experiments.atlas.pictures import Panel, PathPanel, draw_panels
 from ratslam.experiments.atlas.row import Line, MapRow, MapTask
 from ratslam.experiments.atlas.sessions import Recipe, Recorded, record
 from ratslam.experiments.tables.comparison import Record
 from ratslam.experiments.tables.recordings import metres
+from ratslam.runs.settings.packaged import find_config
+from ratslam.runs.settings.run_config import load_config
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 

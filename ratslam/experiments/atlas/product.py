@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ratslam.atlas.localiser import Localisation, Localiser
 from ratslam.core.session import Session
 from ratslam.experiments.atlas.row import Localised, Methods
 from ratslam.experiments.atlas.sessions import Recorded
 from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, StoredMap
 from ratslam.experiments.trials.touch_trial import capacity_for
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.localise import localising
-from ratslam.pipeline.map_changes import changes_of
-from ratslam.pipeline.merge import merge_maps
-from ratslam.pipeline.saved_map import read_map
+from ratslam.places.localiser import Localisation, Localiser
+from ratslam.runs.build_session import build_session
+from ratslam.runs.localise import localising
+from ratslam.runs.map_changes import changes_of
+from ratslam.runs.merge import merge_maps
+from ratslam.runs.saved_map import read_map
 from robot.touch_source import observation_of
 
 

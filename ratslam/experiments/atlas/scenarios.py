@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import networkx
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.atlas.sessions import Recipe, draw_seed, record, touch_config
 from ratslam.experiments.tables.touch import KIDNAPS, MAIN
+from ratslam.runs.settings.run_config import RunConfig
 from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, is_open, neighbours
 from robot.world.maze_routes import exploration_route
 from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.trials.touch_trial import collect_session
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

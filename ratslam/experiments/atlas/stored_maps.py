@@ -20,8 +20,8 @@ from ratslam.core.session import Session
 from ratslam.experiments.atlas.sessions import Recipe, Recorded, record
 from ratslam.experiments.studies.machine import code_digest
 from ratslam.experiments.trials.touch_trial import start_session
-from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.saved_map import NAME, describe_readings, write_map
+from ratslam.mapping.map import KeyframeMap
+from ratslam.runs.saved_map import NAME, describe_readings, write_map
 from robot.touch_source import observation_of
 
 STEPS = "steps.npz"

@@ -20,8 +20,6 @@ import numpy as np
 
 from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from evaluation.plots import style
-from ratslam.backends.recall import RecallBackend
-from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import Session
 from ratslam.experiments.cells.figure import CellFigure, CellTask
@@ -34,10 +32,12 @@ from ratslam.experiments.tables.recordings import Recording
 from ratslam.experiments.tables.touch import SessionFigures, TouchTask, run_and_measure, task_config
 from ratslam.experiments.trials.recording_trial import closure_claims, run_recording
 from ratslam.experiments.trials.touch_trial import collect_session, new_session
+from ratslam.methods.recall import RecallBackend
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
 from ratslam.network.pose_cells import Belief, Ties, ViewCells
 from ratslam.recall import filter
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource
 from robot.touch_source import observation_of
 from tactile.base.random_streams import stream

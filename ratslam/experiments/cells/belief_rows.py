@@ -40,7 +40,7 @@ from ratslam.experiments.cells.figure import CellFigure, CellTask
 from ratslam.experiments.cells.panel_grid import head_panel, panel_grid
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.keyframes.config import KeyframeMapConfig
+from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.network.config import PoseCellConfig
 from ratslam.recall.filter import BASIN
 from tactile.base.random_streams import stream

@@ -25,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.backends.config import RecallBackendConfig
-from ratslam.backends.recall import RecallBackend
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
 from ratslam.network.pose_cells import SUPPORT, Belief

@@ -15,13 +15,13 @@ from scipy.stats import qmc
 
 from ratslam.classic.batch import Network
 from ratslam.classic.cell_batch import CellSets
-from ratslam.config.run_config import load_config
-from ratslam.config.strict_yaml import Document, override, validate
-from ratslam.config.strict_yaml.document import Place
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.experiments.cells.set_scores import SetScores, score_sets
 from ratslam.experiments.cells.study_course import CELLS, StudyCourse, read_course
 from ratslam.experiments.studies.executor import Executor
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.settings.strict_yaml import Document, override, validate
+from ratslam.runs.settings.strict_yaml.document import Place
 from tactile.base.atomic_write import flush_to_disk, write_atomically
 from tactile.base.config import Settings
 from tactile.base.errors import os_errors_of

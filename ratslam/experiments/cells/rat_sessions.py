@@ -7,12 +7,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.session import Session, Step
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_plan import RecordingPlan, plan_recording
-from ratslam.pipeline.cell_recorder import CellSums
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.cell_plan import RecordingPlan, plan_recording
+from ratslam.runs.cell_recorder import CellSums
+from ratslam.runs.settings.run_config import RunConfig, load_config
+from ratslam.runs.source import open_observations, read_observations
 from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Sample, Source
 from tactile.base.errors import InputError

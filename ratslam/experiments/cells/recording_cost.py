@@ -17,15 +17,15 @@ import jax
 import numpy as np
 
 from evaluation.metrics.resources import peak_memory, reset_peak_memory
-from ratslam.config.run_config import LoopConfig
 from ratslam.core.packing import PackedRecords, allocate, layout_of
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import CHUNK, Session, run_chunk
 from ratslam.experiments.cells.figure import CellFigure
 from ratslam.experiments.cells.timing import on_one_core, time_call
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.cell_recorder import CellRecorder, open_cell_recorder
+from ratslam.runs.build_session import build_session
+from ratslam.runs.cell_recorder import CellRecorder, open_cell_recorder
+from ratslam.runs.settings.run_config import LoopConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses
 from robot.sources.source import Sample

@@ -13,10 +13,10 @@ import numpy as np
 
 from ratslam.classic.cell_batch import CellCourse
 from ratslam.classic.pose_cell_config import NetworkConfig, network_of, rings, units
-from ratslam.config.run_config import RunConfig
 from ratslam.network.config import PoseCellConfig
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations, read_observations
 from robot.sources.odometry import from_poses
 from robot.sources.source import Source
 from tactile.base.errors import InputError

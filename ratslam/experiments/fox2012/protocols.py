@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import override, parse, validate
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import override, parse, validate
 
 MAPPERS = {"blob": "none", "geometric": "geometric", "template": "template", "fused": "fused"}
 """`touch.reports.walls` of the paper's three mappers (II-E to II-G), and ours."""

@@ -29,7 +29,6 @@ from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error
 from evaluation.plots import style
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.fox2012.protocols import (
     FILTERED,
     PAPERS,
@@ -49,7 +48,8 @@ from ratslam.experiments.trials.arena_trial import (
     simulate_session,
 )
 from ratslam.experiments.trials.reproduction import Paper, ResultRow, column, count_sets, run_with_progress
-from ratslam.pipeline.artifacts import true_grid
+from ratslam.runs.artifacts import true_grid
+from ratslam.runs.settings.run_config import RunConfig
 from robot.touch_source import report_config_of
 from robot.world.arena import Arena, wall_segments
 from tactile.base.random_streams import stream

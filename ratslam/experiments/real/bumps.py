@@ -13,14 +13,14 @@ import numpy as np
 
 from evaluation.metrics.trajectory import align, ate
 from evaluation.plots import style
-from ratslam.config.run_config import load_config
 from ratslam.core.session import Session
 from ratslam.core.types import GridDrawing
 from ratslam.experiments.real.figure import RealFigure, require_recordings
 from ratslam.experiments.real.wall_distance import wall_distances
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.source import open_observations
 from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
 from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import observation_of

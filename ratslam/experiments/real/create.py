@@ -21,11 +21,11 @@ from ratslam.experiments.tables.buildings import BuildingsRow, buildings_rows
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.recordings import metres
 from ratslam.experiments.trials.recording_trial import RecordingRun, closure_claims, run_recording
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_health import DOUBTED
-from ratslam.keyframes.map_solution import cheapest_map
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_health import DOUBTED
+from ratslam.mapping.map_solution import cheapest_map
 from tactile.base.se2 import between, compose, integrate, wrap
 
 FILES = tuple(f"data/create_lab_{name}.csv" for name in ("truth", "bumps", "walls", "depth"))

@@ -9,12 +9,12 @@ import numpy as np
 
 from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
-from ratslam.config.run_config import load_config
 from ratslam.experiments.real.figure import REACH, RealFigure, require_recordings
-from ratslam.fit.record import RevisitFit, fit_revisits
-from ratslam.fit.wheels import WheelFit, fit_wheels
-from ratslam.fit.whiskers import read_signals_of_reach
-from ratslam.pipeline.source import open_source
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.source import open_source
+from ratslam.service.fit.record import RevisitFit, fit_revisits
+from ratslam.service.fit.wheels import WheelFit, fit_wheels
+from ratslam.service.fit.whiskers import read_signals_of_reach
 from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.plugins import PluginConfig

@@ -18,8 +18,6 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from evaluation.metrics.trajectory import align
-from ratslam.config.completion import complete
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.real.figure import RealFigure, require_recordings
 from ratslam.experiments.real.likeness import OBJECTS
 from ratslam.experiments.real.walk_source import (
@@ -30,6 +28,8 @@ from ratslam.experiments.real.walk_source import (
     walk_simulation,
 )
 from ratslam.experiments.trials.touch_trial import collect_session, run_session
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.session import HeadSimulation
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import OdometryConfig, simulate_odometry

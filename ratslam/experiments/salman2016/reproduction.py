@@ -30,8 +30,6 @@ from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import align
 from evaluation.plots import paper_figures, style
 from evaluation.plots.paper_figures import DrivenPath, MeasuredQuantity, experience_history
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.experiments.salman2016.protocols import (
     BY_MAZE,
     COMMON,
@@ -47,6 +45,8 @@ from ratslam.experiments.salman2016.protocols import (
 from ratslam.experiments.trials.reproduction import Paper, ResultRow, column, count_sets, run_with_progress
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import collect_session, run_session
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import override, parse, validate
 from robot.sources.in_memory import truncate_log
 from robot.sources.view_controls import Control, apply_control
 from tactile.base.random_streams import stream

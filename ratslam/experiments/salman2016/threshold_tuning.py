@@ -20,11 +20,11 @@ from evaluation.metrics.session_metrics import lap_ends
 from evaluation.metrics.view_separation import ViewDifferences, compare_views
 from evaluation.plots.paper_figures import draw_tuning
 from ratslam.classic.view_templates import TemplateConfig
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import Document, override, validate
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.trials.threshold_sweep import sweep_thresholds
 from ratslam.experiments.trials.touch_trial import collect_session
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import Document, override, validate
 from robot.sources.in_memory import InMemorySource, truncate_log
 from tactile.base.errors import InputError
 

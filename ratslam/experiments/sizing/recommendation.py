@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from ratslam.backends.grid import LIVE_SIDE
 from ratslam.classic.levels import SETTLED, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, network_of
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import open_path
-from ratslam.config.strict_yaml.dumper import Dumper
 from ratslam.experiments.sizing.scene_statistics import Scene
 from ratslam.experiments.studies.report import render_table
 from ratslam.experiments.studies.summary import plain
 from ratslam.grid.config import DriftConfig
 from ratslam.grid.particle_maps import LAYERS
+from ratslam.methods.grid import LIVE_SIDE
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import open_path
+from ratslam.runs.settings.strict_yaml.dumper import Dumper
 from robot.simulation.head.session import choose_tier
 
 PARTS = 4  # largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.study import with_settings
 from ratslam.experiments.studies.tiers import shortened
-from ratslam.pipeline.run import open_recorder
-from ratslam.pipeline.source import open_source
+from ratslam.runs.run import open_recorder
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_source
 from robot.recordings.formats import RecordingConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.metrics.resources import one_core
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.sizing.recommendation import FEWEST, Recommendation
 from ratslam.experiments.sizing.scene_statistics import short_session
 from ratslam.experiments.studies.records import RunRecord
@@ -16,7 +15,8 @@ from ratslam.experiments.studies.report import make_report, render
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.study import Job, with_settings
-from ratslam.pipeline.source import open_source
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_source
 from tactile.base.errors import InputError
 
 COARSER = 1.5  # factor on the size of a cell in a cheaper step

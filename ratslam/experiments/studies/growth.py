@@ -12,10 +12,10 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, PositiveInt
 
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import Document, load, override, validate
-from ratslam.config.strict_yaml.document import Place
 from ratslam.experiments.studies.study import with_settings
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import Document, load, override, validate
+from ratslam.runs.settings.strict_yaml.document import Place
 from robot.simulation.head.session import HeadSimulation
 from robot.world.maze_routes import winding_loop
 from robot.world.scene import PAPER_CIRCUITS, PathConfig

@@ -16,8 +16,8 @@ from evaluation.metrics.trajectory import ate
 from ratslam.core.session import Session
 from ratslam.experiments.studies.growth import Ground, GrowthTask
 from ratslam.experiments.studies.machine import Machine, compilations, machine
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.source import open_observations, read_observations
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import repeat_course
 from tactile.base.config import Settings

@@ -27,10 +27,10 @@ from ratslam.experiments.studies.metrics import quantity
 from ratslam.experiments.studies.records import RunRecord, record_of
 from ratslam.experiments.studies.study import Job
 from ratslam.experiments.studies.tiers import compare_with_tier
-from ratslam.pipeline.artifacts import true_grid
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.online_error import OnlineErrorLog
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.artifacts import true_grid
+from ratslam.runs.build_session import build_session
+from ratslam.runs.online_error import OnlineErrorLog
+from ratslam.runs.source import open_observations, read_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.perturbation import perturb
 from robot.sources.source import Source

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, NonNegativeInt, field_va
 
 from evaluation.metrics.metric import Direction
 from ratslam.experiments.studies.metrics import COLUMNS, METRICS
-from ratslam.keyframes.config import FULL, Ablation
+from ratslam.mapping.config import FULL, Ablation
 from tactile.base.config import Settings
 
 

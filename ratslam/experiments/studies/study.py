@@ -17,12 +17,12 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel
 
-from ratslam.config.packaged import find_config
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import Document, load, open_path, override, validate
-from ratslam.config.strict_yaml.document import KeyPath, Place
 from ratslam.experiments.studies.schema import RowPlan, StudyPlan
-from ratslam.keyframes.config import FULL, Ablation
+from ratslam.mapping.config import FULL, Ablation
+from ratslam.runs.settings.packaged import find_config
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import Document, load, open_path, override, validate
+from ratslam.runs.settings.strict_yaml.document import KeyPath, Place
 from tactile.base.errors import InputError, InputErrors
 
 Model = TypeVar("Model", bound=BaseModel)

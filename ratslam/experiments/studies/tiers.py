@@ -9,10 +9,10 @@ import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.view_separation import image_difference
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.metrics import quantity
 from ratslam.experiments.studies.study import with_settings
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.simulation.head.session import HeadSimulation
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.errors import InputError

@@ -17,17 +17,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from ratslam.backends.recall import RecallBackend
-from ratslam.backends.session_batch import Recording, RecordingSession, SessionBatch
 from ratslam.classic import batch
 from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
-from ratslam.config.run_config import load_config
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.tables.cycles import SESSIONS
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.speed import MOTION, replay_network
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations
+from ratslam.methods.recall import RecallBackend
+from ratslam.methods.session_batch import Recording, RecordingSession, SessionBatch
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 

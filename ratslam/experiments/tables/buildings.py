@@ -20,12 +20,12 @@ import numpy as np
 from scipy.special import expit
 
 from evaluation.metrics.statistics import expected_calibration_error
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.tables.recordings import Recording, metres, real_recordings
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
 
 FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)

@@ -1,6 +1,6 @@
 """The table of closures: fits and tests the log-odds that a closure sequence is true.
 
-Each touch session is simulated and finished. The weights of `ratslam.keyframes.closure_judge` are fitted on
+Each touch session is simulated and finished. The weights of `ratslam.mapping.closure_judge` are fitted on
 the sequences of its final map, by a logistic regression with a ridge; each sequence counts three times, with
 all keyframes after it, with `YOUNG` and with none, because it is judged while it is young too. Views that
 contradict a place never count for it: recall leaves so few of them within its sequences that their weight
@@ -20,13 +20,12 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from evaluation.metrics.statistics import auc
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.touch import CHANGE, TouchTask, task_config
 from ratslam.experiments.trials.touch_trial import run_session, start_session
-from ratslam.keyframes.closure_judge import (
+from ratslam.mapping.closure_judge import (
     BEYOND,
     KINDS,
     WEIGHTS,
@@ -34,10 +33,11 @@ from ratslam.keyframes.closure_judge import (
     log_odds,
     sequence_evidence,
 )
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
-from ratslam.keyframes.loop_closures import ClosureLog, Verdict
-from ratslam.keyframes.map import KeyframeMap
-from ratslam.pipeline.source import open_observations
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.map import KeyframeMap
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.se2 import between, wrap
 

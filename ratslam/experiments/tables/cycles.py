@@ -20,13 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig, load_config
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
-from ratslam.keyframes import archive_selection, selection_worker
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations
+from ratslam.mapping import archive_selection, selection_worker
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import RunConfig, load_config
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 from tactile.base.types import Observation
@@ -48,21 +48,21 @@ VERBS = {
         "core/session.py:_compute", "core/packing.py:records", "core/packing.py:<listcomp>",
     ),
     "packing": ("core/packing.py", "core/session.py"),
-    "feedback to the belief": ("backends/", "recall/", "network/", "classic/", "core/backend.py"),
-    "views of the map": ("keyframes/appearance.py", "keyframes/view_sectors.py", "keyframes/signed"),
+    "feedback to the belief": ("methods/", "recall/", "network/", "classic/", "core/backend.py"),
+    "views of the map": ("mapping/appearance.py", "mapping/view_sectors.py", "mapping/signed"),
     "closures": (
-        "keyframes/verification.py", "keyframes/acceptance.py", "keyframes/closure_odds.py",
-        "keyframes/odometry_scan.py", "keyframes/loop_closures.py", "keyframes/piece_",
+        "mapping/verification.py", "mapping/acceptance.py", "mapping/closure_odds.py",
+        "mapping/odometry_scan.py", "mapping/loop_closures.py", "mapping/piece_",
     ),
-    "judge": ("keyframes/closure_judge.py",),
+    "judge": ("mapping/closure_judge.py",),
     "selection": (
-        "keyframes/selection_worker.py", "keyframes/closure_selection.py", "keyframes/map_solution.py",
-        "keyframes/map_hypotheses.py", "keyframes/calibration.py", "keyframes/delayed_job.py",
+        "mapping/selection_worker.py", "mapping/closure_selection.py", "mapping/map_solution.py",
+        "mapping/map_hypotheses.py", "mapping/calibration.py", "mapping/delayed_job.py",
     ),
-    "merging": ("keyframes/archive", "keyframes/keyframe_merger.py", "keyframes/merg"),
-    "solver": ("keyframes/optimizer.py", "keyframes/linearisation.py", "pose_graph/"),
-    "health": ("keyframes/map_health.py", "keyframes/claimed_revisits.py"),
-    "log and experiences": ("keyframes/step_record.py", "keyframes/experiences.py", "keyframes/travel.py"),
+    "merging": ("mapping/archive", "mapping/keyframe_merger.py", "mapping/merg"),
+    "solver": ("mapping/optimizer.py", "mapping/linea", "mapping/block_", "mapping/least_", "mapping/edges"),
+    "health": ("mapping/map_health.py", "mapping/claimed_revisits.py"),
+    "log and experiences": ("mapping/step_record.py", "mapping/experiences.py", "mapping/travel.py"),
     "rest of the map": ("",),
 }  # fmt: skip
 """Parts of a cycle, and how the places of their functions, `FILE.py:FUNCTION`, begin; the first that fits

@@ -14,14 +14,14 @@ import numpy as np
 from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.trajectory import position_error
-from ratslam.config.completion import complete
-from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.arena_trial import session_at_start
-from ratslam.pipeline.artifacts import true_grid
-from ratslam.pipeline.source import open_source, read_observations
+from ratslam.runs.artifacts import true_grid
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_source, read_observations
 from robot.simulation.create.wheel_odometry import MEAN_ERRORS
 from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import open_touch_source, report_config_of

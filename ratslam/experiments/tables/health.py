@@ -3,7 +3,7 @@
 Each session is finished once and its map spoilt in many ways (`trials.spoilt_maps`). A map is bad if its
 error exceeds `HARM_FACTOR` times odometry's (recordings: and 0.3 m): whisker sessions by the Energy Metric,
 recordings by ATE, both of keyframes. Even sessions fit the regression, odd ones test it; the weights below
-the table, of all sessions, become those of `ratslam.keyframes.map_health`. Only maps with closures count.
+the table, of all sessions, become those of `ratslam.mapping.map_health`. Only maps with closures count.
 Sessions are of mazes and recordings used for development.
 """
 
@@ -20,7 +20,6 @@ from scipy.special import expit
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.statistics import auc
 from evaluation.metrics.trajectory import ate
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
@@ -28,9 +27,10 @@ from ratslam.experiments.tables.recordings import Recording, real_recordings
 from ratslam.experiments.tables.touch import MAIN, ROWS
 from ratslam.experiments.trials.recording_trial import run_recording
 from ratslam.experiments.trials.spoilt_maps import spoilt_maps
-from ratslam.keyframes.closure_selection import ACCEPTED_WEIGHT
-from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
+from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.odometry import OdometryConfig
 from robot.sources.perturbation import miscalibrate
 

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.tables.recordings import GOLDEN, Recording, metres
 from ratslam.experiments.trials.recording_trial import run_recording
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.perturbation import perturb
 
 FALSE_CLOSURE_CELLS = 2.5

@@ -24,11 +24,11 @@ from scipy import stats
 
 from evaluation.metrics.session_metrics import touch_metrics
 from evaluation.metrics.trajectory import ate
-from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import collect_session, run_session
+from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.random_streams import stream
 
 FIRST_SEED = 9200

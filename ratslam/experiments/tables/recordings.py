@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.config.run_config import RunConfig, load_config
+from ratslam.runs.settings.run_config import RunConfig, load_config
 
 DATA = "RATSLAM_DATA"
 """Environment variable: the folder of the real recordings, which are not part of the project."""

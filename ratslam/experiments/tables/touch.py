@@ -26,14 +26,14 @@ from evaluation.metrics.session_metrics import (
     touch_metrics,
 )
 from evaluation.metrics.statistics import wilson_interval
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.experiments.studies.executor import run_tasks
 from ratslam.experiments.studies.growth import with_new_ground
 from ratslam.experiments.tables.comparison import Compared, Files, SessionLog, compare_runs
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row
 from ratslam.experiments.trials.touch_trial import run_session
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.simulation.head.baseline import HALL_BASELINE
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.odometry import OdometryConfig

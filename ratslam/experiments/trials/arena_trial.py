@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from ratslam.backends.grid import GridBackend
-from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
 from ratslam.grid.likelihoods import distinct_cells
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
+from ratslam.methods.grid import GridBackend
+from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.touch_source import TouchSource, observation_of, report_config_of
 from robot.world.arena import Arena, arena_text

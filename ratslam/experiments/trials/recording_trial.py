@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
-from ratslam.config.run_config import RunConfig
 from ratslam.core.session import Session
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import Perturbation
 from robot.touch_source import observation_of

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.keyframes.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
-from ratslam.keyframes.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.keyframes.map import KeyframeMap
-from ratslam.keyframes.map_solution import MapSolution
-from ratslam.keyframes.optimizer import MapFit, System
+from ratslam.mapping.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_solution import MapSolution
+from ratslam.mapping.optimizer import MapFit, System
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 

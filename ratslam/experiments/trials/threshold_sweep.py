@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.backends.classic import ClassicBackend, ClassicEvidence
-from ratslam.backends.config import ClassicBackendConfig, select_settings
-from ratslam.config.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.core.types import Estimate
 from ratslam.experiments.trials.touch_trial import capacity_for
+from ratslam.methods.classic import ClassicBackend, ClassicEvidence
+from ratslam.methods.config import ClassicBackendConfig, select_settings
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource
 from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, stack

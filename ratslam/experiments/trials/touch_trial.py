@@ -12,12 +12,12 @@ from functools import lru_cache
 import numpy as np
 
 from evaluation.metrics.session_metrics import SessionResult
-from ratslam.backends.registry import Sensors, backend_settings, build
-from ratslam.config.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
-from ratslam.pipeline.source import open_observations
+from ratslam.methods.registry import Sensors, backend_settings, build
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.touch_source import observation_of
 from tactile.base.config import Settings

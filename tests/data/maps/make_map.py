@@ -5,7 +5,7 @@
 writes FORMAT.npz and FORMAT.csv into this folder: the map after the first 360 readings of `touch_circuits` (a
 whisker head in a maze), and the poses (x m, y m, heading rad) of all steps after 160 more. Files of earlier
 formats stay as they are, and their poses are made anew where a later version goes on differently:
-`tests/ratslam/pipeline/test_map_formats.py` opens each.
+`tests/ratslam/runs/test_map_formats.py` opens each.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 import ratslam
-from ratslam.config.run_config import LoopConfig
-from ratslam.config.strict_yaml import parse, validate
-from ratslam.pipeline.map_archive import FORMAT
+from ratslam.runs.map_archive import FORMAT
+from ratslam.runs.settings.run_config import LoopConfig
+from ratslam.runs.settings.strict_yaml import parse, validate
 from robot.recordings.formats import RecordingConfig, open_recording
 from robot.sources.description import describe
 

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.backends.grid import GridOutcome
 from ratslam.classic import pose_cells
 from ratslam.classic.batch import Course, Network, networks, trials
 from ratslam.classic.levels import window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, units
 from ratslam.classic.window import ring_difference
+from ratslam.methods.grid import GridOutcome
 from tactile.base.types import Odometry, stack
 from tests.helpers.grid_world import drive, initial, report
-from tests.ratslam.backends.grid_filters import PRINTED
+from tests.ratslam.methods.grid_filters import PRINTED
 
 CONFIG = NetworkConfig(cells_xy=21)
 STEPS = 60

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig, load_config
-from ratslam.config.strict_yaml import dump_data
-from ratslam.fit.record import walls_of
-from ratslam.fit.rig import Quantity, Rig, rig_file, rig_settings
+from ratslam.runs.settings.run_config import RunConfig, load_config
+from ratslam.runs.settings.strict_yaml import dump_data
+from ratslam.service.fit.record import walls_of
+from ratslam.service.fit.rig import Quantity, Rig, rig_file, rig_settings
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions

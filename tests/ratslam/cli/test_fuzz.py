@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from evaluation.metrics.trajectory import ate, read_tum
-from ratslam.config.run_config import load_config
+from ratslam.runs.settings.run_config import load_config
 from robot.recordings.recorder import Recorder
 from tactile.base.se2 import integrate
 from tests.helpers import scenes

@@ -12,11 +12,11 @@ import pytest
 
 import ratslam
 from evaluation.report.run_report import read_run_report
-from ratslam.backends.localise import LOG_ODDS
 from ratslam.cli import main
-from ratslam.pipeline.localise import check_assignments
-from ratslam.pipeline.saved_map import read_map
-from tests.ratslam.pipeline.test_saved_map import rewritten
+from ratslam.methods.localise import LOG_ODDS
+from ratslam.runs.localise import check_assignments
+from ratslam.runs.saved_map import read_map
+from tests.ratslam.runs.test_saved_map import rewritten
 
 ROOT = Path(__file__).parents[3]
 SQUARE = ROOT / "configs" / "square.yaml"

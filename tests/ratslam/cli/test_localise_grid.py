@@ -12,9 +12,9 @@ import ratslam
 from ratslam.cli import main
 from ratslam.core.localisation import Localisation
 from ratslam.grid.localiser import GridLocaliser
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.localise import localising
-from ratslam.pipeline.saved_map import read_map
+from ratslam.runs.build_session import build_session
+from ratslam.runs.localise import localising
+from ratslam.runs.saved_map import read_map
 from tactile.base.types import Odometry, observation
 from tests.ratslam.cli.test_localise import refused
 

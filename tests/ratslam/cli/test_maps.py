@@ -11,8 +11,8 @@ import pytest
 
 import ratslam
 from ratslam.cli import main
-from ratslam.keyframes.map_solution import MapSolution, Obstacle
-from ratslam.pipeline.saved_map import read_map
+from ratslam.mapping.map_solution import MapSolution, Obstacle
+from ratslam.runs.saved_map import read_map
 from robot.recordings.formats import RecordingConfig, open_recording
 from tests.helpers.square_run import copy_square_run
 

@@ -17,8 +17,8 @@ import pytest
 
 from ratslam.cli import build_parser, main
 from ratslam.cli.common import CommandParser, Commands
-from ratslam.pipeline.map_care import map_info
-from ratslam.pipeline.saved_map import read_map
+from ratslam.runs.map_care import map_info
+from ratslam.runs.saved_map import read_map
 from tests.helpers.square_run import copy_square_run
 
 FILE = Path(__file__).parents[2] / "data" / "maps" / "ratslam-map-1.npz"
@@ -129,9 +129,9 @@ def sequence(path: Path) -> int:
 def test_an_output_that_cannot_be_made_is_refused_before_the_work(
     command: tuple, tmp_path: Path, capsys, monkeypatch
 ) -> None:
-    for module in ("ratslam.pipeline.merge", "ratslam.pipeline.map_care", "ratslam.pipeline.saved_map"):
+    for module in ("ratslam.runs.merge", "ratslam.runs.map_care", "ratslam.runs.saved_map"):
         __import__(module)
-    monkeypatch.setattr("ratslam.pipeline.saved_map.read_map", lambda *_: pytest.fail("work"))
+    monkeypatch.setattr("ratslam.runs.saved_map.read_map", lambda *_: pytest.fail("work"))
     link = tmp_path / "link.npz"
     link.symlink_to("nowhere")
     for output in (link, tmp_path / LONG, tmp_path / "none" / "new.npz"):
@@ -171,7 +171,7 @@ def test_a_full_disk_leaves_the_run_whose_map_is_undone(tmp_path: Path, capsys) 
 
 def test_an_output_that_appears_during_the_work_stays(tmp_path: Path, capsys, monkeypatch) -> None:
     output = tmp_path / "new.npz"
-    from ratslam.pipeline import map_care
+    from ratslam.runs import map_care
 
     write_map = map_care.write_map
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from ratslam.cli import build_parser, main
 from ratslam.cli.path import read_place
-from ratslam.pipeline.goal_planner import experience_at
-from ratslam.pipeline.map_way import TOLERANCE
-from ratslam.pipeline.saved_map import read_map
+from ratslam.runs.goal_planner import experience_at
+from ratslam.runs.map_way import TOLERANCE
+from ratslam.runs.saved_map import read_map
 from tactile.base.errors import InputError
-from tests.ratslam.atlas.test_route import TRAVEL, line_map, travel_graph
-from tests.ratslam.pipeline.test_map_formats import FILES
+from tests.ratslam.places.test_route import TRAVEL, line_map, travel_graph
+from tests.ratslam.runs.test_map_formats import FILES
 
 MAP = str(FILES[-1])
 number = st.floats(-1e6, 1e6)

@@ -24,10 +24,10 @@ from evaluation.monitor.progress import RunMonitor, RunProgress
 from evaluation.monitor.watch import draw_watch, path_length, status_line, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor
-from ratslam.config.run_config import load_config
 from ratslam.core.session import CHUNK
-from ratslam.pipeline.runner import open_runner
-from ratslam.pipeline.source import open_observations
+from ratslam.runs.runner import open_runner
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.source import open_observations
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line
 from tests.helpers.live import until

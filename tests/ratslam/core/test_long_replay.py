@@ -114,12 +114,12 @@ def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.backends.registry import BACKENDS
-    from ratslam.config.run_config import RunConfig
-    from ratslam.pipeline.build_session import build_session
-    from ratslam.pipeline.run import process_source
-    from ratslam.pipeline.run_directory import RunDirectory
-    from ratslam.pipeline.runner import Runner
+    from ratslam.methods.registry import BACKENDS
+    from ratslam.runs.build_session import build_session
+    from ratslam.runs.run import process_source
+    from ratslam.runs.run_directory import RunDirectory
+    from ratslam.runs.runner import Runner
+    from ratslam.runs.settings.run_config import RunConfig
 
     source = Circuit(kind, steps)
     config = RunConfig.model_validate(

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.backends.registry import Sensors
 from ratslam.core.path_map import PathMap
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.examples import dead_reckoning
+from ratslam.methods.registry import Sensors
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry, observation
 

@@ -15,8 +15,8 @@ import pytest
 
 import ratslam.examples
 from evaluation.metrics.registry import METRICS
-from ratslam.backends.registry import BACKENDS
 from ratslam.examples import own_arrays, taxel_array
+from ratslam.methods.registry import BACKENDS
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 

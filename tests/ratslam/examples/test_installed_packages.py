@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from ratslam.__main__ import main
-from ratslam.backends.registry import BACKENDS
-from ratslam.config.run_config import load_config
 from ratslam.examples import dead_reckoning
-from ratslam.pipeline.run import run
+from ratslam.methods.registry import BACKENDS
+from ratslam.runs.run import run
+from ratslam.runs.settings.run_config import load_config
 from tests.helpers.distributions import install
 from tests.helpers.live import ROOT
 

@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from evaluation.metrics.metric import Quantity
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import override, parse, validate
 from ratslam.experiments.sizing.recommendation import (
     FEWEST,
     MEMORY,
@@ -33,7 +31,9 @@ from ratslam.experiments.studies.records import RunRecord
 from ratslam.experiments.studies.study import with_settings
 from ratslam.experiments.studies.tiers import with_tier
 from ratslam.grid.particle_maps import LAYERS
-from ratslam.pipeline.source import open_source
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import override, parse, validate
+from ratslam.runs.source import open_source
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"

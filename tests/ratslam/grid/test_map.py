@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.backends.grid import GridEvidence
 from ratslam.core.types import Estimate
 from ratslam.grid import genealogy
+from ratslam.methods.grid import GridEvidence
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, filter_of, report, settings
 

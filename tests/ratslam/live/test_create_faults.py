@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ratslam.config.run_config import load_config
-from ratslam.pipeline.run import run
+from ratslam.runs.run import run
+from ratslam.runs.settings.run_config import load_config
 from robot.recordings.mcap_reader import Recording
 from tactile.base.types import MotionKind, Report, StepEnd
 from tests.helpers.live import PATIENCE

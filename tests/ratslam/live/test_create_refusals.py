@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from ratslam.cli import main
-from ratslam.config.run_config import load_config
+from ratslam.runs.settings.run_config import load_config
 
 pytest.importorskip("serial", reason="needs pyserial")
 CREATE = {"create": {"port": "/dev/ttyNONE"}, "room": 0.0}

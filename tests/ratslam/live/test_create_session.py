@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ratslam.config.run_config import load_config
-from ratslam.pipeline.run import run
+from ratslam.runs.run import run
+from ratslam.runs.settings.run_config import load_config
 from robot.live.config import LiveConfig
 from robot.live.create_selftest import check_create
 from robot.recordings.mcap_reader import Recording

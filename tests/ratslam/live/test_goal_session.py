@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import write_tum
-from ratslam.config.run_config import load_config
 from ratslam.experiments.atlas.sessions import Recipe, touch_config
 from ratslam.experiments.atlas.stored_maps import store_map
 from ratslam.experiments.tables.touch import MAIN
 from ratslam.live.goal_steering import plan_goals
+from ratslam.runs.settings.run_config import load_config
 from robot.live.route import plan_path
 from tactile.whiskers.head_geometry import ur10_head
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS
 from tests.ratslam.live.test_complete_session import CONFIG, PATIENT, emulated
-from tests.ratslam.pipeline.test_map_formats import FILES
+from tests.ratslam.runs.test_map_formats import FILES
 
 MAZE, CIRCUITS = 31002, "CCC"
 

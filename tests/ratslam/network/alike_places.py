@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.backends.config import RecallBackendConfig
-from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
 from tactile.base.se2 import between
 from tactile.base.types import Observation
 from tests.helpers import scenes

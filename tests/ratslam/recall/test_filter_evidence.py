@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.backends.config import RecallBackendConfig
-from ratslam.backends.recall import RecallBackend
 from ratslam.core.session import Session
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
 from ratslam.recall.filter import place_of, recognise
 from ratslam.recall.memory import accumulate_motion, corrected_motion, current_pose, store_keyframe
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains

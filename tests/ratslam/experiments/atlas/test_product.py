@@ -10,7 +10,7 @@ import pytest
 from ratslam.experiments.atlas import product
 from ratslam.experiments.atlas.sessions import Recipe, touch_config
 from ratslam.experiments.atlas.stored_maps import store_map
-from tests.ratslam.pipeline.touch_walks import SMALL
+from tests.ratslam.runs.touch_walks import SMALL
 
 MAZE, SESSIONS = 31001, 4
 

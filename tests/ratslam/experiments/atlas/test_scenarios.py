@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.atlas.scenarios import (
     FOREIGN,
     LOCALISED,
@@ -26,6 +25,7 @@ from ratslam.experiments.atlas.scenarios import (
     wall_middle,
 )
 from ratslam.experiments.atlas.sessions import Recipe, record
+from ratslam.runs.settings.run_config import RunConfig
 from robot.world.maze import CELL_SIDE, Maze
 from robot.world.scene import make_maze
 

@@ -10,7 +10,7 @@ import pytest
 from ratslam.experiments.atlas import arenas, stored_maps
 from ratslam.experiments.atlas.scenarios import unknown_start
 from ratslam.experiments.atlas.stored_maps import STEPS, MapArrays, map_path, store_map
-from ratslam.pipeline.saved_map import read_map
+from ratslam.runs.saved_map import read_map
 
 
 def test_a_map_of_other_code_is_not_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,6 @@ import pytest
 from ratslam.classic.batch import Network
 from ratslam.classic.cell_batch import CellSets, walk
 from ratslam.cli import main
-from ratslam.config.run_config import load_config
 from ratslam.experiments.cells.cell_study import (
     FOLDER,
     PARAMETERS,
@@ -29,8 +28,9 @@ from ratslam.experiments.cells.cell_study import (
 from ratslam.experiments.cells.set_scores import score_sets
 from ratslam.experiments.cells.study_course import expected_poses, place_bins, read_course
 from ratslam.experiments.studies.executor import Executor
-from ratslam.pipeline.build_session import build_session
-from ratslam.pipeline.source import open_observations, read_observations
+from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.source import open_observations, read_observations
 
 ROOT = Path(__file__).parents[4]
 SMALL = ["sets=4", "steps=100", "chunk=2", "bins=5", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]

@@ -34,7 +34,7 @@ from ratslam.experiments.trials.arena_trial import (
 )
 from ratslam.experiments.trials.reproduction import ResultRow, reproduce
 from ratslam.grid.config import GridConfig
-from ratslam.pipeline.artifacts import true_grid
+from ratslam.runs.artifacts import true_grid
 from robot.world.arena import Arena
 from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.errors import InputError

@@ -9,9 +9,9 @@ import pytest
 
 from ratslam.experiments.real.create import CreateResult, Variant, create_table, draw_create, true_revisits
 from ratslam.experiments.real.wall_distance import wall_distances
-from ratslam.keyframes.appearance import ViewAppearance
-from ratslam.keyframes.config import FULL, KeyframeMapConfig
-from ratslam.keyframes.keyframe_graph import KeyframeGraph
+from ratslam.mapping.appearance import ViewAppearance
+from ratslam.mapping.config import FULL, KeyframeMapConfig
+from ratslam.mapping.keyframe_graph import KeyframeGraph
 
 ROOM = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]], float)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.config.completion import complete
 from ratslam.experiments.real.walk import (
     compare_one_way,
     continue_path,
@@ -28,6 +27,7 @@ from ratslam.experiments.real.walk_source import (
     walk_simulation,
 )
 from ratslam.recall.config import sector_shifts
+from ratslam.runs.settings.completion import complete
 from robot.recordings.whiskers.objects import ObjectRecord
 from robot.simulation.head.session import HeadSimulation
 from robot.sources.odometry import OdometryConfig

@@ -16,7 +16,6 @@ from evaluation.metrics.view_separation import ViewDifferences
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main
-from ratslam.config.strict_yaml import parse
 from ratslam.experiments.salman2016.threshold_tuning import (
     THRESHOLDS,
     ThresholdScore,
@@ -25,6 +24,7 @@ from ratslam.experiments.salman2016.threshold_tuning import (
     tune_threshold,
     view_differences,
 )
+from ratslam.runs.settings.strict_yaml import parse
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 

@@ -9,11 +9,11 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.cli.studies import PRESETS
-from ratslam.config.run_config import RunConfig
-from ratslam.config.strict_yaml import load, override
 from ratslam.experiments.studies.presets import METHODS, PARTS, TIERS, preset_study, variations
 from ratslam.experiments.studies.records import RunLog
 from ratslam.experiments.studies.tiers import shortened
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import load, override
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]

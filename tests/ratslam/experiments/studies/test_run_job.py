@@ -14,8 +14,8 @@ from ratslam.experiments.studies.machine import COMPILED, Stopwatch
 from ratslam.experiments.studies.metrics import MEASURED, METRICS
 from ratslam.experiments.studies.run_job import run_job
 from ratslam.experiments.studies.study import read_study
-from ratslam.keyframes.config import FULL
-from ratslam.pipeline.run import run
+from ratslam.mapping.config import FULL
+from ratslam.runs.run import run
 from robot.recordings.mcap_reader import record_source
 from robot.recordings.npz_trace import read_trace
 from tactile.base.errors import InputError

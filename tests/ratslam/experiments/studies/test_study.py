@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig
 from ratslam.experiments.studies.schema import StudyPlan
 from ratslam.experiments.studies.study import Study, read_study
-from ratslam.keyframes.config import FULL, KeyframeMapConfig
+from ratslam.mapping.config import FULL, KeyframeMapConfig
+from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]

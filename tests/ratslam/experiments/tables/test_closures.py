@@ -8,7 +8,7 @@ import numpy as np
 
 from ratslam.experiments.tables import closures, touch
 from ratslam.experiments.tables.closures import JudgedSession, closures_table, fit_weights
-from ratslam.keyframes.closure_judge import KINDS, WEIGHTS, SequenceEvidence, log_odds, shipped_weights
+from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, log_odds, shipped_weights
 
 FIT, CONTRADICT = 3, 0
 

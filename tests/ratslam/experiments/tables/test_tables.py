@@ -9,10 +9,10 @@ import pytest
 
 from evaluation.metrics.session_metrics import TouchMetrics
 from ratslam.cli import main
-from ratslam.config.run_config import load_config
 from ratslam.experiments.tables import batches, buildings, cycles, grid, laser, recordings, touch
 from ratslam.experiments.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.experiments.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.checks.source import check_source
+from ratslam.service.checks.source import check_source
 from robot.recordings.whiskers.reach import COLUMNS, ENTRY, WHISKERS, ReachConfig, open_reach, read_reach
 from robot.sources.registry import SOURCES
 from tactile.base.errors import InputError

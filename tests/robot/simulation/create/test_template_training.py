@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.config.run_config import RunConfig
+from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
 from robot.simulation.create.template_training import (
     DURATIONS,

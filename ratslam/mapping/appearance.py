@@ -1,0 +1,428 @@
+"""Views of the keyframes: views or whisker images, and the metric by which recall compares them.
+
+Each class stores the views of all keyframes, gives recall the metric, and measures how badly a keyframe would
+fit at another pose. The properties of the sensor are estimated from the session itself.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from copy import copy, deepcopy
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from ratslam.core.backend import Evidence
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.compiled import compiled
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.gain_odds import GainPrior
+from ratslam.mapping.ground import NEAR
+from ratslam.mapping.view_sectors import NO_ESTIMATE, BiasEstimate, SectorFan
+from ratslam.recall.memory import NO_LIKENESS
+from ratslam.recall.observation_model import label_gains
+from ratslam.recall.whisker_likelihood import (
+    PixelLayout,
+    estimate_background,
+    estimate_variation,
+    live_pixels,
+    log_odds_table,
+    pixel_levels,
+)
+from tactile.base.types import Observation
+
+BIAS_INTERVAL = 16
+"""Keyframes between two estimates of the heading bias from views."""
+MIN_KEYFRAMES = 40
+"""Keyframes before the first estimate, of the heading bias or of log-odds."""
+MIN_ERRORS = 400
+"""Errors against ruled-out keyframes before the scale of errors is estimated."""
+QUANTILES = (0.005, 0.01, 0.02, 0.04, 0.08)
+"""Quantiles of the errors between different places, whose geometric mean is the scale. There are several,
+because identical places make a step in the quantiles, and one quantile alone could lie below the step."""
+LEAST_QUANTILE = 1e-3
+"""Least such quantile as a share of the largest, because views of different places may be identical."""
+LOG_ODDS_INTERVAL = 40
+"""Keyframes between two estimates of the log-odds of whisker images."""
+NEW_IMAGE_LOG_ODDS = 3.0
+"""Log-odds that stand for a whisker image never seen before."""
+NEUTRAL_MISFIT = 0.5
+"""Misfit of a keyframe without others to compare it with."""
+NEUTRAL_IMAGE_MISFIT = float(np.log(2))
+"""Misfit of a whisker image without evidence."""
+
+
+class ViewMetric(NamedTuple):
+    """The metric of recall; see `MapFeedback`."""
+
+    angle: float
+    scale: float
+    likeness: np.ndarray
+
+
+class ConfirmedPairs(NamedTuple):
+    """P pairs of keyframes at one place: keyframe [P], match [P], and bool [P]: they face opposite ways."""
+
+    frame: np.ndarray
+    match: np.ndarray
+    reversed: np.ndarray
+
+
+class Appearance(Checkpointed, ABC):
+    """Views of all keyframes."""
+
+    NEAR_SHARE: ClassVar = NEAR
+    """See `Ground.near_share`."""
+    JUDGED: ClassVar = False
+    """Whether `ratslam.mapping.closure_judge` has weights for such views."""
+
+    def present(self) -> Appearance:
+        """The present metric with the views so far, whose memory is shared: a view never changes."""
+        other = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, GrowableArray):  # views added or replaced later are not those of the copy
+                setattr(other, name, copy(value))
+        for name in self.PARTS:
+            setattr(other, name, deepcopy(getattr(self, name)))
+        return other
+
+    @abstractmethod
+    def metric(self) -> ViewMetric:
+        """The present metric of recall."""
+
+    @abstractmethod
+    def view_of(self, observation: Observation) -> np.ndarray:
+        """[D] the view of an observation, as `stored` gives it of a keyframe."""
+
+    @abstractmethod
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
+
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        """Updates the metric from the newest keyframe's evidence and, at intervals, from confirmed pairs.
+
+        Returns:
+            the heading bias that the views show, `NO_ESTIMATE` if it was not estimated.
+        """
+        return NO_ESTIMATE
+
+    @abstractmethod
+    def extend(self, other: Appearance) -> None:
+        """Adds the views of another map of the same sensor; the metric is learned anew by `relearn`."""
+
+    def gain_prior(self, usual: GainPrior) -> GainPrior:
+        """Gains of views before any were counted; `usual` if nothing else is known of them."""
+        return usual
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        """Learns the metric anew from all views and these confirmed pairs."""
+
+    @abstractmethod
+    def take(self, frames: np.ndarray) -> None:
+        """Reduces the views to those of keyframes [n]; what was learned of the sensor stays."""
+
+    @abstractmethod
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The views [n, D] and ids [n] of keyframes [n], as recall stores them."""
+
+    @abstractmethod
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] how unlike the view of a keyframe, or of each of the keyframes [n], is that of each of the
+        keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
+
+    @abstractmethod
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] log-odds that the view of a keyframe and that of each of the keyframes `others` [n] are of one
+        place, nat; `reversed` as in `misfit`."""
+
+    @abstractmethod
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
+        (`reversed` [n] bool); 0 or more."""
+
+
+class ViewAppearance(Appearance):
+    """Views compared by their mean absolute difference.
+
+    Args:
+        size: number of values of a view. fan: field of view, rad; 0: to be estimated; None: the views are not
+            ordered sectors. normalise: the preprocessing of recall.
+    """
+
+    VALUES = ("_scale",)
+    PARTS = ("_fan",)
+
+    def __init__(
+        self, size: int, fan: float | None, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
+    ) -> None:
+        self._normalise = normalise
+        self._fan = None if fan is None or not size else SectorFan(size, fan / size)
+        self._view = GrowableArray((size,), np.float64)
+        self._background = GrowableArray((), np.float64)
+        self._scale = (0, 0.0)  # number of errors it was estimated from, and the scale
+
+    def metric(self) -> ViewMetric:
+        return ViewMetric(self._fan.angle if self._fan else 0.0, self._scale[1], NO_LIKENESS)
+
+    def view_of(self, observation: Observation) -> np.ndarray:
+        size = self._view.rows.shape[1]
+        view = self._normalise(np.asarray(observation.view, float)) if size else np.zeros(0)
+        return np.asarray(view, float).reshape(-1)[:size]
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._view.append(self.view_of(observation))
+        if self._fan:
+            self._fan.append(self._view.rows[-1], turn, length)
+
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, ViewAppearance)
+        if self._fan and other._fan and len(other._view.rows) > len(self._view.rows):
+            self._fan = deepcopy(other._fan)  # the longer session knows the sectors better
+        self._view.extend(other._view.rows)
+        self._background.extend(other._background.rows)
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        self._scale = 0, self._scale[1]
+        self._rescale()
+
+    def take(self, frames: np.ndarray) -> None:
+        self._view.replace(self._view.rows[frames])
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._view.rows[frames], np.full(len(frames), -1)
+
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        errors = np.asarray(evidence.background)
+        self._background.extend(errors[np.isfinite(errors)])
+        self._rescale()
+        count = len(self._view.rows) - 1
+        if self._fan is None or count % BIAS_INTERVAL or count < MIN_KEYFRAMES:
+            return NO_ESTIMATE
+        before, estimate = self._fan.angle, self._fan.estimate()
+        if not before and self._fan.angle:
+            # Shifted views have smaller errors, so the errors so far no longer count.
+            self._background.replace(self._background.rows[:0])
+            self._scale = 0, 0.0
+        return estimate
+
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """Mean absolute differences."""
+        return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
+
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """1 for equal views, 0 at the scale of errors, which few different places stay below."""
+        return 1 - self.unlikeness(frame, others, reversed) / max(self._scale[1], 1e-300)
+
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """0..1: the smallest error against the keyframes, relative to twice the scale."""
+        if not len(near):
+            return NEUTRAL_MISFIT
+        error = self.unlikeness(frame, near, reversed).min()
+        return float(min(error / max(2 * self._scale[1], 1e-300), 1.0))
+
+    def _rescale(self) -> None:
+        """Estimates the scale when there are a tenth more errors than at the last estimate."""
+        count = len(self._background.rows)
+        if count >= max(MIN_ERRORS, 1.1 * self._scale[0]):
+            small = np.quantile(self._background.rows, QUANTILES)
+            # As shares of the largest, so that the result does not depend on the sensor's unit.
+            share = small / small[-1] if small[-1] > 0 else small
+            scale = float(small[-1] * np.exp(np.log(np.maximum(share, LEAST_QUANTILE)).mean()))
+            self._scale = count, scale
+
+
+class WhiskerAppearance(Appearance):
+    """Whisker images compared by log-odds that are learned from the session.
+
+    Args:
+        temper: factor on the log-odds, see `RecallConfig`. normalise: the preprocessing of recall.
+        half_turns: whether images are also compared as seen in the opposite direction.
+    """
+
+    VALUES = ("_likeness",)
+    JUDGED = True
+
+    def __init__(
+        self,
+        pixels: PixelLayout,
+        temper: float,
+        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        half_turns: bool = True,
+    ) -> None:
+        self._pixels, self._temper, self._normalise = pixels, temper, normalise
+        self._angle = np.pi if half_turns else 0.0
+        self._level = GrowableArray((len(pixels.group),), np.int64)
+        self._likeness = NO_LIKENESS
+
+    def metric(self) -> ViewMetric:
+        return ViewMetric(self._angle, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
+
+    @property
+    def layout(self) -> PixelLayout:
+        """The layout of the pixels."""
+        return self._pixels
+
+    def view_of(self, observation: Observation) -> np.ndarray:
+        view = self._normalise(np.asarray(observation.view, float))
+        return pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._level.append(self.view_of(observation))
+
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, WhiskerAppearance)
+        self._level.extend(other._level.rows)
+
+    def relearn(self, pairs: ConfirmedPairs) -> None:
+        frame, match, reversed = pairs
+        images = self._level.rows
+        variation = estimate_variation(images[frame], self._images(match, reversed))
+        self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
+
+    def take(self, frames: np.ndarray) -> None:
+        self._level.replace(self._level.rows[frames])
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._level.rows[frames], np.full(len(frames), -1)
+
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+        if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:
+            self.relearn(confirmed_pairs())
+        return NO_ESTIMATE
+
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """Negative log-odds; zeros while these are not learned."""
+        if not self._likeness.size:
+            return np.zeros(len(others))
+        pixels, frames = self._pixels, np.broadcast_to(frame, len(others))
+        return -summed_log_odds(
+            self._likeness, pixels.group, self._level.rows, pixels.opposite, frames, others, reversed
+        )
+
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return -self._temper * self.unlikeness(frame, others, reversed)
+
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """log(1 + 1 / odds) of the most similar of the keyframes."""
+        if not len(near) or not self._likeness.size:
+            return NEUTRAL_IMAGE_MISFIT
+        return float(np.log1p(np.exp(self._temper * self.unlikeness(frame, near, reversed).min())))
+
+    def _images(self, frames: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n, D] levels of keyframes, those `reversed` [n] as seen in the opposite direction."""
+        images = self._level.rows[frames]
+        return np.where(reversed[:, None], images[:, self._pixels.opposite], images)
+
+
+@compiled
+def mean_differences(views: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n] mean absolute differences of the views [N, D] numbered a [n] and b [n]."""
+    found = np.empty(len(a))
+    for k in range(len(a)):
+        total = 0.0
+        for d in range(views.shape[1]):
+            total += abs(views[a[k], d] - views[b[k], d])
+        found[k] = total / views.shape[1]
+    return found
+
+
+@compiled
+def summed_log_odds(
+    table: np.ndarray,
+    group: np.ndarray,
+    levels: np.ndarray,
+    opposite: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    reversed: np.ndarray,
+) -> np.ndarray:
+    """[n] log-odds that the images numbered a [n] and b [n] are of one place.
+
+    Args:
+        table: [G, L, L] log-odds by group of pixels and the levels of both. group: [D] of each pixel.
+        levels: [N, D] the images. opposite: [D] the pixel at the other side of the head.
+        reversed: [n] bool, whether image b is seen in the opposite direction.
+    """
+    found = np.empty(len(a))
+    for k in range(len(a)):
+        total = 0.0
+        for d in range(len(group)):
+            other = opposite[d] if reversed[k] else d
+            total += table[group[d], levels[a[k], d], levels[b[k], other]]
+        found[k] = total
+    return found
+
+
+@compiled
+def near_facing(
+    poses: np.ndarray, frames: np.ndarray, guard: int, radius: float, facing: float
+) -> np.ndarray:
+    """[F, N] int8: for each of the keyframes `frames` [F], which older ones are near it: 1 those that face
+    alike, -1 those that face the opposite way, 0 all others.
+
+    Args:
+        poses: [N, 3]. guard: number of newest keyframes before each that do not count. radius: largest
+            distance, m. facing: least cosine of the difference in heading, or in opposite headings.
+    """
+    ahead, aside = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    found = np.zeros((len(frames), len(poses)), np.int8)
+    for row in range(len(frames)):
+        k = frames[row]
+        for other in range(k - guard):
+            dx, dy = poses[other, 0] - poses[k, 0], poses[other, 1] - poses[k, 1]
+            if dx * dx + dy * dy < radius * radius:
+                cosine = ahead[other] * ahead[k] + aside[other] * aside[k]
+                if abs(cosine) > facing:
+                    found[row, other] = 1 if cosine > 0 else -1
+    return found
+
+
+SAME_ID_LOG_ODDS = 3.0
+"""Log-odds of one place where the given ids are equal, and against it where they differ."""
+LABEL_SPREAD = 0.5
+"""Standard deviation of the gain of an id, some of which were seen at several keyframes, nat."""
+
+
+class LabelAppearance(Appearance):
+    """Ids given with the recording. They are seen from anywhere within reach of a place."""
+
+    NEAR_SHARE = 1.0
+
+    def __init__(self) -> None:
+        self._label = GrowableArray((), np.int64)
+
+    def metric(self) -> ViewMetric:
+        return ViewMetric(0.0, 0.0, NO_LIKENESS)
+
+    def view_of(self, observation: Observation) -> np.ndarray:
+        return np.zeros(0)
+
+    def append(self, observation: Observation, turn: float, length: float) -> None:
+        self._label.append(int(observation.label))
+
+    def extend(self, other: Appearance) -> None:
+        assert isinstance(other, LabelAppearance)
+        self._label.extend(other._label.rows)
+
+    def gain_prior(self, usual: GainPrior) -> GainPrior:
+        """An id is the same at a true pose, and another one at a false pose."""
+        same, other = label_gains(len(np.unique(self._label.rows)))
+        return GainPrior(true=(same, LABEL_SPREAD), false=(other, LABEL_SPREAD))
+
+    def take(self, frames: np.ndarray) -> None:
+        self._label.replace(self._label.rows[frames])
+
+    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((len(frames), 0)), self._label.rows[frames]
+
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return (self._label.rows[others] != self._label.rows[frame]).astype(float)
+
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        return SAME_ID_LOG_ODDS * (1 - 2 * self.unlikeness(frame, others, reversed))
+
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        if not len(near):
+            return NEUTRAL_MISFIT
+        return float(self.unlikeness(frame, near, reversed).min())

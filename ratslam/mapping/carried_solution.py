@@ -1,0 +1,406 @@
+"""The final map of a robot that may be carried: the odometry cut where all views together show it.
+
+While a session goes on, a cut is found from one closure sequence at a time: it lies up to a lap off, or is
+missing where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are
+selected anew with the odometry cut there, and so on in turn, because each makes the other better. Each time
+it is retraced once on all keyframes and once on the earlier ones alone: two stretches at one wrong place bear
+each other out, but the first of them has to fit what was there before. Each map is aligned by closures along
+its own poses (`track_closures`): bent, the right one would look less likely than a wrong one. Of all these
+maps and the one before, the one that the views and the measurements together find most likely is given. The
+method is ours.
+
+Closure sequences along the poses of a map, where its views fit.
+
+Recall proposes few sequences on a stretch between two cuts of the odometry, so the stretch is bent and its
+views look as if it were elsewhere. Where the poses of two keyframes are near each other and the view fits,
+they are a closure. The rule is ours.
+
+Retracing: where a robot that may be carried was at each keyframe of a finished map, all views considered.
+
+The map's own stretches between breaks, the places that closure sequences claim and, where the map's poses fit
+badly, the places that look alike are followed as tracks in both directions. The sequence of tracks with the
+largest log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967);
+odometry is cut where it jumps from one track to another. That its states are tracks is ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.core.compiled import compiled
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.closure_selection import (
+    CUT,
+    Selection,
+    SelectionProblem,
+    cut_odometry,
+    optimise_with_cuts,
+)
+from ratslam.mapping.gain_odds import BINS, GainOdds, learn_gain_odds
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.map_hypotheses import MapHypotheses
+from ratslam.mapping.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
+from ratslam.mapping.optimizer import MapFit, MapProblem, System
+from ratslam.mapping.pose_tracks import SelfTraverse, Track
+from ratslam.mapping.verification import turn_on_spot
+
+ROUNDS = 3
+"""Number of times that the robot is retraced."""
+ALIGNED = 3
+"""Number of times that a map is aligned by the views along its poses; more change it little."""
+MOST_RETRACED = 2000
+"""Largest number of keyframes of a map that is retraced: each is compared with every other."""
+FEWEST_RETRACED = 100
+"""Least number of them: fewer teach nothing about how views fit."""
+
+
+class Case(NamedTuple):
+    """What is selected from once the odometry is cut.
+
+    Attributes:
+        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem: among
+            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one if
+            there is none.
+    """
+
+    log: ClosureLog
+    sequences: np.ndarray
+    problem: SelectionProblem
+    breaks: tuple[tuple[int, int], ...]
+
+    def starts(self, fit: MapFit) -> list[MapFit]:
+        """Maps to start from: a fit, and those that follow the sequences in order of time."""
+        cut = self.problem._replace(measurements=self._measurements())
+        return [fit, *MapHypotheses().follow(cut, self.sequences)]
+
+    def cost(self, fit: MapFit) -> float:
+        """Chi-square of a fit, its cuts left out."""
+        return System(self._measurements()).robust_cost(fit) + self.problem.views_cost(fit.poses)
+
+    def _measurements(self) -> MapProblem:
+        return cut_odometry(self.problem.measurements, self.breaks)
+
+
+class Judged(NamedTuple):
+    """A selection, and its log-likelihood with what all views say, nat.
+
+    Attributes:
+        case: with the sequences of recall. aligned: with those along the poses too. selection: of these.
+    """
+
+    case: Case
+    aligned: Case
+    selection: Selection
+    likelihood: float
+
+
+def is_retraced(graph: KeyframeGraph) -> bool:
+    """Whether the final map of these keyframes, none of them merged, is retraced; one that is told where it
+    begins a piece is not."""
+    config = graph.config
+    known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
+    return bool(config.may_be_carried and config.select_every and known)
+
+
+def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolution:
+    """The map of `solution` after the robot has been retraced; the same if it has no sequences.
+
+    Args:
+        graph: keyframes, none of them merged.
+    """
+    fits, fit, log = view_fits(graph), solution.fit, solution.log
+    odds = learn_odds(SelfTraverse.of_map(graph, fit, fits))
+    first = _case(graph, log, np.flatnonzero(solution.cut.rows >= 0))
+    if not len(first.sequences):
+        return solution
+    newest = best = _judge(graph, fits, odds, first, [fit])
+    past = earlier_fits(fits)
+    for _ in range(ROUNDS):
+        found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
+        newest = max(found, key=lambda judged: judged.likelihood)
+        best = max(best, newest, key=lambda judged: judged.likelihood)
+    case, cut = best.aligned, _uncut(graph)
+    given = selected_map(graph, case.log, cut, case.sequences, best.selection)
+    refused = given.log.verdicts() != Verdict.ACCEPTED
+    refused[: log.sequences] = False  # what recall says against the map stays
+    given.log.strike_sequences(np.flatnonzero(refused))
+    return given
+
+
+def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:
+    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`, and, if these
+    are fewer, to its sequences."""
+    if len(rows) == len(solution.fit.poses):
+        return solution
+    log, cut = kept.log.copy(), GrowableArray((), np.int64)
+    log.follow(solution.log)
+    cut.replace(solution.cut.rows[rows])
+    log.strike_across(np.flatnonzero(cut.rows >= 0))
+    return MapSolution(solution.fit._replace(poses=solution.fit.poses[rows]), log, cut)
+
+
+def _case(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+    """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
+    log = log.copy()
+    log.strike_across(cuts)
+    return _case_of(graph, log, cuts)
+
+
+def _case_of(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+    """The selection among the sequences of a log, none of which lies across a cut; changes the log."""
+    sequences = np.flatnonzero(sequences_to_select(graph, log))
+    problem = selection_case(graph, log, _uncut(graph), sequences, np.copy)
+    shows = np.array([np.append(np.flatnonzero(problem.first >= frame), -1)[0] for frame in cuts], int)
+    return Case(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
+
+
+def _align(graph: KeyframeGraph, fits: np.ndarray, case: Case, fit: MapFit) -> tuple[Case, Selection]:
+    """The selection among the sequences of a case and those along the poses of a fit."""
+    log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
+    add_closures_along(log, SelfTraverse.of_map(graph, fit, fits), cuts, graph.config.max_gap)
+    aligned = _case_of(graph, log, cuts)
+    return aligned, optimise_with_cuts(aligned.problem, fit, aligned.breaks)
+
+
+def _retrace(
+    graph: KeyframeGraph,
+    fits: np.ndarray,
+    compared: np.ndarray,
+    odds: GainOdds,
+    before: Judged,
+    log: ClosureLog,
+) -> Judged:
+    """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
+    fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
+    session = SelfTraverse.of_map(graph, fit, fits)
+    found = retrace(session._replace(fits=compared), learn_odds(session), cuts, log, graph.sector_angle)
+    case = _case(graph, log, found.cuts)
+    return _judge(graph, fits, odds, case, case.starts(fit._replace(poses=found.poses)))
+
+
+def _judge(
+    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, starts: list[MapFit]
+) -> Judged:
+    """The most likely of the selections from these starts, aligned by the views.
+
+    Args:
+        fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
+    """
+    selections = [optimise_with_cuts(case.problem, start, case.breaks) for start in starts]
+    likelihoods = [_likelihood(graph, fits, odds, case, one.fit) for one in selections]
+    selection, aligned = selections[int(np.argmax(likelihoods))], case
+    for _ in range(ALIGNED):
+        aligned, selection = _align(graph, fits, case, selection.fit)
+    return Judged(case, aligned, selection, _likelihood(graph, fits, odds, case, selection.fit))
+
+
+def _likelihood(graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, fit: MapFit) -> float:
+    """Of all views, the cuts, the odometry and the sequences of recall; those along the poses would count
+    the views twice."""
+    seen = SelfTraverse.of_map(graph, fit, fits).own_odds(odds).sum()
+    return float(seen) - JUMP * len(case.breaks) - case.cost(fit) / 2
+
+
+def _uncut(graph: KeyframeGraph) -> GrowableArray:
+    """[N] no keyframe cut, see `KeyframeGraph.cut`."""
+    cut = GrowableArray((), np.int64)
+    cut.replace(np.full(graph.count, -1))
+    return cut
+
+
+LONGEST = 10
+"""Largest number of closures of one sequence, which is accepted or refused as a whole."""
+
+
+def add_closures_along(log: ClosureLog, session: SelfTraverse, cuts: np.ndarray, max_gap: int) -> None:
+    """Adds to the log the earlier keyframe that fits best at the pose of each keyframe, where any fits better
+    than a new place.
+
+    Args:
+        cuts: keyframes [n], ascending, before which the odometry is cut; no sequence lies across one.
+            max_gap: largest number of keyframes between two closures of a sequence.
+    """
+    part = np.searchsorted(cuts, np.arange(session.size), side="right")
+    before, length = -1, 0
+    for frame, pose in enumerate(session.poses):
+        earlier = session.ground._replace(poses=session.poses[:frame])
+        best = earlier.best_match(pose, session.fits[frame])
+        if best is None:
+            continue
+        near = before >= 0 and frame - before <= max_gap and part[frame] == part[before]
+        follows = bool(near and length < LONGEST)
+        posterior = float(1 / (1 + np.exp(-best.gain)))
+        log.add(Candidate(frame, best.frame, best.shift, posterior, best.gain), follows)
+        before, length = frame, length + 1 if follows else 1
+
+
+SAMPLES = 60
+"""Number of stretches by which the odds of false poses are learned."""
+FIRST, FURTHER = 8, 16
+"""Keyframes by which alike places are chosen, and those after them whose fits there count."""
+ALIKE = 4
+"""Number of alike places for each stretch."""
+ELSEWHERE = 2.0
+"""Least distance of another place, as a multiple of the reach of a keyframe."""
+EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
+"""Odds that say nothing."""
+
+
+def view_fits(graph: KeyframeGraph) -> np.ndarray:
+    """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
+    (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
+    count, shifts = graph.count, 2 if np.cos(graph.sector_angle) < 0 else 1
+    fits = np.empty((count, shifts, count), np.float32)
+    every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
+    for frame in range(count):
+        fits[frame] = graph.log_odds(frame, every, reversed).reshape(shifts, count)
+        fits[frame, :, max(frame - graph.guard, 0) : frame + graph.guard + 1] = -np.inf
+    return fits
+
+
+def earlier_fits(fits: np.ndarray) -> np.ndarray:
+    """The fits [N, S, N] at earlier keyframes, -inf at later ones."""
+    later = np.triu(np.ones((len(fits), len(fits)), bool))
+    return np.where(later[:, None], np.float32(-np.inf), fits)
+
+
+def learn_odds(session: SelfTraverse) -> GainOdds:
+    """The log-odds of a fit, from those at the map's own poses and on tracks from other places that look
+    alike."""
+    true, false = session.own_fits(), [np.zeros(0)]
+    places = session.places()
+    frames = np.arange(FIRST, session.size - FIRST - FURTHER, max(session.size // SAMPLES, 1))
+    for frame in frames.tolist():
+        fits = session.scan(frame, places, FIRST)
+        apart = np.hypot(*(places - session.poses[frame])[:, :2].T)
+        facing = np.cos(places[:, 2] - session.poses[frame, 2]) > np.cos(2 * session.ground.reach_heading)
+        fits[(apart < ELSEWHERE * session.ground.reach) & facing] = -np.inf
+        for place in np.argsort(-fits, kind="stable")[:ALIKE].tolist():
+            *_, found, _ = session.follow(frame, places[place], frame + FIRST + FURTHER, EVEN)
+            false.append(found[FIRST:])
+    other = np.concatenate(false)
+    return learn_gain_odds(true[np.isfinite(true)], other[np.isfinite(other)])
+
+
+JUMP = CUT
+"""What being carried costs, nat: twice what a cut costs a selection, because each view counts here, and
+successive ones are alike."""
+BEYOND, AROUND = 60, 180
+"""Keyframes over which a stretch of the map is followed beyond its ends, and over which any other track is
+followed."""
+LOOKED, EVERY = 8, 4
+"""Keyframes whose views are considered together to see whether the map fits, and how often."""
+DOUBTED = 0.5
+"""Mean log-odds of these below which other places are tried, nat."""
+TRIED = 4
+"""Number of such places."""
+
+
+class Retraced(NamedTuple):
+    """Poses [N, 3] of the keyframes, the log-odds of their views there less `JUMP` for each cut, and the
+    keyframes [n] before which odometry is cut."""
+
+    poses: np.ndarray
+    odds: float
+    cuts: np.ndarray
+
+
+def retrace(
+    session: SelfTraverse, odds: GainOdds, cuts: np.ndarray, log: ClosureLog, sector_angle: float
+) -> Retraced:
+    """The most likely track through all keyframes.
+
+    Args:
+        cuts: keyframes [n] before which the odometry of the map is cut. log: whose sequences claim places.
+    """
+    tracks = _own_tracks(session, odds, cuts)
+    for frame, pose in _claims(session, log, sector_angle):
+        _add(tracks, session, odds, frame, pose)
+    _search(tracks, session, odds)
+    poses, gained = (np.stack(part) for part in zip(*tracks, strict=True))
+    reach = session.ground.reach, session.ground.reach_heading
+    chosen, jumps, total = _best_sequence(poses, gained, *reach, JUMP)
+    return Retraced(poses[chosen, np.arange(session.size)], total, np.flatnonzero(jumps))
+
+
+def _own_tracks(session: SelfTraverse, odds: GainOdds, cuts: np.ndarray) -> list[Track]:
+    """The stretches of the map between its cuts, followed on beyond them."""
+    own, tracks = session.own_odds(odds), []
+    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), session.size], strict=True):
+        track = Track(np.full((session.size, 3), np.nan), np.full(session.size, -np.inf))
+        track.poses[first:last], track.odds[first:last] = session.poses[first:last], own[first:last]
+        for end, stop in ((last - 1, last - 1 + BEYOND), (first, first - BEYOND)):
+            frames, poses, _, gained = session.follow(end, session.poses[end], stop, odds)
+            track.poses[frames], track.odds[frames] = poses, gained
+        tracks.append(track)
+    return tracks
+
+
+def _claims(session: SelfTraverse, log: ClosureLog, sector_angle: float) -> list[tuple[int, np.ndarray]]:
+    """The poses [3] that the sequences claim for the keyframe of their middle members."""
+    claims = []
+    for sequence in np.flatnonzero((log.left() > 1) & (log.verdicts() != Verdict.UNDONE)).tolist():
+        members = log.members(sequence)
+        frame, match, shift, _ = members[len(members) // 2].tolist()
+        claims.append((frame, turn_on_spot(session.poses[match], -shift * sector_angle)))
+    return claims
+
+
+def _search(tracks: list[Track], session: SelfTraverse, odds: GainOdds) -> None:
+    """Adds tracks of places that look alike where the poses of the map do not fit."""
+    fits = np.convolve(session.own_odds(odds), np.ones(LOOKED), "valid")
+    places = session.places()
+    for frame in range(0, len(fits), EVERY):
+        if fits[frame] < DOUBTED * LOOKED:
+            likeness = session.scan(frame, places, LOOKED)
+            for place in np.argsort(-likeness, kind="stable")[:TRIED].tolist():
+                _add(tracks, session, odds, frame, places[place])
+
+
+def _add(tracks: list[Track], session: SelfTraverse, odds: GainOdds, frame: int, pose: np.ndarray) -> None:
+    """Adds the track of a keyframe at a pose [3], unless one leads past it."""
+    if not any(track.leads_past(frame, pose, session.ground) for track in tracks):
+        tracks.append(session.track(frame, pose, AROUND, odds))
+
+
+@compiled
+def _best_sequence(
+    poses: np.ndarray, odds: np.ndarray, reach: float, reach_heading: float, jump: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """The sequence of tracks with the largest log-odds.
+
+    Args:
+        poses: [K, N, 3] of K tracks. odds: [K, N], -inf where a track does not lead. reach, reach_heading:
+            differences below which two tracks are at one pose, m and rad. jump: cost of a change between
+            tracks that are not.
+
+    Returns:
+        the track of each keyframe [N]; bool [N], whether it was reached by a jump; the log-odds.
+    """
+    tracks, count = odds.shape
+    score = odds[:, 0].copy()
+    before, jumped = np.zeros((count, tracks), np.int64), np.zeros((count, tracks), np.bool_)
+    for k in range(1, count):
+        best, after = int(np.argmax(score)), np.full(tracks, -np.inf)
+        for t in range(tracks):
+            if odds[t, k] == -np.inf:
+                continue
+            value, source, leaps = score[best] - jump, best, True
+            for u in range(tracks):
+                if score[u] <= value or odds[t, k - 1] == -np.inf:
+                    continue
+                x, y = poses[t, k - 1, 0] - poses[u, k - 1, 0], poses[t, k - 1, 1] - poses[u, k - 1, 1]
+                alike = np.cos(poses[t, k - 1, 2] - poses[u, k - 1, 2]) > np.cos(reach_heading)
+                if u == t or (x * x + y * y < reach * reach and alike):
+                    value, source, leaps = score[u], u, False
+            before[k, t], jumped[k, t], after[t] = source, leaps, value + odds[t, k]
+        score = after
+    chosen, jumps = np.empty(count, np.int64), np.zeros(count, np.bool_)
+    chosen[-1] = np.argmax(score)
+    for k in range(count - 1, 0, -1):
+        chosen[k - 1] = before[k, chosen[k]]
+        jumps[k] = jumped[k, chosen[k]]
+    return chosen, jumps, score[chosen[-1]]

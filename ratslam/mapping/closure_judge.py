@@ -1,0 +1,435 @@
+"""Whether the robot is really back: the log-odds that a closure sequence is true.
+
+A sequence claims that its middle keyframe was at the pose of the one it matched. That pose is followed by
+odometry, corrected by the keyframes near by, through the sequence and `BEYOND` keyframes before and after it,
+once over the map (m) and once over the older pass alone as odometry knows it (o), which no closure has bent.
+Each view on the way counts by how well it fits there, for or against:
+
+    L_g = a_g + w+ max(R, 0) + w- min(R, 0) + n_within . w1 + n_around . w2,    g = m, o
+    L   = (L_m + L_o) / 2
+
+R is the log of the density that odometry gave to the claimed place over its mean at all older keyframes. The
+numbers n count views by kind (`KINDS`), by their gain: log-odds at the best keyframe near by less the log of
+their mean elsewhere. The weights are those of a logistic regression on sequences with known truth of
+simulated sessions; `python -m ratslam reproduce tables closures` fits and tests them. They are far below
+those of independent views, because successive views are alike.
+
+Recall chooses a sequence because the views at the places that it claims are alike, which they may be by
+chance; the views around them are not chosen. So the evidence of recall counts less where L is low
+(`ClosureLog.credit`), a sequence that is not likely waits for a selection (`AT_ONCE`), and a map whose
+sequences are unlikely together is doubted. L of true sequences is small while a session is
+young, or where odometry is noisier than it was taken to be: a sequence is weighed against the others with
+less evidence, not refused by L alone. The rules are ours.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit
+
+from ratslam.core.compiled import compiled
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.following import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING
+from ratslam.mapping.ground import REACH, REACH_HEADING
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.odometry_scan import log_ratio
+from ratslam.mapping.optimizer import MapFit
+from tactile.base.se2 import correct_heading, integrate, inverse
+
+AT_ONCE = 1.0
+"""Least log-odds of a sequence that is accepted before it is weighed against the others."""
+WEIGHTS = "closure_judge.json"
+"""The weights, beside this file."""
+BEYOND = 80
+"""Keyframes before and after a sequence whose views count."""
+EXTENT = 50
+"""Keyframes of the older pass before and after it, beyond those, that may be compared."""
+LEAST, MOST = -6.0, 8.0
+"""Limits of R; odometry has outliers."""
+EDGES = np.array([-1.5, 0.0, 1.5])
+"""Gains, nat, between views that contradict, disagree, agree and fit."""
+KINDS = len(EDGES) + 3
+"""Kinds of views: these four; beside the way, contradicted by none; off the way."""
+STRAY = 1.0
+"""Distance of a followed pose from odometry, in reaches, from which it is compared with fewer keyframes."""
+CONTROLS = 48
+"""Number of keyframes elsewhere with which a view is compared."""
+BOX = 16
+"""Keyframes of a way that are compared with the ground in the box around them."""
+
+
+class SequenceEvidence(NamedTuple):
+    """What is known of n sequences.
+
+    Attributes:
+        foretold: [n] R; NaN where odometry is broken between the keyframes that a sequence joins, about which
+            nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over the older
+            pass; of the sequence and around it.
+    """
+
+    foretold: np.ndarray
+    counts: np.ndarray
+
+    def features(self) -> np.ndarray:
+        """[n, 2, 3 + 2 KINDS] factors of the weights, over the map and over the older pass."""
+        n = len(self.foretold)
+        ratio = np.column_stack([np.ones(n), np.maximum(self.foretold, 0), np.minimum(self.foretold, 0)])
+        return np.concatenate(
+            [np.repeat(ratio[:, None], 2, axis=1), self.counts.reshape(n, 2, 2 * KINDS)], axis=2
+        )
+
+
+@cache
+def shipped_weights() -> np.ndarray:
+    """Weights [2, 3 + 2 KINDS] of whisker views, over the map and over the older pass: a, w+, w-, w1, w2,
+    nat."""
+    return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
+
+
+def log_odds(evidence: SequenceEvidence, weights: np.ndarray) -> np.ndarray:
+    """[n] L; NaN where nothing is said.
+
+    Args:
+        weights: see `shipped_weights`.
+    """
+    ways: np.ndarray = (evidence.features() * weights).sum(axis=2)
+    return ways.mean(axis=1)
+
+
+def judge_sequences(
+    graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray
+) -> np.ndarray:
+    """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and where
+    the robot may be carried, as odometry then foretells nothing.
+
+    Args:
+        fit, log, cut: see `MapSolution`.
+    """
+    if not graph.appearance.JUDGED or graph.config.may_be_carried:
+        return np.full(len(sequences), np.nan)
+    return log_odds(sequence_evidence(graph, fit, log, cut, sequences), shipped_weights())
+
+
+def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
+    """Stores the log-odds of sequences [n] of the present map in the log; of those that have lost keyframes
+    by merging the former ones stay."""
+    whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
+    log.rate_anew(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
+
+
+def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
+    """Log-odds of a sequence of the present map."""
+    (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
+    return float(odds)
+
+
+def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
+    """Probability that the accepted sequences of a map are false if they are so together,
+    1 / (1 + exp(S)), with the sum S of L; NaN if nothing is said of any."""
+    accepted = np.flatnonzero((log.verdicts() == Verdict.ACCEPTED) & (log.left() > 0))
+    odds = judge_sequences(graph, fit, log, cut, accepted)
+    return float(expit(-np.nansum(odds))) if np.isfinite(odds).any() else np.nan
+
+
+def sequence_evidence(
+    graph: KeyframeGraph,
+    fit: MapFit,
+    log: ClosureLog,
+    cut: GrowableArray,
+    sequences: np.ndarray,
+    after: int = BEYOND,
+) -> SequenceEvidence:
+    """The evidence for sequences [n], each with a candidate or more, in a map of N keyframes.
+
+    Args:
+        fit, log, cut: see `MapSolution`. after: number of keyframes after a sequence that are known.
+    """
+    found = SequenceEvidence(np.full(len(sequences), np.nan), np.zeros((len(sequences), 2, 2, KINDS)))
+    ways = _ways(graph, log, cut, sequences, after)
+    drive = _drive(graph, fit, ways)
+    for k, way in ways.items():
+        found.foretold[k] = _foretold(graph, drive, way)
+        reach = EXTENT + way.last - way.first + BEYOND
+        older = slice(
+            max(way.match - reach, 0), max(min(way.match + reach, way.middle - graph.guard), way.match) + 1
+        )
+        before = max(way.first - graph.guard, way.match) + 1
+        for g, (ground, begins) in enumerate(((fit.poses[:before], 0), (drive.reckoned[older], older.start))):
+            found.counts[k, g] = _views_on(graph, drive, way, ground, begins)
+    return found
+
+
+class Way(NamedTuple):
+    """The keyframes from `low` to before `high` whose views count, those of the sequence from `first` to
+    `last`; keyframe `middle` is claimed to be where `match` was, turned by `turn`, rad."""
+
+    middle: int
+    match: int
+    turn: float
+    low: int
+    high: int
+    first: int
+    last: int
+
+
+def _ways(
+    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
+) -> dict[int, Way]:
+    """The ways of sequences [n], by their row; none of those that join keyframes between which the odometry
+    is broken."""
+    table, breaks = log.table(), np.flatnonzero(graph.is_broken(cut))
+    order = np.argsort(table[:, 5], kind="stable")
+    begin, end = np.searchsorted(table[order, 5], np.stack([sequences, sequences + 1]))
+    ways = {}
+    for k in range(len(sequences)):
+        rows = table[order[begin[k] : end[k]]]
+        middle, match, shift = rows[len(rows) // 2, :3].astype(int).tolist()
+        part, of_match = np.searchsorted(breaks, [middle, match], side="right").tolist()
+        if part == of_match:
+            first, last = int(rows[0, 0]), int(rows[-1, 0])
+            low = max(first - BEYOND, int(breaks[part - 1]) if part else 0)
+            high = min(last + after + 1, int(breaks[part]) if part < len(breaks) else graph.count)
+            ways[k] = Way(
+                middle, match, -shift * graph.sector_angle, low, high, max(first, low), min(last, high - 1)
+            )
+    return ways
+
+
+class Drive(NamedTuple):
+    """The odometry and views of N keyframes.
+
+    Attributes:
+        motion, variance: [N, 3] into each keyframe, without systematic errors. reckoned: [N, 3] poses by
+            odometry. elsewhere: [N] see `_fit_elsewhere`; 0 beside all ways.
+    """
+
+    motion: np.ndarray
+    variance: np.ndarray
+    reckoned: np.ndarray
+    elsewhere: np.ndarray
+
+
+def _drive(graph: KeyframeGraph, fit: MapFit, ways: dict[int, Way]) -> Drive:
+    motion = correct_heading(graph.motion.rows, graph.length.rows, fit.bias, fit.turn_error)
+    reckoned = graph.dead_reckoned(graph.start.bias, graph.start.turn_error)
+    asked = np.zeros(graph.count, bool)
+    for way in ways.values():
+        asked[way.low : way.high] = True
+    elsewhere = np.zeros(graph.count)
+    elsewhere[asked] = _fit_elsewhere(graph, np.flatnonzero(asked))
+    return Drive(motion, graph.own_variances(), reckoned, elsewhere)
+
+
+def _fit_elsewhere(graph: KeyframeGraph, frames: np.ndarray) -> np.ndarray:
+    """[n] log of the mean likelihood of the views of keyframes [n] at up to `CONTROLS` keyframes elsewhere,
+    in turn seen ahead and, where half turns are compared, from the opposite direction."""
+    others = np.unique(np.linspace(0, graph.count - 1, CONTROLS).astype(int))
+    shape = len(frames), len(others)
+    row, control = (each.ravel() for each in np.indices(shape))
+    reversed = (control % 2 > 0) & _sees_half_turns(graph)
+    odds = graph.log_odds(frames[row], others[control], reversed).reshape(shape)
+    away = np.abs(others - frames[:, None]) > graph.guard
+    mean = np.where(away, np.exp(odds), 0.0).sum(axis=1) / np.maximum(away.sum(axis=1), 1)
+    return np.where(mean > 0, np.log(np.where(mean > 0, mean, 1.0)), 0.0)
+
+
+def _sees_half_turns(graph: KeyframeGraph) -> bool:
+    return bool(np.cos(graph.sector_angle) < 0)
+
+
+def _views_on(graph: KeyframeGraph, drive: Drive, way: Way, ground: np.ndarray, begins: int) -> np.ndarray:
+    """[2, KINDS] of `SequenceEvidence`, over keyframes from number `begins` on at the poses `ground`."""
+    start = ground[way.match - begins] + [0.0, 0.0, way.turn]
+    reach, turns = REACH * graph.cell, np.arange(1 + _sees_half_turns(graph)) * np.pi
+    motion, variance = drive.motion[way.low : way.high], drive.variance[way.low : way.high]
+    middle, lag = way.middle - way.low, way.low - begins
+    ahead = integrate(motion[middle + 1 :], start)
+    back = integrate(inverse(motion[middle:0:-1]), start)[::-1]
+    path = np.concatenate([back, start[None], ahead])
+    limits = (STRAY + MOST_REACH) * reach, MOST_REACH_HEADING * REACH_HEADING * 1.5
+    frame, other, turned = _pairs(path, ground, turns, *limits, lag, graph.guard)
+    fits = graph.log_odds(frame + way.low, other + begins, turned > 0) - drive.elsewhere[frame + way.low]
+    offsets = np.searchsorted(frame, np.arange(len(path) + 1))
+    near = Near(ground, turns, offsets, other, turned, fits)
+    bounds = reach, REACH_HEADING, graph.closure_variance(), EDGES
+    kinds = _follow(start, middle, motion, variance, near, bounds, lag, graph.guard)
+    within = np.zeros(len(path), bool)
+    within[way.first - way.low : way.last + 1 - way.low] = True
+    return np.stack([np.bincount(kinds[part & (kinds >= 0)], minlength=KINDS) for part in (within, ~within)])
+
+
+def _foretold(graph: KeyframeGraph, drive: Drive, way: Way) -> float:
+    """R of a claim."""
+    config, (j, i, turn) = graph.config, way[:3]
+    x, y, heading = drive.reckoned[: j + 1].T.copy()
+    variance = np.ascontiguousarray(drive.variance[i + 1 : j + 1, 1:])
+    gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
+    apart = np.empty(max(j - graph.guard, 1))
+    return float(np.clip(log_ratio(x, y, heading, variance, i, j, -turn, gate, apart), LEAST, MOST))
+
+
+@compiled
+def _turned(angle: float) -> float:
+    return angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
+
+
+@compiled
+def _pairs(
+    path: np.ndarray, ground: np.ndarray, turns: np.ndarray, reach: float, turn: float, lag: int, guard: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which keyframes [n] of a path are within reach of which [n] of the ground, seen at which turn [n]; in
+    the order of the path. Keyframes of nearly the same time are left out.
+
+    Args:
+        lag: number of the first keyframe of the path, counted from the first of the ground.
+    """
+    capacity, count = 256, 0
+    found = np.empty((3, capacity), np.int64)
+    close, around = np.empty(len(ground), np.int64), 0  # those in the box around a part of the path
+    close_x, close_y = np.empty(len(ground)), np.empty(len(ground))
+    apart = np.empty(len(ground))
+    for k in range(len(path)):
+        if k % BOX == 0:
+            left, right, below, above, around = np.inf, -np.inf, np.inf, -np.inf, 0
+            for at in range(k, min(k + BOX, len(path))):
+                left, right = min(left, path[at, 0] - reach), max(right, path[at, 0] + reach)
+                below, above = min(below, path[at, 1] - reach), max(above, path[at, 1] + reach)
+            for g in range(len(ground)):
+                x, y = ground[g, 0], ground[g, 1]
+                close[around], close_x[around], close_y[around] = g, x, y
+                around += int((x >= left) & (x <= right) & (y >= below) & (y <= above))
+        for near in range(around):
+            apart[near] = (close_x[near] - path[k, 0]) ** 2 + (close_y[near] - path[k, 1]) ** 2
+        for near in range(around):
+            g = close[near]
+            if apart[near] >= reach * reach or abs(g - k - lag) <= guard:
+                continue
+            for s in range(len(turns)):
+                if abs(_turned(ground[g, 2] + turns[s] - path[k, 2])) < turn:
+                    if count == capacity:
+                        more = np.empty((3, 2 * capacity), np.int64)
+                        more[:, :count] = found
+                        found, capacity = more, 2 * capacity
+                    found[0, count], found[1, count], found[2, count] = k, g, s
+                    count += 1
+    return found[0, :count].copy(), found[1, :count].copy(), found[2, :count].copy()
+
+
+class Near(NamedTuple):
+    """The keyframes [n] that are compared with those [W] of a way.
+
+    Attributes:
+        ground: [G, 3] poses. turns: [S] rad, by which they may be seen turned. offsets: [W + 1] of the rows
+            of `other`, `turned` and `fits` [n] that belong to each keyframe of the way: the one compared
+            with, the number of its turn, and the gain there, nat.
+    """
+
+    ground: np.ndarray
+    turns: np.ndarray
+    offsets: np.ndarray
+    other: np.ndarray
+    turned: np.ndarray
+    fits: np.ndarray
+
+
+@compiled
+def _move(pose: np.ndarray, motion: np.ndarray, onwards: bool) -> None:
+    """Moves a pose [3] by a motion, or back by it."""
+    if not onwards:
+        pose[2] -= motion[2]
+    sign = 1.0 if onwards else -1.0
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    pose[0] += sign * (c * motion[0] - s * motion[1])
+    pose[1] += sign * (s * motion[0] + c * motion[1])
+    pose[2] = _turned(pose[2] + motion[2] if onwards else pose[2])
+
+
+@compiled
+def _is_apart(pose: np.ndarray, ground: np.ndarray, reach: float, frame: int, guard: int) -> bool:
+    """Whether no keyframe of the ground is within `reach`, m, but those of nearly the same time as number
+    `frame` of it."""
+    for g in range(len(ground)):
+        x, y = ground[g, 0] - pose[0], ground[g, 1] - pose[1]
+        if x * x + y * y < reach * reach and abs(g - frame) > guard:
+            return False
+    return True
+
+
+@compiled
+def _look(
+    pose: np.ndarray, near: Near, frame: int, reach: float, turn: float, on_way: tuple[float, float]
+) -> tuple[float, np.ndarray, bool]:
+    """Compares a keyframe of a way with those within `reach` (m) and `turn` (rad).
+
+    Returns:
+        the best gain, -inf without any; [3] how far the pose is from there, the mean weighted by the
+        likelihoods; whether a keyframe is within `on_way`, m and rad.
+    """
+    best, weight, off, met = -np.inf, 0.0, np.zeros(3), False
+    for k in range(near.offsets[frame], near.offsets[frame + 1]):
+        g = near.other[k]
+        x, y = near.ground[g, 0] - pose[0], near.ground[g, 1] - pose[1]
+        angle = _turned(near.ground[g, 2] + near.turns[near.turned[k]] - pose[2])
+        if x * x + y * y >= reach * reach or abs(angle) >= turn:
+            continue
+        if x * x + y * y < on_way[0] * on_way[0] and abs(angle) < on_way[1]:
+            met = True
+        fit = near.fits[k]
+        if fit > best:
+            scale = np.exp(best - fit) if weight > 0 else 0.0
+            weight, off, best = weight * scale, off * scale, fit
+        share = np.exp(fit - best)
+        weight += share
+        off += share * np.array([x, y, angle])
+    return best, off / weight if weight > 0 else off, met
+
+
+@compiled
+def _follow(
+    start: np.ndarray, middle: int, motion: np.ndarray, variance: np.ndarray, near: Near,
+    bounds: tuple[float, float, np.ndarray, np.ndarray], lag: int, guard: int,
+) -> np.ndarray:  # fmt: skip
+    """[W] kind of each view on the way, -1 for none; it is followed from its keyframe `middle`.
+
+    Args:
+        motion, variance: [W, 3] of the odometry into each keyframe of the way. bounds: reach, m and rad;
+            variance [3] of a closure; `EDGES`. lag: number of the first keyframe of the way, counted from
+            the first of the ground.
+    """
+    kinds = np.full(len(motion), -1)
+    reach, reach_heading, spread, edges = bounds
+    for onwards in (True, False):
+        pose, place, heading = start.copy(), spread[0], spread[2]
+        frame = middle if onwards else middle - 1
+        while 0 <= frame < len(motion):
+            if frame != middle:
+                row = frame if onwards else frame + 1
+                _move(pose, motion[row], onwards)
+                place += variance[row, 0] + heading * (motion[row, 0] ** 2 + motion[row, 1] ** 2)
+                heading += variance[row, 2]
+            far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
+            turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
+            best, off, on_way = _look(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
+            seen = pose.copy()
+            if best > 0:
+                share, again = place / (place + spread[0]), heading / (heading + spread[2])
+                pose[0] += share * off[0]
+                pose[1] += share * off[1]
+                pose[2] = _turned(pose[2] + again * off[2])
+                place, heading = place * (1 - share), heading * (1 - again)
+            if on_way:
+                kinds[frame] = np.searchsorted(edges, best)
+            elif _is_apart(seen, near.ground, reach, frame + lag, guard):
+                kinds[frame] = len(edges) + 2
+            elif best < edges[0] and best > -np.inf:
+                kinds[frame] = 0
+            elif best < 0:
+                kinds[frame] = len(edges) + 1
+            frame += 1 if onwards else -1
+    return kinds

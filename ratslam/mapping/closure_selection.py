@@ -1,0 +1,247 @@
+"""Selection among all closure sequences, by the cost of the map with each of them accepted or refused.
+
+Refusing a sequence costs its evidence, accepting it costs the strain on the map. So the robust cost of a
+sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total cost
+are selected. The cost has many local minima, so it is minimised from several starts. For a robot that may be
+carried, the odometry is cut where that saves more than the cost of a cut. The rules are ours; robust weights
+by Geman & McClure 1985, several starts after Latif et al. 2013."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.mapping.optimizer import LoopClosures, MapFit, MapProblem, System
+from tactile.base.se2 import between, compose, integrate, inverse
+
+ACCEPTED_WEIGHT = 0.25
+"""Robust weight above which a sequence is accepted: its strain is then less than its evidence."""
+STEPS = 12
+"""Solver iterations from each start."""
+FINE = 1e-3
+"""Largest change per solver iteration at convergence, m and rad."""
+CUT = 30.0
+"""Cost of a cut of the odometry, chi-square; robots are seldom carried away."""
+AGREEMENT = 3.0
+"""Squared deviation up to which a sequence agrees with the odometry."""
+MIN_STRAIN = 16.0
+"""Least squared deviation at which a cut is tried."""
+TRIALS = 5
+"""Number of sequences at which a cut is tried before the best is taken."""
+COST_TOLERANCE = 0.5
+"""Difference in cost, chi-square, below which two cuts count as equally good."""
+LOOSE = 1e4
+"""Standard deviation of the odometry at a cut, m and rad."""
+
+
+ViewsCost = Callable[[np.ndarray], float]
+"""What the views say against poses [N, 3] of the keyframes, chi-square."""
+
+
+class SelectionProblem(NamedTuple):
+    """The sequences to select from, and the odometry.
+
+    Attributes:
+        measurements: with the closures of all R sequences. evidence: [R] log-likelihood ratios. first, last:
+            [R] first and last keyframe of each sequence. views_cost: what the views say against poses [N, 3],
+            chi-square. place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
+    """
+
+    measurements: MapProblem
+    evidence: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    views_cost: ViewsCost
+    place: Callable[[np.ndarray], np.ndarray] = np.copy
+
+
+class Selection(NamedTuple):
+    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of the
+    odometry: (keyframe after the cut, sequence that shows it)."""
+
+    fit: MapFit
+    cost: float
+    cuts: tuple[tuple[int, int], ...]
+
+
+FindCut = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
+"""Finds the keyframe before which the odometry is cut. Arguments: all poses [N, 3]; poses [n, 3] by odometry
+of the keyframes that follow a keyframe; the motion [3] that moves the last of them to where it was
+recognised; the number of that keyframe."""
+
+
+def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selection:
+    """The selection with the least cost, without cuts.
+
+    Args:
+        starts: maps to start from; the first is the current map.
+    """
+    system = System(case.measurements)
+    return min((_optimise(case, system, start, ()) for start in starts), key=_cost)
+
+
+def select_closures_and_cuts(
+    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
+) -> Selection:
+    """The selection with the least cost for a robot that may be carried: with cuts of the odometry.
+
+    Args:
+        starts: see `select_closures`. find: see `FindCut`. earlier: cuts (keyframe, sequence) of the current
+            map.
+    """
+    best = select_closures(case, starts)
+    if earlier:
+        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=_cost)
+    return _with_cuts(case, best, find)
+
+
+def _cost(selection: Selection) -> float:
+    return selection.cost
+
+
+def _with_cuts(case: SelectionProblem, best: Selection, find: FindCut) -> Selection:
+    """Cuts the odometry where it is strained or contradicted most, while that lowers the cost."""
+    while True:
+        strain = _strain(case, best)
+        strained = [
+            sequence for sequence in np.argsort(-strain)[:TRIALS].tolist() if strain[sequence] >= MIN_STRAIN
+        ]
+        found = [selection for sequence in strained for selection in _cut(case, best, sequence, find)]
+        cut = _nearest(case, best, found) if found else best
+        if cut.cost >= best.cost:
+            return best
+        best = cut
+
+
+def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) -> Selection:
+    """The cheapest selection; of equally good ones the one whose cut is shown by the earliest sequence. A cut
+    costs the same anywhere between two sequences, and views find it better where less odometry lies
+    between."""
+    least = min(selection.cost for selection in found)
+    alike = [selection for selection in found if selection.cost <= least + COST_TOLERANCE]
+    return min(alike, key=lambda selection: case.first[selection.cuts[len(best.cuts)][1]])
+
+
+def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
+    """[R] squared deviation between the start of each sequence and the odometry since the last accepted
+    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
+    chain, closures, *_ = cut_odometry(case.measurements, best.cuts)
+    strain = np.zeros(len(case.evidence))
+    for sequence in range(len(strain)):
+        since, first = _since(case, best, sequence), int(case.first[sequence])
+        if first <= since:
+            continue
+        motion = best.fit.corrected(chain)[since:first]
+        before, claimed = _claim(best, closures, since), _claim(best, closures, first, sequence)
+        onwards = integrate(motion, before)
+        error = between(onwards[-1], claimed)
+        variance = chain.variance[since:first]
+        lever = ((onwards[:, :2] - onwards[-1, :2]) ** 2).sum(axis=1) / 2
+        allowed = variance.sum(axis=0) + 2 * closures.variance
+        allowed[:2] += (variance[:, 2] * lever).sum()
+        strain[sequence] = (error**2 / allowed).sum()
+    contradicts = (best.fit.weights <= ACCEPTED_WEIGHT) & (strain > AGREEMENT)
+    return np.where(contradicts, np.maximum(strain, case.evidence), strain)
+
+
+def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | None = None) -> np.ndarray:
+    """[3] pose of a keyframe by its closures alone; without any, its pose in the map."""
+    among = closures.j == frame
+    among &= (
+        (closures.sequence == sequence)
+        if sequence is not None
+        else (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
+    )
+    if not among.any():
+        return best.fit.poses[frame]
+    member = int(np.flatnonzero(among)[0])
+    return compose(best.fit.poses[closures.i[member]], np.array([0.0, 0.0, closures.turn[member]]))
+
+
+def _since(case: SelectionProblem, best: Selection, sequence: int) -> int:
+    """The last keyframe before a sequence that an accepted sequence joins to the map."""
+    earlier = (best.fit.weights > ACCEPTED_WEIGHT) & (case.last < case.first[sequence])
+    return int(case.last[earlier].max(initial=0))
+
+
+def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) -> list[Selection]:
+    """The map with a cut between a sequence and the accepted one before it; and the same with a second cut
+    after the sequence, so that later accepted sequences stay in place: a robot carried twice."""
+    poses = best.fit.poses
+    since, first = _since(case, best, sequence), int(case.first[sequence])
+    if first <= since:
+        return []
+    claimed = _claim(best, case.measurements.closures, first, sequence)
+    frame, moved = _carry(case, best, since, first, claimed, poses, find)
+    cuts = (*best.cuts, (frame, sequence))
+    found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
+    accepted = best.fit.weights > ACCEPTED_WEIGHT
+    later = np.flatnonzero(accepted & (case.first > case.last[sequence]))
+    if accepted[sequence] or not len(later):
+        return found
+    following = int(later[np.argmin(case.first[later])])
+    end, back = int(case.last[sequence]), int(case.first[following])
+    again, twice = _carry(case, best, end, back, poses[back], moved, find)
+    twice[back:] = poses[back:]
+    return [*found, optimise_with_cuts(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
+
+
+def _carry(
+    case: SelectionProblem,
+    best: Selection,
+    since: int,
+    first: int,
+    claimed: np.ndarray,
+    poses: np.ndarray,
+    find: FindCut,
+) -> tuple[int, np.ndarray]:
+    """The keyframe between `since` and `first` before which to cut so that `first` comes to the pose
+    `claimed`, and the resulting poses."""
+    chain = case.measurements.chain
+    motion = best.fit.corrected(chain)[since:first]
+    onwards = integrate(motion, poses[since])  # of frames since + 1 ... first
+    carried = compose(claimed, inverse(onwards[-1]))
+    frame = find(poses, onwards, carried, since)
+    moved = poses.copy()
+    moved[since + 1 : first + 1] = onwards
+    moved[first + 1 :] = compose(compose(onwards[-1], inverse(poses[first])), poses[first + 1 :])
+    moved[frame:] = compose(carried, moved[frame:])
+    return frame, moved
+
+
+def cut_odometry(problem: MapProblem, cuts: tuple[tuple[int, int], ...]) -> MapProblem:
+    """The problem with loose odometry at the cuts (keyframe, sequence)."""
+    if not cuts:
+        return problem
+    variance = problem.chain.variance.copy()
+    variance[[frame - 1 for frame, _ in cuts]] = LOOSE**2
+    return problem._replace(chain=problem.chain._replace(variance=variance))
+
+
+def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
+    """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
+    return _optimise(case, System(cut_odometry(case.measurements, cuts)), start, cuts)
+
+
+def _optimise(
+    case: SelectionProblem, system: System, start: MapFit, cuts: tuple[tuple[int, int], ...]
+) -> Selection:
+    fit = system.solve(start, STEPS, FINE)
+    cost = system.robust_cost(fit) + case.views_cost(fit.poses)
+    return Selection(fit, cost + CUT * len(cuts), cuts)
+
+
+def choose_sequences(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
+    """The closures of the sequences marked in [R] bool."""
+    rows = sequences[closures.sequence]
+    number = np.cumsum(sequences) - 1
+    return closures._replace(
+        i=closures.i[rows],
+        j=closures.j[rows],
+        turn=closures.turn[rows],
+        sequence=number[closures.sequence[rows]],
+        scale=closures.scale[sequences],
+        cost_limit=np.broadcast_to(closures.cost_limit, closures.scale.shape)[sequences],
+    )

@@ -1,0 +1,452 @@
+"""The keyframes' poses and odometry, and the least-squares problem that joins them to the loop closures.
+
+Places of the pieces of a map that nothing joins: their poses are arbitrary, so they lie far apart.
+
+A keyframe may begin a piece: no odometry leads to it. Until closures join it, a piece lies in the frame of
+its first keyframe, which is `APART` cells from that of the piece before: nothing mistakes it for a part of
+the map. Once accepted closures join it, it is moved to where they claim.
+"""
+
+from __future__ import annotations
+
+from copy import copy, deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.appearance import Appearance
+from ratslam.mapping.calibration import learn_heading_noise, starting_calibration, starting_noise
+from ratslam.mapping.config import Ablation, KeyframeMapConfig
+from ratslam.mapping.edges import Edges
+from ratslam.mapping.loop_closures import ClosureLog
+from ratslam.mapping.optimizer import (
+    NO_LINKS,
+    CalibrationPrior,
+    LoopClosures,
+    MapCovariance,
+    MapFit,
+    MapProblem,
+    OdometryChain,
+    solve,
+)
+from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion, integrate, inverse
+
+LOOSE = 1e4
+"""Standard deviation of odometry across a break, cells and rad."""
+INTERRUPTED = int(np.iinfo(np.int64).max)
+"""Value of `cut` where keyframes before were taken out of the map: no sequence shows the break."""
+NO_ROBUST_SCALE = 1e12
+"""Robust scale at which no closure sequence loses weight."""
+
+
+class KeyframeGraph(Checkpointed):
+    """Keyframes as a chain of odometry with breaks, and the heading bias of the odometry.
+
+    Args:
+        cell: size of a pose cell, m. appearance: of the keyframes. guard: number of newest keyframes, which
+            are never recalled.
+
+    Attributes:
+        pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
+            travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
+            that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`. begins: [N]
+            a piece of the map begins with the keyframe, to which no odometry leads (`begin_piece`).
+            seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
+            in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
+            odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
+        start: the prior before any view.
+        heading_noise: factor on the variance of its turns. reckoned: [3] the newest keyframe by odometry
+            with the calibration of the start.
+    """
+
+    VALUES = ("bias", "turn_error", "prior", "heading_noise", "reckoned", "links")
+
+    def __init__(
+        self, config: KeyframeMapConfig, cell: float, appearance: Appearance, guard: int, ablation: Ablation
+    ) -> None:
+        self.config, self.cell, self.guard, self.ablation = config, cell, guard, ablation
+        self.appearance = appearance
+        self.pose = GrowableArray((3,), np.float64)
+        self.motion = GrowableArray((3,), np.float64)
+        self.length = GrowableArray((), np.float64)
+        self.turn = GrowableArray((), np.float64)
+        self.cut = GrowableArray((), np.int64)
+        self.begins = GrowableArray((), np.bool_)
+        self.seam = GrowableArray((), np.bool_)
+        self.taken = GrowableArray((), np.int64)
+        self.links = NO_LINKS
+        self.start = self.prior = starting_calibration(config, cell)
+        self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
+        self.heading_noise = starting_noise(config)
+        self.reckoned = np.zeros(3)
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes."""
+        return len(self.pose.rows)
+
+    @property
+    def ever(self) -> int:
+        """Number of keyframes ever taken; the newest one is never merged."""
+        return int(self.taken.rows[-1]) + 1 if self.count else 0
+
+    @property
+    def sector_angle(self) -> float:
+        """Turn per sector shift of a view, rad; 0 while unknown."""
+        return self.appearance.metric().angle
+
+    def copy(self) -> KeyframeGraph:
+        """A copy of the present state, which may change independently."""
+        other = copy(self)
+        for name, array in self._growable_arrays().items():
+            setattr(other, name, deepcopy(array))
+        other.appearance = self.appearance.present()
+        return other
+
+    def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
+        """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
+        self.reckoned = self.reckoned_after(motion, length) if self.count else np.array(pose, float)
+        self._append(pose, motion, length, turn, begins=False)
+
+    def begin_piece(self) -> None:
+        """Adds a keyframe to which no odometry leads, as the start of a new piece (`piece_placement`); an
+        empty graph gets its first keyframe."""
+        self.reckoned = self.next_start()
+        motion = between(self.pose.rows[-1], self.reckoned) if self.count else np.zeros(3)
+        self._append(self.reckoned, motion, 0.0, 0.0, begins=self.count > 0)
+
+    def append_newest(self, other: KeyframeGraph) -> None:
+        """Adds the newest keyframe of another graph."""
+        pose, motion, length, turn, begins = (
+            array.rows[-1] for array in (other.pose, other.motion, other.length, other.turn, other.begins)
+        )
+        self.reckoned = other.reckoned
+        self._append(pose, motion, length, turn, begins=bool(begins))
+
+    def next_start(self) -> np.ndarray:
+        """[3] the pose of the next keyframe if it begins a piece."""
+        return piece_start(int(self.begins.rows.sum()) + min(self.count, 1), self.cell)
+
+    def _append(
+        self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float, *, begins: bool
+    ) -> None:
+        self.taken.append(self.ever)
+        self.pose.append(pose)
+        self.motion.append(motion)
+        self.length.append(length)
+        self.turn.append(turn)
+        self.cut.append(-1)
+        self.begins.append(begins)
+        self.seam.append(False)
+
+    def replace(self, other: KeyframeGraph, poses: np.ndarray, cut: np.ndarray) -> None:
+        """Takes over all keyframes of a graph without links, with other poses [N, 3] and breaks [N]."""
+        for name, array in self._growable_arrays().items():
+            array.replace(getattr(other, name).rows)
+        self.pose.replace(poses)
+        self.cut.replace(cut)
+        self.links = NO_LINKS
+
+    def take(self, rows: np.ndarray) -> None:
+        """Reduces all arrays to the keyframes `rows` [n]; links are not touched."""
+        for array in self._growable_arrays().values():
+            array.replace(array.rows[rows])
+
+    def pose_after(self, motion: np.ndarray, length: float) -> np.ndarray:
+        """[3] the pose after a motion [3] over a distance since the newest keyframe."""
+        origin = self.pose.rows[-1] if self.count else np.zeros(3)
+        return compose(origin, self.correct(motion, length))
+
+    def reckoned_after(self, motion: np.ndarray, length: float) -> np.ndarray:
+        """The same by odometry with the calibration of the start."""
+        return compose(self.reckoned, self.calibrated(motion, length))
+
+    def calibrated(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
+        """Motions [..., 3] over distances [...] with the calibration of the start; to the bit the same
+        without one."""
+        bias, turn_error = self.start.bias, self.start.turn_error
+        return correct_heading(motion, length, bias, turn_error) if bias or turn_error else motion
+
+    def correct(self, motion: np.ndarray, length: np.ndarray | float) -> np.ndarray:
+        """Motions [..., 3] over distances [...] without the systematic errors of the odometry."""
+        return correct_heading(motion, length, self.bias, self.turn_error)
+
+    def dead_reckoned(self, bias: float = 0.0, turn_error: float = 0.0) -> np.ndarray:
+        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's; each
+        piece from its own start."""
+        first = self.pose.rows[:1]
+        if not len(first):
+            return first
+        motion = correct_heading(self.motion.rows[1:], self.length.rows[1:], bias, turn_error)
+        poses = np.concatenate([first, integrate(motion, first[0])])
+        return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell).place(poses)
+
+    def dead_reckon(self) -> None:
+        """Replaces all poses by odometry with the current calibration."""
+        self.pose.rows[:] = self.dead_reckoned(self.bias, self.turn_error)
+
+    def move_to(self, fit: MapFit, log: ClosureLog) -> None:
+        """Takes over a fit, moved as a whole so that the keyframes move as little as possible; pieces that
+        nothing joins to the first one start where they started."""
+        before, first = self.pose.rows.copy(), slice(None)
+        if self.begins.rows.any():
+            first = self.pieces(log) == 0
+        poses = compose(fit_rigid_motion(fit.poses[first], before[first]), fit.poses)
+        self.pose.rows[:] = self.placement(log).place(poses)
+        self.bias, self.turn_error = fit.bias, fit.turn_error
+
+    def pieces(self, log: ClosureLog) -> np.ndarray:
+        """[N] the piece of each keyframe: pieces are joined by accepted closures; a cut separates none."""
+        placement = self.placement(log)
+        return number_pieces(self.begins.rows, np.column_stack([placement.j, placement.i]))
+
+    def placement(self, log: ClosureLog) -> PiecePlacement:
+        """What joins the pieces: the closures accepted in a log, and odometry links."""
+        if not self.begins.rows.any():
+            return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell)
+        table = log.table()[log.accepted_middle_first()]
+        match, frame = table[:, 1].astype(int), table[:, 0].astype(int)
+        turn = np.concatenate([-table[:, 2] * self.sector_angle, np.full(len(self.links.i), np.nan)])
+        i, j = np.concatenate([match, self.links.i]), np.concatenate([frame, self.links.j])
+        return PiecePlacement(self.begins.rows.copy(), i, j, turn, self.cell)
+
+    def place_pieces(self, log: ClosureLog) -> None:
+        """Moves pieces as wholes to where the accepted closures claim them, see `PiecePlacement`."""
+        self.pose.rows[:] = self.placement(log).place(self.pose.rows)
+
+    def fit(self) -> MapFit:
+        """The current poses (not copied) and calibration."""
+        return MapFit(self.pose.rows, self.bias, np.zeros(0), self.turn_error)
+
+    def calibration_prior(self) -> CalibrationPrior:
+        """Prior of the calibration in the optimisation."""
+        return self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
+
+    def odometry(self, cut: GrowableArray) -> OdometryChain:
+        """The odometry between keyframes with its variances, loose at the breaks `cut` and between pieces."""
+        return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
+
+    def variances(self, cut: GrowableArray) -> np.ndarray:
+        """[N, 3] variances of the odometry into each keyframe, loose at the breaks `cut`, where a piece
+        begins, and at seams."""
+        variance = self.odometry_variance(self.length.rows, self.turn.rows)
+        loose = self.is_broken(cut) | self.seam.rows
+        return np.where(loose[:, None], self._loose_variance(), variance)
+
+    def is_broken(self, cut: GrowableArray) -> np.ndarray:
+        """[N] bool: no odometry leads to the keyframe, for a break of `cut` or because a piece begins."""
+        return (cut.rows >= 0) | self.begins.rows
+
+    def own_variances(self) -> np.ndarray:
+        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
+        return self.odometry_variance(self.length.rows, self.turn.rows) / [
+            1.0,
+            1.0,
+            self.heading_noise.factor,
+        ]
+
+    def heading_variance(self, length: np.ndarray | float, turn: np.ndarray | float) -> np.ndarray | float:
+        """Variance of heading by odometry over distances (m) and sums of absolute turns (rad), with the
+        learned noise, rad^2."""
+        noise = self.config.noise
+        driven = noise.heading_per_cell**2 * length / self.cell + noise.heading_per_radian**2 * turn
+        return driven * self.heading_noise.factor
+
+    def newest_variance(self) -> np.ndarray:
+        """[3] variance of the odometry into the newest keyframe."""
+        if self.begins.rows[-1]:
+            return self._loose_variance()
+        return np.array(self._odometry_variance(float(self.length.rows[-1]), float(self.turn.rows[-1])))
+
+    def closure_variance(self) -> np.ndarray:
+        """[3] variance of a closure, m^2, m^2, rad^2."""
+        spread = self.config.closure_sd * self.cell
+        return np.array([spread**2, spread**2, self.config.closure_heading**2])
+
+    def closures(self, log: ClosureLog) -> LoopClosures:
+        """The accepted loop closures with their variances and robust scales."""
+        config, variance = self.config, self.closure_variance()
+        scales = (config.robust_per_score, config.robust_least, config.robust_most)
+        closures = log.closures(self.sector_angle, variance, scales)
+        if config.select_every:
+            spare = (closures.score - config.sequence_cost) * closures.credit
+            worth = 2 * np.maximum(spare, 1.0) / closures.size
+            # A sequence must be able to cost more than its evidence, else it could never be refused.
+            return closures._replace(
+                scale=worth, cost_limit=np.maximum(config.closure_cost_limit, 1.5 * worth)
+            )
+        if not self.ablation.robust:
+            return closures._replace(scale=np.full_like(closures.scale, NO_ROBUST_SCALE))
+        return closures
+
+    def problem(self, log: ClosureLog, cut: GrowableArray) -> MapProblem:
+        """The least-squares problem of the keyframes with the odometry broken at `cut`."""
+        links = self.links._replace(variance=self.links.variance * [1.0, 1.0, self.heading_noise.factor])
+        return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior(), links)
+
+    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """See `Appearance.unlikeness`."""
+        taken = self.taken.rows
+        return self.appearance.unlikeness(taken[frame], taken[others], reversed)
+
+    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """See `Appearance.log_odds`."""
+        taken = self.taken.rows
+        return self.appearance.log_odds(taken[frame], taken[others], reversed)
+
+    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """See `Appearance.misfit`."""
+        return self.appearance.misfit(int(self.taken.rows[frame]), self.taken.rows[near], reversed)
+
+    def solve(self, log: ClosureLog, iterations: int) -> MapFit:
+        """The optimised map, from the current poses."""
+        return solve(self.fit(), self.problem(log, self.cut), iterations)
+
+    def optimise(self, log: ClosureLog) -> None:
+        """Solves for the poses and the bias, and stores the robust weights in the log."""
+        fit = self.solve(log, self.config.iterations)
+        log.weigh(fit.weights)
+        self.move_to(fit, log)
+
+    def calibration(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> CalibrationPrior:
+        """Means and standard deviations of the calibration of a solution."""
+        bias_sd, turn_error_sd = MapCovariance(fit, self.problem(log, cut)).calibration_sd()
+        return CalibrationPrior(fit.bias, bias_sd, fit.turn_error, turn_error_sd)
+
+    def learn_noise(self, fit: MapFit, log: ClosureLog) -> None:
+        """Updates the noise of the odometry from a fit that solves the problem of the accepted closures."""
+        start, problem = starting_noise(self.config), self.problem(log, self.cut)
+        self.heading_noise = learn_heading_noise(self.heading_noise, start, fit, problem)
+
+    def map_covariance(self, log: ClosureLog) -> MapCovariance:
+        """The covariance of the current map."""
+        return MapCovariance(self.fit(), self.problem(log, self.cut))
+
+    def newest_covariance(self, log: ClosureLog) -> np.ndarray:
+        """[3, 3] covariance of the newest keyframe's pose in the frame of the first one of its piece (m, m,
+        rad)."""
+        if self.count < 2:
+            return np.zeros((3, 3))
+        piece = self.pieces(log)
+        first = int(np.flatnonzero(piece == piece[-1])[0])
+        return self.map_covariance(log).relative(first, self.count - 1, 0.0)
+
+    def edges(self, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> Edges:
+        """Edges of a solution: odometry, corrected by its bias in pieces with a closure, none where it is
+        broken, and closures with their robust weights."""
+        chain, closures, _, links = self.problem(log, cut)
+        broken, pairs = self.is_broken(cut), log.accepted_pairs()
+        steps, piece = np.flatnonzero(~broken[1:]), number_pieces(broken, pairs)
+        closed = np.isin(piece[1:], piece[pairs[:, 0]])[:, None]
+        moved = np.where(closed, fit.corrected(chain), self.calibrated(chain.motion, chain.length))
+        zero = np.zeros(len(closures.i))
+        turned = np.stack([zero, zero, closures.turn], axis=1)
+        trust = log.weights()[:, None] / closures.variance
+        return Edges(
+            np.concatenate([steps, links.i, closures.i]),
+            np.concatenate([steps + 1, links.j, closures.j]),
+            np.concatenate([moved[steps], fit.corrected_links(links), turned]),
+            np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]),
+        )
+
+    def _loose_variance(self) -> np.ndarray:
+        return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
+
+    def odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """[n, 3] variances of odometry over these distances [n], m, and sums of absolute turns [n], rad."""
+        return np.stack(self._odometry_variance(length, turn), axis=1)
+
+    def _odometry_variance(self, length: Any, turn: Any) -> tuple[Any, Any, Any]:
+        noise, cell = self.config.noise, self.cell
+        along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
+        least = noise.least_heading**2 * self.heading_noise.factor
+        return along, along, self.heading_variance(length, turn) + least
+
+
+APART = 1000.0
+"""Distance between the first keyframes of pieces that nothing joins, cells."""
+
+
+NOTHING_JOINED = np.zeros(0, int), np.zeros(0, int), np.zeros(0)
+"""No closures: `i`, `j` and `turn` of a `PiecePlacement`."""
+
+
+def piece_start(number: int, cell: float) -> np.ndarray:
+    """[3] pose of the first keyframe of the piece that begins as the `number`-th, 0 for the first one."""
+    return np.array([APART * cell * number, 0.0, 0.0])
+
+
+class PiecePlacement(NamedTuple):
+    """What joins the pieces of N keyframes.
+
+    Attributes:
+        begins: [N] bool, a piece begins with the keyframe. i, j: [M] keyframes of accepted closures, of each
+            sequence the middle one first, and of odometry links. turn: [M] see `LoopClosures`; NaN for a
+            link. cell: m.
+    """
+
+    begins: np.ndarray
+    i: np.ndarray
+    j: np.ndarray
+    turn: np.ndarray
+    cell: float
+
+    def place(self, poses: np.ndarray) -> np.ndarray:
+        """[N, 3] the poses with pieces moved as wholes: joined ones that lie apart to where their closures
+        claim, and each that is not joined to the first one to its own start. The first piece stays."""
+        starts = np.flatnonzero(self.begins)
+        if not len(starts):
+            return poses
+        poses, stretch = poses.copy(), np.cumsum(self.begins)
+        group = self._gather(poses, stretch)
+        for number in np.unique(group)[1:].tolist():
+            start, frames = starts[number - 1], group[stretch] == number
+            moved = compose(piece_start(number, self.cell), inverse(poses[start]))
+            poses[frames] = compose(moved, poses[frames])
+        return poses
+
+    def _gather(self, poses: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+        """Moves joined stretches together, in place; returns the first stretch that each is joined to."""
+        group = np.arange(int(stretch[-1]) + 1)
+        far = np.hypot(*(poses[self.i] - poses[self.j])[:, :2].T) > APART / 2 * self.cell
+        for m in np.argsort(far, kind="stable").tolist():
+            i, j = int(self.i[m]), int(self.j[m])
+            low, high = sorted((int(group[stretch[i]]), int(group[stretch[j]])))
+            if low == high:
+                continue
+            if far[m] and np.isfinite(self.turn[m]):
+                frames = group[stretch] == high
+                poses[frames] = compose(self._motion(poses, m, bool(frames[j])), poses[frames])
+            group[group == high] = low
+        return group
+
+    def _motion(self, poses: np.ndarray, m: int, of_later: bool) -> np.ndarray:
+        """[3] the motion that brings the keyframe j of a closure to where i claims it, or i to j."""
+        i, j = int(self.i[m]), int(self.j[m])
+        turn = np.array([0.0, 0.0, self.turn[m]])
+        if of_later:
+            return compose(compose(poses[i], turn), inverse(poses[j]))
+        return compose(compose(poses[j], -turn), inverse(poses[i]))
+
+
+def number_pieces(broken: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    """[N] the piece of each keyframe, numbered from 0 in the order of their first keyframes.
+
+    Args:
+        broken: [N] bool, no odometry leads to the keyframe: it is cut before it, or a piece begins there.
+            closures: [M, 2] keyframes joined by accepted closures.
+    """
+    if not len(broken):
+        return np.zeros(0, int)
+    stretch = np.cumsum(broken)
+    stretch = stretch - stretch[0]  # a stretch is a run of keyframes without a break
+    later, earlier = stretch[closures].T
+    count = int(stretch[-1]) + 1
+    joined = coo_array((np.ones(len(closures), bool), (later, earlier)), shape=(count, count))
+    _, piece = connected_components(joined, directed=False)
+    _, first, number = np.unique(piece[stretch], return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number]

@@ -1,0 +1,270 @@
+"""The final map: the optimised poses, the closure sequences selected, and the odometry breaks.
+
+A second selection of closures where the odometry seems noisier than it was taken to be.
+
+A false sequence that is accepted early bends the map, the bent map raises the noise that is learned, and with
+more noise further false sequences fit: two halves of a maze that look alike become one. Among maps of one
+noise the bent one is then the cheapest. So the sequences are selected once more from dead reckoning with the
+noise at the start, and the more probable map is kept, each with the noise learned from it.
+
+Odometry that is honestly noisy is explained with little noise if only the closures are refused. So a refused
+sequence costs its whole evidence here, beside its bounded cost in the selection: in doubt the map stays that
+explains more of what was recognised. The rule is ours; the evidence is that of MacKay 1992, see
+`odometry_noise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from enum import StrEnum
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.calibration import HeadingNoise, learn_heading_noise, log_posterior, starting_noise
+from ratslam.mapping.claimed_revisits import claims_cost
+from ratslam.mapping.closure_judge import judge_anew
+from ratslam.mapping.closure_selection import (
+    ACCEPTED_WEIGHT,
+    FINE,
+    STEPS,
+    Selection,
+    SelectionProblem,
+    select_closures,
+    select_closures_and_cuts,
+)
+from ratslam.mapping.keyframe_graph import KeyframeGraph, number_pieces
+from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.map_hypotheses import MapHypotheses
+from ratslam.mapping.odometry_breaks import find_break
+from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
+from ratslam.mapping.piece_joining import spans_pieces
+from tactile.base.se2 import compose, inverse
+
+Place = Callable[[np.ndarray], np.ndarray]
+"""Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
+
+
+class Obstacle(StrEnum):
+    """Why a closure sequence cannot be undone, as a clause."""
+
+    NOT_ACCEPTED = "is not an accepted closure sequence of this map"
+    MERGED = "has keyframes that are merged with those that it joins them to"
+    ONLY_LINK = "is the only link across a break of the odometry"
+
+
+class MapSolution(NamedTuple):
+    """Optimised poses and bias, the closure log with its verdicts, and the odometry breaks ([N]
+    sequences)."""
+
+    fit: MapFit
+    log: ClosureLog
+    cut: GrowableArray
+
+    def placed(self, graph: KeyframeGraph) -> MapSolution:
+        """The map with the pieces of `graph` where they belong, see `PiecePlacement`; the fit may have moved
+        them."""
+        poses = graph.placement(self.log).place(self.fit.poses)
+        return self._replace(fit=self.fit._replace(poses=poses))
+
+    def without_closures(self, graph: KeyframeGraph) -> MapSolution:
+        """Odometry as it was read, without cuts; all accepted sequences are open."""
+        log, cut = self.log.copy(), deepcopy(self.cut)
+        for sequence in np.flatnonzero(log.verdicts() == Verdict.ACCEPTED).tolist():
+            log.judge(sequence, Verdict.OPEN)
+        cut.rows[:] = -1
+        return MapSolution(MapFit(graph.dead_reckoned(), 0.0, np.zeros(0)), log, cut)
+
+    def pieces(self, graph: KeyframeGraph) -> np.ndarray:
+        """[N] the piece of each keyframe of a graph that is not merged."""
+        return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
+
+    def open_pieces(self, graph: KeyframeGraph) -> np.ndarray:
+        """[N] bool, keyframes of a piece without an accepted closure."""
+        piece = self.pieces(graph)
+        return ~np.isin(piece, piece[self.log.accepted_pairs()[:, 0]])
+
+    def by_odometry(self, graph: KeyframeGraph, odometry: np.ndarray) -> MapSolution:
+        """The map whose pieces without an accepted closure are their odometry, from where each begins: what
+        views alone show of its bias may be wrong. The one place for this rule.
+
+        Args:
+            odometry: [N, 3] of the keyframes; NaN where it is not known, which leaves a piece as it is.
+        """
+        fit, piece, open_ = self.fit, self.pieces(graph), self.open_pieces(graph)
+        poses = fit.poses.copy()
+        for number in np.unique(piece[open_]).tolist():
+            rows = np.flatnonzero(piece == number)
+            own = odometry[rows]
+            if rows[0]:
+                own = compose(compose(poses[rows[0]], inverse(own[0])), own)
+            poses[rows] = np.where(np.isfinite(own).all(), own, poses[rows])
+        fit = fit._replace(poses=poses)
+        if open_.all() and np.isfinite(odometry).all():
+            fit = fit._replace(bias=graph.start.bias, turn_error=graph.start.turn_error)
+        return self._replace(fit=fit)
+
+    def obstacle(self, sequence: int, log: ClosureLog) -> Obstacle | None:
+        """Why a sequence cannot be undone; None if it can.
+
+        Args:
+            log: the one from which this solution was selected.
+        """
+        if not 0 <= sequence < log.sequences or self.log.verdict(sequence) != Verdict.ACCEPTED:
+            return Obstacle.NOT_ACCEPTED
+        if log.has_merged(sequence):
+            return Obstacle.MERGED
+        return Obstacle.ONLY_LINK if np.any(self.cut.rows == sequence) else None
+
+
+def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+    """The map with the closures accepted so far, optimised; dead reckoning without any."""
+    if len(log.accepted_rows()):
+        return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
+    return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
+
+
+def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
+    """The map of least cost with the closures accepted so far, reached from the current poses and from dead
+    reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
+    problem = graph.problem(log, graph.cut)
+    place = graph.placement(log).place
+    starts = [graph.fit(), *(_dead_reckoned(graph, prior, place) for prior in priors)]
+    system = System(problem)
+    fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
+    log.weigh(fit.weights)
+    return MapSolution(fit, log, graph.cut)
+
+
+def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
+    """The map with the closure sequences that are best accepted together; None if none has the evidence of an
+    accepted one: weak sequences count only beside it, as images without information give a few of them."""
+    config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
+    candidates = sequences_to_select(graph, log)
+    if not (candidates & (log.scores() >= config.min_score)).any():
+        return None
+    place = graph.placement(log).place
+    sequences = np.flatnonzero(candidates)
+    judge_anew(graph, log, sequences)
+    broken = np.flatnonzero(np.isin(cut.rows, sequences))
+    earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
+    cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
+    case = selection_case(graph, log, cut, sequences, place)
+    return selected_map(graph, log, cut, sequences, _select(graph, case, sequences, earlier, hypotheses))
+
+
+def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+    """[R] bool, the sequences to select from."""
+    config = graph.config
+    enough = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
+    possible = (log.left() > 0) & (log.verdicts() != Verdict.UNDONE)
+    return enough & possible & ~spans_pieces(graph, log)
+
+
+def selection_case(
+    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, place: Place
+) -> SelectionProblem:
+    """The problem of a selection among sequences [R], which the log then holds for accepted, with the
+    odometry broken at `cut`."""
+    for sequence in np.flatnonzero((log.left() > 0) & (log.verdicts() != Verdict.UNDONE)).tolist():
+        log.judge(sequence, Verdict.OPEN)
+    for sequence in sequences.tolist():
+        log.judge(sequence, Verdict.ACCEPTED)
+    problem, (first, last) = graph.problem(log, cut), log.spans()[sequences].T
+    evidence = np.maximum(log.scores() * log.credit(), 1.0)[sequences]
+    return SelectionProblem(problem, evidence, first, last, partial(claims_cost, graph), place)
+
+
+def selected_map(
+    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, selection: Selection
+) -> MapSolution:
+    """The map of a selection among sequences [R]; log and cut take it over."""
+    for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
+        log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
+    for frame, sequence in selection.cuts:
+        cut.rows[frame] = sequences[sequence]
+    # Solved once more without the refused sequences, which removes their remaining pull.
+    fit = solve(selection.fit, graph.problem(log, cut), STEPS, FINE)
+    log.weigh(fit.weights)
+    return MapSolution(fit, log, cut)
+
+
+def _select(
+    graph: KeyframeGraph,
+    case: SelectionProblem,
+    sequences: np.ndarray,
+    earlier: tuple[tuple[int, int], ...],
+    hypotheses: MapHypotheses,
+) -> Selection:
+    """Selects among the sequences `sequences`, starting from the current map and from the hypotheses. The
+    odometry is cut only if the robot may be carried."""
+    present = graph.fit()._replace(poses=graph.pose.rows.copy())
+    starts = [present, *hypotheses.follow(case, sequences)]
+    if not graph.config.may_be_carried:
+        # A selection, or the one from dead reckoning where that is more probable with less noise.
+        found = select_closures(case, starts)
+        noise, start = graph.heading_noise, starting_noise(graph.config)
+        if not seems_noisy(noise, start):
+            return found
+        reckoned = _dead_reckoned(graph, case.measurements.prior, case.place)
+        return reconsidered(case, found, reckoned, noise, start)
+    return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
+
+
+def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior, place: Place) -> MapFit:
+    """Odometry corrected by the mean of a calibration, from the first keyframe, its pieces placed."""
+    poses = place(graph.dead_reckoned(prior.bias, prior.turn_error))
+    return MapFit(poses, prior.bias, np.zeros(0), prior.turn_error)
+
+
+NOISY = 2.0
+"""Standard deviations by which the learned noise has to exceed that of the start to be doubted."""
+ROUNDS = 4
+"""Largest number of times that a map and its noise are learned in turn."""
+SETTLED = 0.05
+"""Change of the log of the noise below which both are known."""
+
+
+class Settled(NamedTuple):
+    """A selection with the noise learned from it, and its log probability, up to a constant."""
+
+    selection: Selection
+    log_probability: float
+
+
+def seems_noisy(noise: HeadingNoise, start: HeadingNoise) -> bool:
+    """Whether the learned noise of the odometry is surely above that of the start."""
+    return noise.log_factor - start.log_factor > NOISY * noise.sd
+
+
+def reconsidered(
+    case: SelectionProblem, found: Selection, reckoned: MapFit, noise: HeadingNoise, start: HeadingNoise
+) -> Selection:
+    """The more probable of a selection and of that from dead reckoning.
+
+    Args:
+        case: with the learned noise. found: the selection with it, without cuts. reckoned: dead reckoning.
+            noise: the learned one. start: that of the first map.
+    """
+    factor = float(np.exp(start.log_factor - noise.log_factor))
+    afresh = case._replace(measurements=case.measurements.with_heading_noise(factor))
+    kept, other = _settle(case, found.fit, noise, start), _settle(afresh, reckoned, start, start)
+    return other.selection if other.log_probability > kept.log_probability else found
+
+
+def _settle(case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: HeadingNoise) -> Settled:
+    """The selection from a fit, with the noise that is learned from it."""
+    for _ in range(ROUNDS):
+        selection = select_closures(case, [fit])
+        fit, before = selection.fit, noise
+        noise = learn_heading_noise(before, start, fit, case.measurements)
+        step = noise.log_factor - before.log_factor
+        case = case._replace(measurements=case.measurements.with_heading_noise(float(np.exp(step))))
+        if abs(step) < SETTLED:
+            break
+    seen = log_posterior(noise.log_factor - start.log_factor, fit, System(case.measurements))
+    refused = case.evidence[fit.weights <= ACCEPTED_WEIGHT].sum()
+    return Settled(selection, seen - case.views_cost(fit.poses) / 2 - float(refused))

@@ -1,0 +1,116 @@
+"""Selection of closure sequences beside the session.
+
+A selection takes longer than a step. So a thread works on a copy of the map while the session goes on, and
+the result is taken up a fixed number of keyframes later, finished or not: the session then waits for it. Live
+and replay so take up the same result at the same keyframe."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+from functools import partial
+
+import numpy as np
+
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
+from ratslam.mapping.calibration import HeadingNoise
+from ratslam.mapping.closure_selection import FINE, STEPS
+from ratslam.mapping.delayed_job import DelayedJob
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import ClosureLog
+from ratslam.mapping.map_hypotheses import MapHypotheses
+from ratslam.mapping.map_solution import selected_solution
+from ratslam.mapping.optimizer import MapFit, solve
+from tactile.base.se2 import compose, inverse
+
+DELAY = 10
+"""Keyframes after which a selection is taken up, at most as many as lie between two selections."""
+THREAD = ThreadPoolExecutor(1, "closure selection")
+"""Of all maps of the process."""
+
+
+class SelectedMap(Checkpointed):
+    """The result of a selection among R sequences.
+
+    Attributes:
+        found: whether any sequence had enough evidence; without one only the hypotheses count.
+        before: [R] verdicts before the selection. log: with the verdicts after it. poses [N, 3], calibration
+            (rad/m, rad/rad), cut, noise: see `KeyframeGraph`.
+    """
+
+    VALUES = ("found", "before", "poses", "calibration", "noise")
+    PARTS = ("log", "hypotheses")
+
+    def __init__(self, log: ClosureLog, hypotheses: MapHypotheses) -> None:
+        self.log, self.hypotheses = log, hypotheses
+        self.found, self.before = False, log.verdicts().copy()
+        self.poses, self.calibration, self.noise = np.zeros((0, 3)), (0.0, 0.0), HeadingNoise()
+        self.cut = GrowableArray((), np.int64)
+
+    def select(self, graph: KeyframeGraph) -> SelectedMap:
+        """Selects, and learns the noise of the odometry from the result; changes `graph`."""
+        solution = selected_solution(graph, self.log, self.hypotheses)
+        if solution is not None:
+            fit, self.log, self.cut = solution
+            graph.cut = self.cut
+            graph.learn_noise(fit, self.log)
+            self.poses, self.calibration = fit.poses, (fit.bias, fit.turn_error)
+            self.noise, self.found = graph.heading_noise, True
+        return self
+
+    def take_up(self, graph: KeyframeGraph, log: ClosureLog) -> None:
+        """Moves the map to the selected one, continued by the poses since; verdicts given since then stay."""
+        self.judge(log)
+        size, (bias, turn_error) = len(self.poses), self.calibration
+        graph.cut.rows[:size] = self.cut.rows
+        graph.heading_noise = self.noise
+        moved = compose(self.poses[-1], inverse(graph.pose.rows[size - 1]))
+        poses = np.concatenate([self.poses, compose(moved, graph.pose.rows[size:])])
+        start = MapFit(graph.placement(log).place(poses), bias, np.zeros(0), turn_error)
+        fit = solve(start, graph.problem(log, graph.cut), STEPS, FINE)
+        log.weigh(fit.weights)
+        graph.move_to(fit, log)
+
+    def judge(self, log: ClosureLog) -> None:
+        """Takes over the verdicts on sequences whose verdict has not changed since the selection began."""
+        same = np.flatnonzero(log.verdicts()[: len(self.before)] == self.before)
+        log.take_verdicts(self.log, same)
+
+
+class SelectionWorker(Checkpointed):
+    """Selects every so many keyframes.
+
+    Args:
+        every: number of keyframes between two selections, 0: never.
+    """
+
+    PARTS = ("hypotheses", "job")
+
+    def __init__(self, every: int) -> None:
+        self._every = every
+        self.job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
+        self.hypotheses = MapHypotheses()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a selection is in progress."""
+        return self.job.busy
+
+    def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
+        """Begins a selection if it is due."""
+        if self._every and graph.ever % self._every == 0:
+            selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
+            due = graph.ever + min(DELAY, self._every)
+            self.job.begin(due, partial(selected.select, graph.copy()))
+
+    def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
+        """Takes up a selection if it is due; whether it changed the map."""
+        selected = self.job.take(graph.ever)
+        if selected is None:
+            return False
+        self.hypotheses = selected.hypotheses
+        if selected.found:
+            selected.take_up(graph, log)
+            log.count_selection()
+        return selected.found

@@ -1,0 +1,134 @@
+"""Tests of closure candidates: whether they continue a sequence, and whether a sequence fits the map."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import Candidate, ClosureLog
+from ratslam.mapping.optimizer import MapCovariance
+from tactile.base.se2 import between, compose, wrap
+
+
+class SequenceTest(NamedTuple):
+    """Result of a test of a closure sequence against the map.
+
+    Attributes:
+        fits: it is accepted. distance: squared Mahalanobis distance of its newest candidate. breaks_odometry:
+            it contradicts the map and is so long that the robot, if that is possible, was carried.
+    """
+
+    fits: bool
+    distance: float
+    breaks_odometry: bool
+
+
+class MapClaim(NamedTuple):
+    """How a map judges a claimed place.
+
+    Attributes:
+        log_ratio: log of the probability density that the map gives to the place, over its mean density at
+            all keyframes that could be recalled. distance: squared Mahalanobis distance from it.
+            position_sd, heading_sd: largest standard deviation of the map's own relative pose, m and rad.
+    """
+
+    log_ratio: float
+    distance: float
+    position_sd: float
+    heading_sd: float
+
+
+def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
+    """The pose [3] turned on the spot by `angle`, rad."""
+    return compose(pose, np.array([0.0, 0.0, angle]))
+
+
+def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+    """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
+    last, config = log.last(), graph.config
+    if last is None or candidate.keyframe - last.keyframe > config.max_gap:
+        return False
+    remembered, travelled = _motions(graph, last, candidate)
+    apart = np.hypot(*(remembered - travelled)[:2])
+    allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
+    near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
+    return near and _agrees_with_whole(graph, log, candidate)
+
+
+def verify_sequence(
+    graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate
+) -> SequenceTest | None:
+    """Tests a sequence whose newest member is `candidate`; None while its evidence is too small."""
+    config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
+    if length < config.min_length or score < config.min_score:
+        return None
+    distance = _distance(graph, log, candidate) if graph.ablation.verify else 0.0
+    fits = distance < config.max_distance and score - distance / 2 >= config.min_score
+    carried = config.may_be_carried and not config.select_every  # selection places its own cuts
+    broken = carried and length >= config.break_length and score >= config.break_score
+    return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
+
+
+def has_same_heading(graph: KeyframeGraph, candidate: Candidate) -> bool:
+    """Whether the headings of a closure agree by odometry: a robot that has turned is in another experience,
+    even if its view changes little with heading."""
+    pose, turn = graph.pose.rows, -candidate.shift * graph.sector_angle
+    turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
+    drift = abs(wrap(turned - turn))
+    return bool(np.cos(turn) > 0 and drift < graph.config.agreement_heading * graph.config.max_turn)
+
+
+def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray) -> MapClaim:
+    """How the map judges the place of a closure (keyframe, match, shift)."""
+    j, i, shift = (int(value) for value in member[:3])
+    config, poses, turn = graph.config, graph.pose.rows, -shift * graph.sector_angle
+    own = covariance.relative(i, j, turn)
+    gate = config.gate_sd * graph.cell
+    allowed = own + np.diag([gate**2, gate**2, config.gate_heading**2])
+    origin = turn_on_spot(poses[i], turn)
+    claims = between(origin, compose(poses[: max(j - graph.guard, i + 1)], np.array([0.0, 0.0, turn])))
+    error = claims - between(origin, poses[j])
+    error[:, 2] = wrap(error[:, 2])
+    distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)
+    among = np.log(max(np.exp(-distance / 2).sum(), 1.0))
+    return MapClaim(
+        float(np.log(len(error)) - distance[i] / 2 - among),
+        float(distance[i]),
+        float(np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max())),
+        float(np.sqrt(own[2, 2])),
+    )
+
+
+def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+    """[3] motion from one candidate to a later one: between the remembered poses, and in the map."""
+    pose, angle = graph.pose.rows, graph.sector_angle
+    remembered = between(
+        turn_on_spot(pose[first.match], -first.shift * angle),
+        turn_on_spot(pose[candidate.match], -candidate.shift * angle),
+    )
+    return remembered, between(pose[first.keyframe], pose[candidate.keyframe])
+
+
+def _agrees_with_whole(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+    """Whether the motion from the first member of the newest sequence agrees with odometry."""
+    config = graph.config
+    if not config.sequence_agreement:
+        return True
+    frame, match, shift, _ = log.members(log.sequences - 1)[0]
+    remembered, travelled = _motions(graph, Candidate(frame, match, shift, 0.0, 0.0), candidate)
+    allowed = config.agreement * graph.cell + config.sequence_agreement * np.hypot(*travelled[:2])
+    rotation = abs(wrap(remembered[2] - travelled[2]))
+    return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
+
+
+def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:
+    """Squared Mahalanobis distance of the candidate's claim from the map."""
+    turn = -candidate.shift * graph.sector_angle
+    pose = graph.pose.rows
+    error = between(turn_on_spot(pose[candidate.match], turn), pose[candidate.keyframe])
+    gate = graph.config.gate_sd * graph.cell
+    least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
+    allowed = graph.map_covariance(log).relative(candidate.match, candidate.keyframe, turn) + least
+    return float(error @ np.linalg.solve(allowed, error))

@@ -1,0 +1,201 @@
+"""Views compared with the keyframes of a finished map, which does not change."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ratslam.core.session import capacity_at
+from ratslam.mapping.gain_odds import PLAIN, GainOdds, Weighing
+from ratslam.mapping.ground import Ground, ground_of
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.network.pose_cells import Belief
+from ratslam.places.self_comparison import compare_with_itself
+from ratslam.places.view_comparison import Comparison
+from ratslam.recall import filter
+from ratslam.recall.config import sector_shifts
+from ratslam.recall.memory import MapFeedback, Memory, corrected_motion, first_keyframes, frozen_memory
+from ratslam.recall.observation_model import ObservationLikelihood
+from tactile.base.types import Array
+
+if TYPE_CHECKING:
+    from ratslam.methods.recall import RecallBackend, RecallState
+
+TOGETHER = 64
+"""Number of views compared in one compiled call."""
+
+
+class Look(NamedTuple):
+    """One view compared with a memory.
+
+    Attributes:
+        result: of recall. gain: [S, C] log-likelihood at each sector shift and keyframe less that at a new
+            place. shows: bool, whether the view can be compared.
+    """
+
+    result: filter.RecallResult
+    gain: Array
+    shows: Array
+
+
+class MapViews:
+    """The views of a finished map, compared with each other or with those of a session.
+
+    Args:
+        recall: the backend that made the map. graph: its keyframes.
+    """
+
+    def __init__(self, recall: RecallBackend, graph: KeyframeGraph) -> None:
+        self.recall, self.graph = recall, graph
+        # No keyframe of a finished map is too new to be recalled.
+        self.config = recall.recall.model_copy(update={"guard": 0})
+        self.shifts = sector_shifts(self.config)
+        self._compare = jax.jit(self._look_at_many)
+        self._gains = jax.jit(self._gains_of_many)
+
+    def remember(self, state: RecallState) -> RecallState:
+        """A state of the recall backend, with room for them, with all keyframes that are not merged; all of
+        its belief is novelty."""
+        graph = self.graph
+        frozen = self.freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
+        return self.recall.begin_piece(state)._replace(memory=frozen, health=state.health)
+
+    def freeze(self, frames: np.ndarray, poses: np.ndarray, capacity: int = 0) -> Memory:
+        """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3].
+
+        Args:
+            capacity: rows; 0: as many as it takes.
+        """
+        recall, graph = self.recall, self.graph
+        feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
+        views, labels = graph.appearance.stored(frames)
+        capacity = capacity or capacity_at(len(labels))
+        return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
+
+    def ground(self, poses: np.ndarray) -> Ground:
+        """Keyframes at `poses` [N, 3] as ground."""
+        graph = self.graph
+        return ground_of(
+            poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance(),
+            graph.appearance.NEAR_SHARE,
+        )  # fmt: skip
+
+    def odds(
+        self,
+        frames: np.ndarray,
+        poses: np.ndarray,
+        held: np.ndarray | None = None,
+        weighing: Weighing = PLAIN,
+    ) -> GainOdds:
+        """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
+        with each other.
+
+        Args:
+            held: [N] bool, those that a session is compared with, the others being merged with them; None:
+                all. weighing: of the gains.
+        """
+        held = np.ones(len(frames), bool) if held is None else held
+        whole, guard = self.freeze(frames[held], poses[held]), self.recall.recall.guard
+        views, labels = self.graph.appearance.stored(frames)
+
+        def gains(begin: int, count: int) -> np.ndarray:
+            earlier = first_keyframes(whole, int(held[: begin - guard].sum()))
+            view = jnp.asarray(views[begin : begin + count].T.astype(whole.view.dtype))
+            label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
+            return np.asarray(self._gains(earlier, view, label))
+
+        weighing = weighing._replace(prior=self.graph.appearance.gain_prior(weighing.prior))
+        return compare_with_itself(self.ground(poses), guard, gains, held, weighing)
+
+    def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
+        """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.
+
+        Args:
+            motion: [n, 3] into each of them, without systematic errors, m, m, rad.
+        """
+        views, labels = self.graph.appearance.stored(frames)
+        count, parts = int(memory.count), []
+        dtype, memory = memory.view.dtype, memory._replace(bias=jnp.zeros_like(memory.bias))
+        memory = memory._replace(turn_error=jnp.zeros_like(memory.turn_error))
+        belief = self.no_belief(memory)
+        for begin in range(0, len(frames), TOGETHER):
+            rows = slice(begin, begin + TOGETHER)
+            size = len(labels[rows])
+            filled = [
+                jnp.asarray(np.pad(values, [(0, TOGETHER - size)] + [(0, 0)] * (values.ndim - 1)))
+                for values in (
+                    views[rows].astype(dtype), labels[rows].astype(np.int32),
+                    motion[rows].astype(memory.x.dtype), np.ones(size, bool),
+                )
+            ]  # fmt: skip
+            (memory, belief), looks = self._compare(memory, belief, *filled)
+            parts.append(jax.tree.map(lambda values, size=size: np.asarray(values)[:size], looks))
+        match = np.concatenate([part.result.match for part in parts])
+        shift = np.concatenate([part.result.shift for part in parts])
+        return Comparison(
+            gain=np.concatenate([part.gain[:, :, :count] for part in parts]),
+            shows=np.concatenate([part.shows for part in parts]),
+            match=match,
+            shift=np.argmax(self.shifts == shift[:, None], axis=1),
+            posterior=np.concatenate([part.result.posterior for part in parts]),
+        )
+
+    def no_belief(self, memory: Memory) -> Belief:
+        """The pose cells of a robot that may be anywhere among the keyframes of a memory."""
+        return self.recall.no_belief(memory.label.shape[0])
+
+    def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
+        """Recalls one view in its stored form, and compares it with all keyframes."""
+        memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
+        motion = corrected_motion(memory)
+        belief, result = filter.recognise(
+            self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
+        )
+        zero = jnp.zeros_like(memory.length)
+        memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
+        shows = likelihood.certain & likelihood.informative
+        return memory, belief, Look(result, self._gain(memory, likelihood), shows)
+
+    def no_look(self, memory: Memory) -> Look:
+        """The result of a step without a comparison."""
+        gain = jnp.zeros((len(self.shifts), memory.label.shape[0]), jnp.float32)
+        return Look(filter.empty_result(memory), gain, jnp.bool_(False))
+
+    def _gain(self, memory: Memory, likelihood: ObservationLikelihood) -> Array:
+        tiny = jnp.finfo(likelihood.novelty.dtype).tiny
+        here, new = (jnp.maximum(values, tiny) for values in (likelihood.likelihood, likelihood.novelty))
+        gain = (jnp.log(here) - jnp.log(new)).astype(jnp.float32)
+        return jnp.broadcast_to(gain, (len(self.shifts), memory.label.shape[0]))
+
+    def _look_at_many(
+        self, memory: Memory, belief: Belief, views: Array, labels: Array, motions: Array, real: Array
+    ) -> tuple[tuple[Memory, Belief], Look]:
+        """Looks at views [n, D] in turn; those that are not `real` [n] are left out."""
+
+        def look(state: tuple[Memory, Belief], one: tuple[Array, ...]) -> tuple[tuple[Memory, Belief], Look]:
+            (memory, belief), (view, label, motion, real) = state, one
+            moved = memory._replace(
+                motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
+            )
+            memory, belief, found = lax.cond(
+                real,
+                lambda: self.look(moved, belief, view, label),
+                lambda: (memory, belief, self.no_look(memory)),
+            )
+            return (memory, belief), found
+
+        return lax.scan(look, (memory, belief), (views, labels, motions, real))
+
+    def _gains_of_many(self, memory: Memory, views: Array, labels: Array) -> Array:
+        """[n, S, C] gains of stored views [D, n]; NaN of those that cannot be compared."""
+
+        def look(memory: Memory, one: tuple[Array, Array]) -> tuple[Memory, Array]:
+            memory, likelihood = self.recall.likelihood(self.config, memory, *one)
+            shows = likelihood.certain & likelihood.informative
+            return memory, jnp.where(shows, self._gain(memory, likelihood), jnp.nan)
+
+        return lax.scan(look, memory, (views.T, labels))[1]

@@ -1,0 +1,151 @@
+"""Crops a map: keyframes, views, odometry, closures, experiences and steps of a part of it remain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.core.checkpoint import with_prefix
+from ratslam.mapping.experiences import Experiences
+from ratslam.mapping.keyframe_graph import INTERRUPTED, KeyframeGraph
+from ratslam.mapping.loop_closures import ClosureLog
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.merged_odometry import take_keyframes
+from ratslam.mapping.step_record import StepRecord
+from ratslam.mapping.travel import HALT, Travel
+from ratslam.recall.memory import CroppedRows, MergedRows
+from tactile.base.se2 import between, compose, correct_heading, inverse
+
+Arrays = dict[str, np.ndarray]
+AFRESH = ("archive/", "merger/", "selection/", "tie_odds/")
+"""Parts of a map that begin anew after a crop: what they hold is about keyframes that are gone."""
+
+
+def keyframes_in_box(map: KeyframeMap, box: tuple[float, float, float, float]) -> np.ndarray:
+    """[E] bool: keyframes in a box x0, y0, x1, y1 (m) of the final map."""
+    x, y = map.solution().fit.poses[:, :2].T
+    return (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+
+
+def keyframes_of_steps(map: KeyframeMap, first: int, last: int) -> np.ndarray:
+    """[E] bool: keyframes taken at the steps first to last - 1."""
+    step = map.keyframe_steps()
+    return (step >= first) & (step < last)
+
+
+def keyframes_of_piece(map: KeyframeMap, piece: int) -> np.ndarray:
+    """[E] bool: keyframes of a piece, numbered as `Map.pieces` does."""
+    return map.pieces()[map.keyframe_steps()] == piece
+
+
+def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> CroppedRows:
+    """Reduces a map to some of its keyframes, and returns what the kernel needs to follow.
+
+    Merged keyframes are restored, to be merged anew. Where keyframes are left out, odometry is interrupted:
+    only closures join the parts, which are pieces without them. The robot stays where it was.
+
+    Args:
+        map: is changed. blank: an empty map of the same settings. inside: [E] bool, keyframes that remain, of
+            all ever taken.
+
+    Raises:
+        ValueError: no keyframe remains.
+    """
+    taken = np.flatnonzero(inside)
+    if not len(taken):
+        raise ValueError("no keyframe remains")
+    number = np.where(inside, np.cumsum(inside) - 1, -1)
+    before, kept = map.kept_keyframes().taken.rows.copy(), map.kept_keyframes().count
+    row = map.archive.row.rows.copy() if map.archive.begun else np.arange(kept)
+    graph, log = _unmerged(map)
+    elsewhere = bool(graph.begins.rows[taken[-1] + 1 :].any())
+    since = HALT if elsewhere else _since(graph, int(taken[-1]))
+    own = map.arrays()
+    arrays = {name: value for name, value in own.items() if not name.startswith(AFRESH)}
+    arrays |= {name: value for name, value in blank.arrays().items() if name.startswith(AFRESH)}
+    experiences = Experiences(map.config.place_radius * map.cell, map.config.place_heading)
+    experiences.restore(with_prefix(own, "experiences/"))
+    experiences.take(row, before, number, graph.pose.rows)
+    steps = StepRecord()
+    steps.restore(with_prefix(own, "steps/"))
+    steps.take(number)
+    sequences = log.take(number)
+    _take_graph(graph, taken, sequences, since)
+    if map.archive.begun:
+        arrays["merger/merge_due/0"] = np.array(map.config.merge_stood > 0)
+    views = map.appearance.stored(taken)
+    map.appearance.take(taken)
+    arrays |= _onwards(since, own) | {"solved/0": np.array(-1), "solved/1": np.array(-1)}
+    parts = (
+        ("graph/", graph), ("log/", log), ("steps/", steps), ("experiences/", experiences),
+        ("appearance/", map.appearance),
+    )  # fmt: skip
+    for prefix, part in parts:
+        arrays |= {prefix + name: value for name, value in part.arrays().items()}
+    # The hypotheses of the selection begin at the first keyframe, so that the map stays where it was.
+    arrays["selection/hypotheses/poses/0"] = graph.pose.rows[None, :1].copy()
+    arrays |= _acceptance(own, number, sequences)
+    map.restore(arrays)
+    merged = MergedRows(row[taken], *views, np.maximum(number[before], 0), np.zeros((len(before), 3)))
+    return CroppedRows(merged, inside[before], *since, elsewhere)
+
+
+def _unmerged(map: KeyframeMap) -> tuple[KeyframeGraph, ClosureLog]:
+    """Copies of all keyframes and of all candidates, as the final map has them."""
+    fit, log, broken = map.solution()
+    graph = map.keyframes().copy()
+    graph.pose.replace(fit.poses)
+    graph.cut.replace(broken.rows)
+    graph.bias, graph.turn_error = fit.bias, fit.turn_error
+    graph.reckoned = map.kept_keyframes().reckoned
+    return graph, log.copy()
+
+
+def _since(graph: KeyframeGraph, last: int) -> Travel:
+    """The odometry from a keyframe to the newest one."""
+    reckoned = graph.dead_reckoned()
+    length, turn = (float(values.rows[last + 1 :].sum()) for values in (graph.length, graph.turn))
+    return Travel(between(reckoned[last], reckoned[-1]), length, turn)
+
+
+def _onwards(since: Travel, own: Arrays) -> Arrays:
+    """The arrays of the odometry since the newest keyframe that remains."""
+    motion, length, turn = (own[f"travel/{k}"] for k in range(3))
+    return {
+        "travel/0": compose(since.motion, motion),
+        "travel/1": np.array(since.length + length),
+        "travel/2": np.array(since.turn + turn),
+    }
+
+
+def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, since: Travel) -> None:
+    """Reduces a graph to keyframes; odometry is interrupted where some are left out, and stays cut where the
+    sequence that showed a break is gone."""
+    start = graph.start
+    back = inverse(correct_heading(since.motion, since.length, start.bias, start.turn_error))
+    graph.reckoned = compose(graph.reckoned, back)
+    number = np.cumsum(graph.begins.rows)[taken]
+    skipped = take_keyframes(graph, taken)
+    graph.begins.rows[1:] = np.diff(number) > 0  # also where the first keyframe of a piece is left out
+    cut = graph.cut.rows
+    known = np.isin(cut, sequences)
+    lost = (cut >= 0) & ~known
+    cut[known] = np.searchsorted(sequences, cut[known])
+    cut[lost] = INTERRUPTED
+    cut[skipped] = np.where(graph.begins.rows[skipped], -1, INTERRUPTED)
+    cut[0], graph.begins.rows[0] = -1, False
+    graph.taken.replace(np.arange(len(taken)))
+
+
+def _acceptance(own: Arrays, number: np.ndarray, sequences: np.ndarray) -> Arrays:
+    """The arrays of the rule of acceptance, where it has some: its control, and what it compared."""
+    arrays: Arrays = {}
+    control = with_prefix(own, "acceptance/control/")
+    if control:
+        log = ClosureLog()
+        log.restore(control)
+        log.take(number)
+        arrays |= {f"acceptance/control/{name}": value for name, value in log.arrays().items()}
+    compared = own.get("acceptance/log_ratio")
+    if compared is not None:
+        arrays["acceptance/log_ratio"] = compared[sequences[sequences < len(compared)]]
+    return arrays

@@ -1,0 +1,379 @@
+"""Joins two pieces of a map if the views of one, compared with the keyframes of the other, place it there
+beyond doubt.
+
+A placement of one piece in the other has to explain all its views, be more likely than any other by far, and
+be found from either side. Its keyframes on common ground then give closure sequences, which are selected
+together with all others; the pieces are joined if most of their evidence stands. Anchoring whole sessions is
+Kim et al. 2010; the rule is ours.
+
+A piece of a finished map over the ground of another one.
+
+The piece is solved: as a whole it lies on the ground nearly as a rigid body. So where the robot comes back
+from a way that the other map does not have, its pose follows from all places confirmed so far, and not from a
+long way of odometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ratslam.mapping.following import STILL, Motion, Supposed, advance
+from ratslam.mapping.gain_odds import GainOdds
+from ratslam.mapping.ground import Ground
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_hypotheses import MapHypotheses
+from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.mapping.optimizer import MapCovariance
+from ratslam.places.paths import Path, at_undriven_headings, counted_beside, keyframe_odds
+from ratslam.places.placement import Stretch, Traverse, closures_along, find_placements
+from ratslam.places.view_comparison import Comparison
+from ratslam.recall.memory import Memory
+from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
+
+LOG_ODDS = 15.0
+"""Least log-odds of a placement, beyond the logarithm of the number of places."""
+LEAST = 10
+"""Least number of keyframes of a piece that is joined."""
+HOPELESS = -60.0
+"""Log-odds of the way to either end of a piece below which a placement is dropped."""
+SOLVED = 0.1
+"""Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
+COMMON = 1 / 3
+"""Least share of one of two pieces, of its keyframes that can be compared, that lies on the other's ground: a
+part of another place that is alike counts as often as it is driven."""
+STANDING = 0.5
+"""Least share of the evidence of the closure sequences between two pieces that the selection accepts."""
+
+
+Stretches = tuple[int, ...]
+"""Numbers of the stretches of keyframes, each from one beginning of a piece to the next, that a piece has."""
+
+
+class Views(Protocol):
+    """Compares the views of a map's keyframes, numbered among all ever taken."""
+
+    def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
+        """The memory of keyframes `frames` [N] at `poses` [N, 3]."""
+
+    def ground(self, poses: np.ndarray) -> Ground:
+        """Keyframes at `poses` [N, 3] as ground."""
+
+    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
+        """The log-odds of gains on the ground of keyframes `frames` [N] at `poses` [N, 3]."""
+
+    def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
+        """The views of keyframes `frames` [n], moved by `motion` [n, 3] into each."""
+
+
+class Join(NamedTuple):
+    """What joined two pieces.
+
+    Attributes:
+        stretches: of either. start: [3] pose of the second piece's first keyframe in the first piece, m, m,
+            rad. sd: [3] of a pose in the second piece against the first one, in the middle of their common
+            ground. log_odds: of the second piece in the first and of the first in the second. needed:
+            log-odds that each needed. closures: number between the two.
+    """
+
+    stretches: tuple[Stretches, Stretches]
+    start: np.ndarray
+    sd: np.ndarray
+    log_odds: tuple[float, float]
+    needed: tuple[float, float]
+    closures: int
+
+
+class _Found(NamedTuple):
+    """A placement beyond doubt.
+
+    Attributes:
+        onto: [N] keyframes of the ground that are not merged. frames: [n] keyframes placed on it. ground: of
+            `onto` and all merged with these. on: [n] bool, those on the ground. common: their share of
+            those that can be compared. motion: [3] brings them there.
+    """
+
+    onto: np.ndarray
+    frames: np.ndarray
+    ground: Ground
+    path: Path
+    on: np.ndarray
+    common: float
+    motion: np.ndarray
+    needed: float
+
+    @property
+    def log_odds(self) -> float:
+        """Of the whole piece being there."""
+        return float(self.path.odds.sum())
+
+
+def join_all(
+    map: KeyframeMap,
+    views: Views,
+    tried: set[tuple[Stretches, Stretches]],
+    report: Callable[[str], None] = lambda _: None,
+) -> list[Join]:
+    """Joins pieces of a map, two at a time, until nothing joins any more, and merges keyframes on common
+    ground.
+
+    Args:
+        tried: pairs of pieces that do not join; those found now are added. report: called with a line for
+            each pair that is compared.
+    """
+    joins: list[Join] = []
+    while (join := _join_some(map, views, tried, report)) is not None:
+        joins.append(join)
+        # Merges keyframes on ground that the closures of a finished map confirm.
+        config = map.config
+        if config.merge_stood:
+            map.log.confirm(config.merge_stood)
+            map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)
+    return joins
+
+
+def _join_some(
+    map: KeyframeMap, views: Views, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
+) -> Join | None:
+    """Joins the first two pieces that can be joined, of those that were not tried yet."""
+    graph = map.kept_keyframes()
+    piece, stretch = graph.pieces(map.log), np.cumsum(graph.begins.rows)
+    for pair in combinations(range(int(piece.max()) + 1), 2):
+        one, other = (np.flatnonzero(piece == number) for number in pair)
+        held = tuple(np.unique(stretch[one]).tolist()), tuple(np.unique(stretch[other]).tolist())
+        if held in tried or min(len(one), len(other)) < LEAST:
+            continue
+        tried.add(held)
+        report(f"comparing pieces of {len(one)} and {len(other)} keyframes")
+        join = _join(map, views, one, other)
+        if join is not None:
+            return join._replace(stretches=held)
+    return None
+
+
+def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) -> Join | None:
+    """Joins two pieces of keyframes `one` [N] and `other` [n] if the evidence suffices."""
+    graph = map.kept_keyframes()
+    found = _place(map, views, one, other)
+    back = found and _place(map, views, other, one)
+    if not found or not back or not _agree(graph, found, back):
+        return None
+    if max(found.common, back.common) < COMMON:
+        return None
+    sequences = _closures(graph, views, found)
+    start = compose(found.motion, graph.pose.rows[other[0]])
+    trial, log = graph.copy(), map.log.copy()
+    trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
+    first, solution = log.sequences, _solve_with(trial, log, sequences)
+    new = np.arange(log.sequences) >= first
+    standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
+    scores = solution.log.scores()
+    if not new.any() or scores[standing].sum() < STANDING * scores[new].sum():
+        return None
+    _take_up(map, solution, sequences)
+    middle = sequences[len(sequences) // 2][0]
+    covariance = _covariance(graph, map.log).relative(middle.match, middle.keyframe, 0.0)
+    return Join(
+        ((), ()), start, np.sqrt(np.diag(covariance)),
+        (found.log_odds, back.log_odds), (found.needed, back.needed),
+        sum(len(sequence) for sequence in sequences),
+    )  # fmt: skip
+
+
+def _covariance(graph: KeyframeGraph, log: ClosureLog) -> MapCovariance:
+    """The covariance of a map, the pieces of which are held together: what lies `LOOSE` apart cannot be
+    compared in the precision of a computer."""
+    problem, piece = graph.problem(log, graph.cut), graph.pieces(log)
+    apart = piece[1:] != piece[:-1]
+    variance = np.where(apart[:, None], 1.0, problem.chain.variance)
+    return MapCovariance(graph.fit(), problem._replace(chain=problem.chain._replace(variance=variance)))
+
+
+def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
+    """The placement of keyframes `frames` [n] on the ground of those `onto` [N] and of all merged with these,
+    if it is beyond doubt."""
+    graph, archive = map.kept_keyframes(), map.archive
+    own = graph.pose.rows[frames]
+    every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else graph.taken.rows[onto]
+    poses = archive.poses(graph.pose.rows)[every]
+    ground, odds = views.ground(poses), views.odds(every, poses)
+    motions = _motions(graph, own)
+    session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, HOPELESS)
+    paths = [_weighed(ground, path) for path in find_placements(ground, odds, session)]
+    paths.sort(key=lambda path: -path.odds.sum())
+    needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
+    if not paths or paths[0].odds.sum() < needed:
+        return None
+    best, *others = paths
+    on = (best.odds != 0) & np.array([ground.is_near(pose) for pose in best.poses])
+    common = float(on.sum() / max(session.views.shows.sum(), 1))
+    apart = [(path, between(best.poses[on], path.poses[on])) for path in others]
+    rivals = [float(path.odds.sum()) for path, moved in apart if not _is_small(ground, moved)]
+    if best.odds.sum() - max(rivals, default=-np.inf) < needed:
+        return None
+    moved = fit_rigid_motion(own[on], best.poses[on])
+    return _Found(onto, frames, ground, best, on, common, moved, needed)
+
+
+def _compare(
+    graph: KeyframeGraph, views: Views, ever: np.ndarray, poses: np.ndarray, frames: np.ndarray
+) -> Comparison:
+    """The views of keyframes `frames` [n] on those `ever` [M] taken, at `poses` [M, 3]."""
+    motion = np.array([moved.motion for moved in _motions(graph, graph.pose.rows[frames])])
+    return views.compare(views.freeze(ever, poses), graph.taken.rows[frames], motion)
+
+
+def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
+    """The motions into keyframes of a solved map at `poses` [n, 3]."""
+    motion = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
+    variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
+    return [Motion(*one) for one in zip(motion, variance, strict=True)]
+
+
+def _weighed(ground: Ground, path: Path) -> Path:
+    """A path without evidence against it at headings that the other session never drove, and with less in
+    runs beside its way: two sessions drive different routes, and turn at different places."""
+    odds = counted_beside(ground, path)
+    undriven = at_undriven_headings(ground, path)
+    return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))
+
+
+def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
+    """Whether two placements, of either piece in the other, are the same."""
+    own = graph.pose.rows[found.frames][found.on]
+    return _is_small(found.ground, between(compose(found.motion, own), compose(inverse(back.motion), own)))
+
+
+def _is_small(ground: Ground, apart: np.ndarray) -> bool:
+    """Whether the medians of differences [n, 3] of poses are less than the bend of two maps of one place."""
+    far, turned = np.median(np.hypot(*apart[:, :2].T)), np.median(np.abs(wrap(apart[:, 2])))
+    return bool(far < 2 * ground.reach and turned < ground.reach_heading)
+
+
+def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Candidate]]:
+    """Closure sequences along a placement, with keyframes that are not merged."""
+    poses = graph.pose.rows[found.onto]
+    compared = _compare(graph, views, graph.taken.rows[found.onto], poses, found.frames)
+    ground = views.ground(poses)
+    sequences: list[list[Candidate]] = []
+    last = -graph.config.max_gap - 1
+    for k, match in closures_along(ground, compared, found.path):
+        if not found.on[k]:
+            continue
+        if k - last > graph.config.max_gap:
+            sequences.append([])
+        frame, other = int(found.frames[k]), int(found.onto[match.frame])
+        turn = float(ground.turns[match.shift])
+        sequences[-1].append(_candidate(graph, frame, other, turn, match.gain))
+        last = k
+    return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
+
+
+def _candidate(graph: KeyframeGraph, frame: int, match: int, turn: float, gain: float) -> Candidate:
+    """The closure between two keyframes, the first of which faces `turn` (rad) from the second."""
+    if frame < match:
+        frame, match, turn = match, frame, -turn
+    angle = graph.sector_angle
+    shift = round(-turn / angle) if angle else 0
+    if np.cos(angle) < 0:  # half a turn is the same either way
+        shift = abs(shift)
+    return Candidate(frame, match, shift, float(1 / (1 + np.exp(-gain))), gain)
+
+
+def _add(log: ClosureLog, sequences: list[list[Candidate]]) -> None:
+    for sequence in sequences:
+        for k, candidate in enumerate(sequence):
+            log.add(candidate, k > 0)
+        log.judge(log.sequences - 1, Verdict.ACCEPTED)
+
+
+def _solve_with(graph: KeyframeGraph, log: ClosureLog, sequences: list[list[Candidate]]) -> MapSolution:
+    """The map with further closure sequences, selected together with all others where sequences are selected;
+    changes graph and log."""
+    _add(log, sequences)
+    graph.optimise(log)
+    solution = None
+    if graph.config.select_every:
+        hypotheses = MapHypotheses()
+        hypotheses.begin(graph.fit(), log.sequences)
+        solution = selected_solution(graph, log, hypotheses)
+    return solution or solved_map(graph, log)
+
+
+def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candidate]]) -> None:
+    graph, log = map.kept_keyframes(), map.log
+    for sequence in sequences:
+        for k, candidate in enumerate(sequence):
+            map.archive.add(candidate, k > 0, graph)
+    _add(log, sequences)
+    log.follow(solution.log)
+    graph.pose.rows[:] = solution.fit.poses
+    graph.bias, graph.turn_error = solution.fit.bias, solution.fit.turn_error
+    graph.cut.replace(solution.cut.rows)
+    graph.place_pieces(log)
+    map.selection.hypotheses.begin(graph.fit(), log.sequences)
+
+
+UNCONFIRMED = 6
+"""Keyframes without evidence for a pose, after which it is that of the piece as a rigid body."""
+TOGETHER = 20
+"""Least number of keyframes with evidence for their poses that one rigid motion brings there."""
+
+
+class MapTraverse(NamedTuple):
+    """A solved piece of n keyframes over a ground.
+
+    Attributes:
+        views: compared with the ground. poses: [n, 3] in the piece, m, m, rad. motions: [n] into each
+            keyframe, the first one's not used. hopeless: log-odds of the way to either end below which a
+            placement is dropped.
+    """
+
+    views: Comparison
+    poses: np.ndarray
+    motions: list[Motion]
+    hopeless: float
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path with keyframe k at `pose` [3]: of the whole piece as a rigid body if many places agree on
+        one; else as odometry leads, as far as it is not hopeless."""
+        way = Traverse(self.views, self.motions, self.hopeless).follow(ground, odds, k, pose)
+        confirmed = np.flatnonzero(way.path.odds > 0)
+        own, found = self.poses[way.first + confirmed], way.path.poses[confirmed]
+        together = _largest_rigid_part(ground, own, found)
+        if together.sum() < TOGETHER:
+            return way
+        moved = fit_rigid_motion(own[together], found[together])
+        return Stretch(0, self._along(ground, odds, moved))
+
+    def _along(self, ground: Ground, odds: GainOdds, moved: np.ndarray) -> Path:
+        """The path of the piece moved by `moved` [3], corrected by the views."""
+        rigid, loose = compose(moved, self.poses), np.diag(ground.variance)
+        at, inside, unconfirmed = Supposed(rigid[0], loose), False, UNCONFIRMED
+        poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
+        for k, motion in enumerate(self.motions):
+            if unconfirmed >= UNCONFIRMED:
+                at, motion = Supposed(rigid[k], loose), STILL
+            at, gain = advance(ground, at, motion, self.views.gains(k))
+            gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
+            poses[k], covariances[k] = at
+            unconfirmed = 0 if gained[k] > 0 else unconfirmed + 1
+        return Path(poses, covariances, gained)
+
+
+def _largest_rigid_part(ground: Ground, own: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """[n] bool: the most poses `own` [n, 3] that one rigid motion brings to within the ground's reaches of
+    those `found` [n, 3]."""
+    best = np.zeros(len(own), bool)
+    for k in range(len(own)):
+        apart = between(compose(compose(found[k], inverse(own[k])), own), found)
+        near = np.hypot(*apart[:, :2].T) < ground.reach
+        together = near & (np.abs(wrap(apart[:, 2])) < ground.reach_heading)
+        if together.sum() > best.sum():
+            best = together
+    return best

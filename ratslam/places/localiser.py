@@ -1,0 +1,279 @@
+"""Localisation of a session in a finished map, which does not change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ratslam.core.backend import Evidence, Map
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.growable_array import GrowableArray
+from ratslam.core.localisation import Localisation, LocalisedPose, pieces_of, write_course
+from ratslam.core.types import Action, Estimate
+from ratslam.mapping.following import Motion, Supposed, move
+from ratslam.mapping.gain_odds import DISTINCT, GainOdds
+from ratslam.mapping.ground import Ground
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.travel import HALT
+from ratslam.places.hypotheses import LONGEST, Hypotheses, Recalled, SessionViews
+from ratslam.places.placement import NOTHING_RECALLED
+from tactile.base.types import Observation
+
+if TYPE_CHECKING:
+    import networkx
+
+UNEXPLAINED = 4.0
+"""The session is not in the map if its views, were it there, would have given this multiple of the log-odds
+needed to be found, and the best supposed pose has less than half of these."""
+LARGEST_EXPONENT = 700.0
+"""Of a double, rounded down."""
+HEADING_NOISE = 2.0
+"""Variance of the heading by odometry as a multiple of what the settings say. Maps start from less noise than
+odometry has, so that a wrong map has to bend what is believed; in a turn the pose would be lost by that."""
+UNCERTAIN = 2 * LONGEST
+"""Keyframes before a pose is lost at which it may have been wrong already."""
+
+
+class Place(NamedTuple):
+    """A finished map to localise in.
+
+    Attributes:
+        map: its keyframe map. frames: [N] the keyframes of the ground, numbered as they were taken. ground:
+            them as ground. odds: log-odds of gains on it.
+    """
+
+    map: KeyframeMap
+    frames: np.ndarray
+    ground: Ground
+    odds: GainOdds
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """The keyframes that are not merged."""
+        return self.map.kept_keyframes()
+
+
+class Visits(NamedTuple):
+    """The keyframes of a session whose pose in the map was found and that show something.
+
+    Attributes:
+        step: [K] of the session. pose: [K, 3] in the map, m, m, rad. view: [K, D] as the map stores views.
+    """
+
+    step: np.ndarray
+    pose: np.ndarray
+    view: np.ndarray
+
+
+class Localiser(Checkpointed, Map):
+    """The map of the localise backend: the poses of a session in a finished map.
+
+    Args:
+        place: the finished map. log_odds: above which a pose is found, after the logarithm of the number of
+            places is subtracted. start: [3] pose in the map at which the session is supposed to begin; it is
+            just believed, until views contradict it. None: unknown.
+    """
+
+    VALUES = (
+        "_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds",
+    )  # fmt: skip
+    PARTS = ("_views", "_hypotheses")
+
+    def __init__(self, place: Place, log_odds: float, start: np.ndarray | None = None) -> None:
+        self.place = place
+        self._places = float(np.log(max(place.ground.places(), 1.0)))
+        self._needed = log_odds + self._places
+        shifts, count = len(place.ground.turns), len(place.ground.poses)
+        self._views, self._hypotheses = SessionViews(shifts, count), Hypotheses()
+        self._travel = HALT
+        self._state = int(Localisation.SEARCHING)
+        self._recalled = NOTHING_RECALLED
+        self._newest, self._covariance = np.zeros(3), np.zeros((3, 3))  # pose of the newest keyframe
+        self._mass, self._log_odds = 0.0, -self._places
+        self._pose = GrowableArray((3,), np.float64)
+        self._states = GrowableArray((), np.int64)
+        self._record = GrowableArray((3,), np.float64)  # mass, log-odds, largest standard deviation
+        self._frame = GrowableArray((), np.int64)  # step of each keyframe
+        self._found = GrowableArray((3,), np.float64)  # its pose, NaN where that is not known
+        size = place.map.appearance.stored(place.frames[:0])[0].shape[1]
+        self._view = GrowableArray((size,), np.float64)  # its view
+        if start is not None:
+            self._suppose(start)
+
+    def _suppose(self, start: np.ndarray) -> None:
+        """Believes a pose [3] at which the session begins, just enough to be found."""
+        at = Supposed(start.copy(), np.diag(self.place.ground.variance))
+        self._hypotheses.add(at, self._needed)
+        self._state = int(Localisation.FOUND)
+        self._newest, self._covariance = at
+        self._mass, self._log_odds = 0.5, self._needed - self._places
+
+    # Queries
+
+    def localisation(self) -> LocalisedPose:
+        """The robot's pose now, and whether it is known."""
+        now = move(Supposed(self._newest, self._covariance), self._moved())
+        state = Localisation(self._state)
+        if state == Localisation.FOUND and not now.is_comparable(self.place.ground):
+            state = Localisation.LOST  # nothing was seen for long
+        return LocalisedPose(state, *now, self._mass, self._log_odds)
+
+    def pose(self, estimate: Estimate) -> np.ndarray:
+        del estimate
+        return self.localisation().pose
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] poses of all steps: in the map where they were found, by odometry from there elsewhere."""
+        return self._pose.rows.copy()
+
+    def states(self) -> np.ndarray:
+        """[T] the `Localisation` at each step."""
+        return self._states.rows.copy()
+
+    def visits(self) -> Visits:
+        """Where the session was in the map, and what it saw there."""
+        pose = self._found.rows
+        found = np.isfinite(pose[:, 0])
+        return Visits(self._frame.rows[found], pose[found], self._view.rows[found])
+
+    def pieces(self) -> np.ndarray:
+        """[T] the piece of each step: all steps where the pose was found are one, and so is each stretch
+        between."""
+        return pieces_of(self._states.rows)
+
+    def graph(self) -> networkx.DiGraph:
+        """The graph of the finished map."""
+        return self.place.map.graph()
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """State, mass and log-odds of every step as CSV, and the graph of the finished map."""
+        return {"localisation.csv": self._write, "map.json": self.place.map.files()["map.json"]}
+
+    # Changes
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
+        """Moves all supposed poses by one step, and compares them with the view of a keyframe."""
+        self._travel = self._travel.onwards(observation.odometry)
+        if int(evidence.keyframe) >= 0:
+            self._view.append(self.place.map.appearance.view_of(observation))
+            self._add_keyframe(evidence)
+        now = self.localisation()
+        spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
+        self._pose.append(now.pose)
+        self._states.append(int(now.state))
+        self._record.append((now.mass, now.log_odds, Supposed(now.pose, now.covariance).deviations()[0]))
+        dtype = np.asarray(estimate.pose).dtype
+        return estimate._replace(
+            pose=now.pose.astype(dtype),
+            spread=spread.astype(dtype),
+            lost=np.bool_(now.state != Localisation.FOUND),
+            action=np.int32(Action.NONE),
+            place=np.int32(-1),
+        )
+
+    @property
+    def compared(self) -> int:
+        """Number of views compared with the map."""
+        return len(self._frame.rows)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The whole state, with the poses of the finished map."""
+        return super().arrays() | {"ground": self.place.ground.poses.copy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`.
+
+        Raises:
+            ValueError: the finished map has changed since.
+        """
+        if not np.array_equal(arrays["ground"], self.place.ground.poses):
+            raise ValueError("a session in another map, or in this one before it was changed")
+        super().restore(arrays)
+
+    def _add_keyframe(self, evidence: Evidence) -> None:
+        ground, odds = self.place.ground, self.place.odds
+        moved = self._moved()
+        gain = None
+        if bool(evidence.shows):
+            gain = DISTINCT.weigh(np.asarray(evidence.gain)[:, : len(ground.poses)])
+        self._views.append(moved, gain)
+        self._frame.append(len(self._pose.rows))
+        recalled = self._recall(evidence, moved, gain)
+        confirmed = recalled if self._recalled.is_confirmed else None
+        self._hypotheses.advance(ground, odds, moved, gain, confirmed)
+        if recalled is not None:
+            self._hypotheses.continue_uncertain(ground, odds, recalled)
+        if confirmed is not None:
+            self._hypotheses.propose(ground, odds, self._views, confirmed.pose)
+        self._travel = HALT
+        self._judge(moved)
+        known = self._state == Localisation.FOUND and gain is not None
+        self._found.append(self._newest if known else np.full(3, np.nan))
+
+    def _moved(self) -> Motion:
+        """The motion since the newest keyframe without the systematic errors that the map knows."""
+        graph, (motion, length, turn) = self.place.graph, self._travel
+        variance = graph.odometry_variance(np.array([length]), np.array([turn]))[0]
+        variance[2] *= HEADING_NOISE * graph.heading_noise.further_factor
+        return Motion(graph.correct(motion, length), variance)
+
+    def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:
+        """The recalled pose of the newest keyframe."""
+        shift, match = int(evidence.shift_row), int(evidence.match)
+        ground, posterior = self.place.ground, float(evidence.posterior)
+        self._recalled = self._recalled.onwards(ground, moved, shift, match, posterior)
+        if gain is None or not self._recalled.now:
+            return None
+        return Recalled(self._recalled.pose, float(gain[shift, match]))
+
+    def _judge(self, moved: Motion) -> None:
+        """Finds, keeps or loses the pose."""
+        known = self._hypotheses
+        if not known.count:
+            self._newest, self._covariance = move(Supposed(self._newest, self._covariance), moved)
+            self._mass, self._log_odds = 0.0, -self._places
+            self._judge_unknown(0.0)
+            return
+        order = known.ranked()
+        best, odds = int(order[0]), known.log_odds.rows
+        others = np.logaddexp.reduce([*odds[order[1:]], self._needed])
+        self._newest, self._covariance = known.pose.rows[best].copy(), known.covariance.rows[best].copy()
+        self._mass = float(1 / (1 + np.exp(np.minimum(others - odds[best], LARGEST_EXPONENT))))
+        self._log_odds = float(odds[best] - self._places)
+        rival = odds[order[1]] if known.count > 1 else -np.inf
+        fell = known.fall(best) > self._needed
+        if not fell and not known.at(best).is_comparable(self.place.ground):
+            if self._state == Localisation.FOUND:
+                self._state = int(Localisation.LOST)
+        elif odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
+            self._state = int(Localisation.FOUND)
+        elif self._state != Localisation.FOUND:
+            self._judge_unknown(float(odds[best]))
+        elif fell:
+            self._lose()
+
+    def _judge_unknown(self, best: float) -> None:
+        """The state while no pose is found, and the best supposed one has these log-odds."""
+        if self._state == Localisation.FOUND:
+            self._lose()
+        possible = int(self._views.shows.rows.sum()) * self.place.odds.expected
+        if best >= self._needed / 2:
+            if self._state == Localisation.NOT_THIS_MAP:
+                self._state = int(Localisation.SEARCHING)
+        elif possible >= UNEXPLAINED * self._needed:
+            self._state = int(Localisation.NOT_THIS_MAP)
+
+    def _lose(self) -> None:
+        """The pose is lost: the search begins anew, with the views from now on."""
+        self._state = int(Localisation.LOST)
+        self._mass, self._log_odds = 0.0, -self._places
+        self._found.rows[-UNCERTAIN:] = np.nan
+        self._hypotheses.clear()
+        self._views.forget(0)
+
+    def _write(self, path: Path) -> None:
+        write_course(path, self._states.rows, self._record.rows)

@@ -1,0 +1,153 @@
+"""Where a session is in a finished map: placements that recall proposes, and their evidence.
+
+A placement is followed through the whole session, to its start and to its end: it has to explain all views,
+not only those that proposed it. The rule is ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ratslam.mapping.following import Motion, Supposed
+from ratslam.mapping.gain_odds import GainOdds
+from ratslam.mapping.ground import Ground, Match
+from ratslam.places.hypotheses import HOPELESS, same_pose
+from ratslam.places.paths import Path, follow
+from ratslam.places.view_comparison import Comparison
+from tactile.base.se2 import between, compose
+
+CONFIRMING = 3
+"""Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
+
+
+class RecalledPose(NamedTuple):
+    """Attributes:
+    pose: [3] the newest recalled pose, moved on by odometry; NaN before any. agreeing: number of recalled
+        poses in a row that agree with odometry. now: whether the newest keyframe was recalled.
+    """
+
+    pose: np.ndarray
+    agreeing: int
+    now: bool
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the pose is to be proposed for the newest keyframe."""
+        return self.now and self.agreeing >= CONFIRMING
+
+    def onwards(
+        self, ground: Ground, moved: Motion, shift: int, match: int, posterior: float
+    ) -> RecalledPose:
+        """After the next keyframe, reached by `moved`, which recall places at keyframe `match` of the ground
+        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior."""
+        expected = compose(self.pose, moved.motion)
+        if match < 0 or posterior <= 0.5:
+            return RecalledPose(expected, self.agreeing, False)
+        pose = ground.claims(np.array([shift]), np.array([match]))[0]
+        error = between(expected, pose)
+        agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
+        return RecalledPose(pose, self.agreeing + 1 if agrees else 1, True)
+
+
+NOTHING_RECALLED = RecalledPose(np.full(3, np.nan), 0, False)
+"""Before the first keyframe."""
+
+
+class Followed(Protocol):
+    """A session that can be followed from a supposed pose, see `Traverse`."""
+
+    @property
+    def views(self) -> Comparison: ...
+
+    @property
+    def motions(self) -> list[Motion]: ...
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path with keyframe k at `pose` [3]."""
+
+
+class Traverse(NamedTuple):
+    """A session of n keyframes over a ground.
+
+    Attributes:
+        views: compared with the ground. motions: [n] into each keyframe, the first one's not used.
+        hopeless: log-odds of the way to either end below which a placement is dropped.
+    """
+
+    views: Comparison
+    motions: list[Motion]
+    hopeless: float = HOPELESS
+
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+        """The path with keyframe k at `pose` [3], to both ends of the session unless it is hopeless."""
+        at = Supposed(pose, np.diag(ground.variance))
+        views, motions = self.views, self.motions
+        back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))
+        before = follow(ground, odds, at, back, self.hopeless)
+        onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
+        after = follow(ground, odds, at, onwards, self.hopeless)
+        parts = (np.concatenate([one[:0:-1], other]) for one, other in zip(before, after, strict=True))
+        return Stretch(k + 1 - len(before.poses), Path(*parts))
+
+
+class Stretch(NamedTuple):
+    """The path over consecutive keyframes of a session, from keyframe `first` on."""
+
+    first: int
+    path: Path
+
+    def passes(self, ground: Ground, k: int, pose: np.ndarray) -> bool:
+        """Whether keyframe k of the session is at `pose` [3]."""
+        row = k - self.first
+        inside = 0 <= row < len(self.path.poses)
+        return inside and bool(same_pose(ground, self.path.poses[row : row + 1], pose)[0])
+
+
+def find_placements(ground: Ground, odds: GainOdds, session: Followed) -> list[Path]:
+    """The different placements of a session that recall proposes and that are not hopeless, those with the
+    largest log-odds first."""
+    tried: list[Stretch] = []
+    found: list[Path] = []
+    for k, pose in _proposals(ground, session):
+        if any(stretch.passes(ground, k, pose) for stretch in tried):
+            continue
+        tried.append(session.follow(ground, odds, k, pose))
+        path = tried[-1].path
+        whole = len(path.poses) == len(session.motions)
+        if whole and not any(_is_same(ground, path, other) for other in found):
+            found.append(path)
+    return sorted(found, key=lambda path: -path.odds.sum())
+
+
+def _is_same(ground: Ground, path: Path, other: Path) -> bool:
+    """Whether two paths are the same placement: they are together at most keyframes."""
+    together = [same_pose(ground, path.poses[k : k + 1], pose)[0] for k, pose in enumerate(other.poses)]
+    return bool(np.mean(together) > 0.5)
+
+
+def _proposals(ground: Ground, session: Followed) -> Iterator[tuple[int, np.ndarray]]:
+    """Keyframes and their recalled poses [3] that agree with odometry for `CONFIRMING` of them."""
+    views, newest = session.views, NOTHING_RECALLED
+    for k, moved in enumerate(session.motions):
+        claim = int(views.shift[k]), int(views.match[k])
+        newest = newest.onwards(ground, moved, *claim, float(views.posterior[k]))
+        if newest.is_confirmed:
+            yield k, newest.pose
+
+
+def closures_along(ground: Ground, views: Comparison, path: Path) -> list[tuple[int, Match]]:
+    """Keyframes of a session, by number, and where on the ground each fits best at its pose of a path, if it
+    fits anything there better than a new place.
+
+    Args:
+        views: of the session's n keyframes. path: of the same.
+    """
+    found = []
+    for k, pose in enumerate(path.poses):
+        gain = views.gains(k)
+        match = ground.best_match(pose, gain) if gain is not None else None
+        if match is not None:
+            found.append((k, match))
+    return found

@@ -1,0 +1,203 @@
+"""One map of two: their keyframes, closures and steps one after the other, in pieces apart.
+
+Nothing joins the second map to the first one here (`ratslam.places.joining`). The odometry of the second is
+bent so that the calibration of the first one corrects it as its own did: each session keeps its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.core.checkpoint import with_prefix
+from ratslam.mapping.archive import Archive
+from ratslam.mapping.experiences import Experiences
+from ratslam.mapping.keyframe_graph import INTERRUPTED
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.optimizer import CalibrationPrior
+from ratslam.mapping.step_record import leading_to, settled
+from tactile.base.se2 import bend_motion, between
+
+Arrays = dict[str, np.ndarray]
+AFRESH = (
+    "acceptance/control/",
+    "acceptance/log_ratio",
+    "experiences/",
+    "merger/",
+    "selection/",
+    "solved/",
+    "tie_odds/",
+)
+"""Parts of a map that begin anew: what they hold is about one session."""
+OF_NEWEST = ("live/", "since/", "turned/", "begins/", "doubt/")
+"""Parts about the newest keyframe, which is that of the second map."""
+
+
+class Counts(NamedTuple):
+    """Of the first map: keyframes that are not merged, keyframes ever taken, closure sequences."""
+
+    kept: int
+    ever: int
+    sequences: int
+
+
+class Bend(NamedTuple):
+    """The change of odometry after which the calibration `new` corrects it as `old` did before."""
+
+    old: CalibrationPrior
+    new: CalibrationPrior
+
+    def motions(self, motion: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """[n, 3] motions over distances [n]."""
+        return self.links(motion, length, motion[:, 2])
+
+    def links(self, motion: np.ndarray, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """[n, 3] motions over distances [n] with turns [n] by odometry within them."""
+        return bend_motion(motion, self.turns(length, turn) - turn)
+
+    def turns(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """[n] turns by odometry within distances [n]."""
+        right = turn * (1 + self.old.turn_error) + (self.old.bias - self.new.bias) * length
+        return right / (1 + self.new.turn_error)
+
+
+def unite(first: KeyframeMap, second: KeyframeMap, blank: KeyframeMap) -> KeyframeMap:
+    """The map with all keyframes of two, those of the second in pieces of their own.
+
+    Args:
+        blank: an empty map of the same settings, which becomes the result.
+    """
+    a, b = _finished(first), _finished(second)
+    counts = Counts(len(a["graph/taken"]), int(a["graph/taken"][-1]) + 1, len(a["log/verdict"]))
+    bend = Bend(_calibration(b), _calibration(a))
+    united = a | _graph("graph/", a, b, counts, bend) | _log("log/", a, b, counts.kept, counts.sequences)
+    if first.archive.begun or second.archive.begun:
+        united |= _archive(_archived(first, a), _archived(second, b), counts, bend)
+    united |= _steps(a, b, counts.ever, bend) | _newest(b, bend)
+    kept = {name: value for name, value in united.items() if not name.startswith(AFRESH)}
+    blank.restore(blank.arrays() | kept)
+    blank.appearance.extend(second.appearance)
+    graph, log = blank.kept_keyframes(), blank.log
+    blank.appearance.relearn(blank.archive.confirmed_pairs(graph, log))
+    graph.place_pieces(log)
+    graph.reckoned = graph.pose.rows[-1].copy()
+    blank.selection.hypotheses.begin(graph.fit(), log.sequences)
+    return blank
+
+
+def _finished(map: KeyframeMap) -> Arrays:
+    """The arrays of a map with the poses and verdicts of its final solution."""
+    map.solution()  # which the archive takes over
+    fit, log, broken = map.kept_solution()
+    return (
+        map.arrays()
+        | {f"log/{name}": value for name, value in log.arrays().items()}
+        | {
+            "graph/pose": fit.poses,
+            "graph/cut": broken.rows.copy(),
+            "graph/bias/0": np.array(fit.bias),
+            "graph/turn_error/0": np.array(fit.turn_error),
+        }
+    )
+
+
+def _calibration(arrays: Arrays) -> CalibrationPrior:
+    bias, turn_error = (float(arrays[f"graph/{name}/0"]) for name in ("bias", "turn_error"))
+    return CalibrationPrior(bias, 0.0, turn_error, 0.0)
+
+
+def _archived(map: KeyframeMap, own: Arrays) -> Arrays:
+    """The archive of a map, made of the map itself where no keyframe was merged."""
+    if map.archive.begun:
+        return with_prefix(own, "archive/")
+    count = len(own["graph/taken"])
+    archive = Archive(map.kept_keyframes())
+    rows = {"row": np.arange(count), "offset": np.zeros((count, 3)), "pairs": archive.pairs.rows.copy()}
+    return rows | {name: value for name, value in own.items() if name.startswith(("graph/", "log/"))}
+
+
+def _graph(prefix: str, a: Arrays, b: Arrays, counts: Counts, bend: Bend, size: int | None = None) -> Arrays:
+    """Keyframes; `size`: their number in the first map, that of the map's unless given."""
+    size = counts.kept if size is None else size
+    moved = b | {
+        prefix + "motion": bend.motions(b[prefix + "motion"], b[prefix + "length"]),
+        prefix + "cut": _shifted_cut(b[prefix + "cut"], counts.sequences),
+        prefix + "taken": b[prefix + "taken"] + counts.ever,
+        prefix + "begins": b[prefix + "begins"].copy(),
+    }
+    moved[prefix + "begins"][0] = True
+    moved[prefix + "motion"][0] = 0.0
+    names = ("pose", "motion", "length", "turn", "cut", "begins", "seam", "taken")
+    graph = {prefix + name: np.concatenate([a[prefix + name], moved[prefix + name]]) for name in names}
+    i, j, motion, length, turn, variance = (b[f"{prefix}links/{k}"] for k in range(6))
+    links = (
+        i + size, j + size, bend.links(motion, length, turn), length, bend.turns(length, turn), variance
+    )  # fmt: skip
+    for k, value in enumerate(links):
+        graph[f"{prefix}links/{k}"] = np.concatenate([a[f"{prefix}links/{k}"], value])
+    return graph
+
+
+def _shifted_cut(cut: np.ndarray, sequences: int) -> np.ndarray:
+    return np.where((cut >= 0) & (cut < INTERRUPTED), cut + sequences, cut)
+
+
+def _log(prefix: str, a: Arrays, b: Arrays, size: int, sequences: int) -> Arrays:
+    """Candidates and sequences; the first map has `size` keyframes and so many sequences."""
+    candidate = b[prefix + "candidate"].copy()
+    candidate[:, :2] += size
+    candidate[candidate[:, 3] >= 0, 3] += sequences
+    moved = b | {prefix + "candidate": candidate}
+    names = [name for name in a if name.startswith(prefix)]
+    return {name: np.concatenate([a[name], moved[name]]) for name in names}
+
+
+def _archive(a: Arrays, b: Arrays, counts: Counts, bend: Bend) -> Arrays:
+    pairs = b["pairs"].copy()
+    pairs[:, :2] += counts.ever
+    archive = a | _graph("graph/", a, b, counts, bend, counts.ever)
+    archive |= _log("log/", a, b, counts.ever, counts.sequences)
+    archive |= {
+        "row": np.concatenate([a["row"], b["row"] + counts.kept]),
+        "offset": np.concatenate([a["offset"], b["offset"]]),
+        "pairs": np.concatenate([a["pairs"], pairs]),
+    }
+    return {f"archive/{name}": value for name, value in archive.items()}
+
+
+def _steps(a: Arrays, b: Arrays, ever: int, bend: Bend) -> Arrays:
+    """Steps; those of the second map before its first keyframe lead to that."""
+    frame, motion = b["steps/frame"], b["steps/motion"].copy()
+    early, led = frame == -1, frame < -1
+    motion[early, :3] = between(b["graph/pose"][0], motion[early, :3])
+    motion[:, :3] = np.where(early[:, None], motion[:, :3], bend.motions(motion[:, :3], motion[:, 3]))
+    motion[early, 3] = 0.0
+    number = np.where(early, leading_to(ever), np.where(led, frame - ever, frame + ever))
+    return {
+        "steps/frame": np.concatenate([settled(a["steps/frame"], ever), number]),
+        "steps/motion": np.concatenate([a["steps/motion"], motion]),
+        "steps/odometry": np.concatenate([a["steps/odometry"], b["steps/odometry"]]),
+    }
+
+
+def _newest(b: Arrays, bend: Bend) -> Arrays:
+    """What concerns the newest keyframe and the odometry since."""
+    newest = {name: value for name, value in b.items() if name.startswith(OF_NEWEST)}
+    motion, length = b["travel/0"], b["travel/1"]
+    bent = bend.motions(motion[None], np.asarray(length)[None])[0]
+    return newest | {"travel/0": bent, "travel/1": length, "travel/2": b["travel/2"]}
+
+
+def renew_experiences(map: KeyframeMap) -> None:
+    """Forms the experiences of a finished map anew, so that pieces that were joined share those of their
+    common ground."""
+    graph, poses = map.keyframes(), map.solution().fit.poses
+    experiences = Experiences(map.config.place_radius * map.cell, map.config.place_heading)
+    for frame, begins in enumerate(graph.begins.rows.tolist()):
+        experiences.arrive(poses[: frame + 1], frame, -1, True, begins)
+    if map.archive.begun:
+        kept, archive = map.kept_keyframes().taken.rows, map.archive
+        experiences.merge(kept, archive.row.rows, archive.offset.rows)
+    own = {f"experiences/{name}": value for name, value in experiences.arrays().items()}
+    map.restore(map.arrays() | own)

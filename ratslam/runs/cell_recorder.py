@@ -1,0 +1,173 @@
+"""Records the pose cells of a run: rows go to a file while it runs, which becomes cells.npz at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.core.backend import Backend
+from ratslam.core.session import CHUNK, Step
+from ratslam.runs.cell_plan import RecordingPlan, SumsPlan, plan_recording
+from robot.sources.source import Sample, Source
+
+ROWS = "cells.rows"
+"""File of the rows of a run that goes on, or was killed: plain records of `row_type`."""
+BUFFERED = 32 * CHUNK
+"""Rows kept in memory before they are appended to the file."""
+
+
+def row_type(chosen: int) -> np.dtype:
+    """The record of one step with this number of chosen cells, as the fields of `CellRecording`."""
+    return np.dtype(
+        [
+            ("time", "<f8"),
+            ("truth", "<f8", 3),
+            ("packet", "<f8", 3),
+            ("energy", "<f8"),
+            ("place", "<i4"),
+            ("activity", "<f4", (chosen,)),
+        ]
+    )
+
+
+class CellRecorder:
+    """Records the steps of a session whose probe is `probe_of(plan)`.
+
+    Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
+
+    Args:
+        directory: of the run, where `cells.rows` and `cells.npz` are written.
+    """
+
+    def __init__(self, directory: Path, plan: RecordingPlan) -> None:
+        self._directory, self._plan = directory, plan
+        self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
+        self._filled = 0
+        self._sums: CellSums | None = None
+        (directory / ROWS).touch(exist_ok=False)
+
+    def add(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        """Adds up to one chunk of steps, and the samples of the source that they belong to."""
+        if self._filled + len(steps) > BUFFERED:
+            self._write()
+        rows = self._rows[self._filled : self._filled + len(steps)]
+        unknown = np.full(3, np.nan)
+        rows["time"] = [sample.time for sample in samples]
+        rows["truth"] = [unknown if sample.truth is None else sample.truth for sample in samples]
+        rows["packet"] = [self._plan.cells.packet(step.evidence) for step in steps]
+        rows["energy"] = [self._plan.cells.energy(step.evidence) for step in steps]
+        rows["place"] = [step.estimate.place for step in steps]
+        rows["activity"] = [step.probed for step in steps]
+        self._filled += len(steps)
+        if self._plan.sums is not None:
+            self._add_sums(samples, steps)
+
+    def finish(self) -> None:
+        """Writes cells.npz with all rows and the sums, and removes cells.rows.
+
+        Raises:
+            OSError: the disk is full; the rows written so far stay.
+        """
+        self._write()
+        path, plan = self._directory / ROWS, self._plan
+        kind = self._rows.dtype
+        rows = np.memmap(path, kind, mode="r") if path.stat().st_size else np.zeros(0, kind)
+        sums = None if self._sums is None else self._sums.result()
+        columns = {name: rows[name] for name in kind.names or ()}
+        recording = CellRecording(
+            plan.cells.shape, plan.cells.cell_size, **columns, cell=plan.cell, sums=sums
+        )
+        write_recording(self._directory / NAME, recording)
+        path.unlink()
+
+    def _add_sums(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        assert self._plan.sums is not None
+        if self._sums is None:
+            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
+        for sample, step in zip(samples, steps, strict=True):
+            if step.seldom is not None:
+                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
+
+    def _write(self) -> None:
+        with (self._directory / ROWS).open("ab") as file:
+            file.write(self._rows[: self._filled].tobytes())
+        self._filled = 0
+
+
+def open_cell_recorder(
+    config: RunConfig, source: Source, backend: Backend, directory: Path
+) -> CellRecorder | None:
+    """The recorder of a completed configuration; None: nothing is recorded.
+
+    Raises:
+        InputError: see `plan_recording`.
+    """
+    plan = plan_recording(config, source, backend)
+    return None if plan is None else CellRecorder(directory, plan)
+
+
+class CellSums:
+    """Adds the activity of a number of cells, step by step, in memory that does not grow.
+
+    Args:
+        began: time from which the first step counts, s.
+    """
+
+    def __init__(self, plan: SumsPlan, cells: int, began: float) -> None:
+        self._plan, self._until = plan, began
+        self._width, self._height = len(plan.x_edges) - 1, len(plan.y_edges) - 1
+        self._place = np.zeros((self._height * self._width, cells))
+        self._heading = np.zeros((plan.heading_bins, cells))
+        self._place_seconds = np.zeros(self._height * self._width)
+        self._heading_seconds = np.zeros(plan.heading_bins)
+
+    def add(self, time: float, truth: np.ndarray | None, cell: np.ndarray, activity: np.ndarray) -> None:
+        """Adds a step, for the time since the one before.
+
+        Args:
+            time: s. truth: [3] true pose. Without one, or outside the bins, the step and its time are left
+                out. cell: [n] active cells, where one may come twice. activity: [n] of them.
+        """
+        elapsed, self._until = time - self._until, time
+        at = None if truth is None else self._bins(truth)
+        if at is None:
+            return
+        place, heading = at
+        share = elapsed * activity.astype(np.float64)
+        np.add.at(self._place[place], cell, share)
+        np.add.at(self._heading[heading], cell, share)
+        self._place_seconds[place] += elapsed
+        self._heading_seconds[heading] += elapsed
+
+    def result(self) -> BinnedSums:
+        """The sums so far, float32."""
+        plan, grid = self._plan, (self._height, self._width)
+        return BinnedSums(
+            x_edges=plan.x_edges,
+            y_edges=plan.y_edges,
+            seconds=self._place_seconds.reshape(grid),
+            place=np.ascontiguousarray(self._place.T, np.float32).reshape(-1, *grid),
+            heading_seconds=self._heading_seconds,
+            heading=np.ascontiguousarray(self._heading.T, np.float32),
+        )
+
+    def _bins(self, truth: np.ndarray) -> tuple[int, int] | None:
+        """The place bin (row by row) and the heading bin of a true pose, None outside."""
+        if not np.isfinite(truth).all():
+            return None
+        column, row = _bin(self._plan.x_edges, truth[0]), _bin(self._plan.y_edges, truth[1])
+        if column is None or row is None:
+            return None
+        count = self._plan.heading_bins
+        return row * self._width + column, round(float(truth[2]) / (2 * np.pi) * count) % count
+
+
+def _bin(edges: np.ndarray, value: float) -> int | None:
+    """The bin between edges [n + 1] that holds a value, None outside; the last one holds its upper edge."""
+    if not edges[0] <= value <= edges[-1]:
+        return None
+    return min(int(np.searchsorted(edges, value, side="right")), len(edges) - 1) - 1

@@ -1,0 +1,181 @@
+"""Localisation of a recording in a saved map: the run of a configuration with `backend: localise`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
+from evaluation.metrics.scorecard import Scorecard
+from ratslam.places.localiser import Localiser
+from ratslam.methods.config import Start
+from ratslam.methods.registry import LOCALISING
+from ratslam.runs.settings.other_files import FOLDER, RECORDING, refuse_other_files
+from ratslam.runs.settings.run_config import RunConfig, SourceConfig
+from ratslam.runs.settings.strict_yaml import dump, override, parse, validate
+from ratslam.core.localisation import Localisation
+from ratslam.grid.localiser import GridLocaliser
+from ratslam.runs.progress import Observer
+from ratslam.runs.run import LAST_TASK, catch_interrupt, process_source
+from ratslam.runs.runner import open_runner
+from ratslam.runs.saved_map import SavedMap, is_map
+from ratslam.runs.sensor import check_same_fov
+from ratslam.runs.source import open_observations
+from robot.recordings.formats import RecordingConfig
+from tactile.base.errors import InputError, tell
+
+NOT_LOCALISED = {
+    "classic": "whose view templates say which view is nearest, and not how likely it is of another place",
+    **dict.fromkeys(LOCALISING.values(), "which is a session in another map, and no map of its own"),
+}
+"""Why nothing can be localised in the maps of a method."""
+OWN = (*SourceConfig.model_fields, "score", "cells")
+"""Sections that a session has of its own in a saved map."""
+
+
+class LocalisationSummary(NamedTuple):
+    """The course of a localisation.
+
+    Attributes:
+        states: [T] a `Localisation` after each step. mass: probability of the last pose. changes: places at
+            which the session does not agree with the map.
+    """
+
+    states: np.ndarray
+    mass: float
+    changes: Sequence[ChangeRow]
+
+    def describe(self) -> str:
+        """The summary in one sentence, and a line for each change."""
+        return "\n".join([self._describe_course(), *(change.describe() for change in self.changes)])
+
+    def _describe_course(self) -> str:
+        found = np.flatnonzero(self.states == Localisation.FOUND)
+        last = Localisation(int(self.states[-1])) if len(self.states) else Localisation.SEARCHING
+        if not len(found):
+            return f"not found in {len(self.states)} steps: {describe_state(last)}"
+        lost = int((np.diff((self.states == Localisation.FOUND).astype(int)) < 0).sum())
+        again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
+        return (
+            f"found after {found[0] + 1} of {len(self.states)} steps, known in {len(found)} of them{again}; "
+            f"at the end: {describe_state(last)}, probability {self.mass:.3f}"
+        )
+
+
+def describe_state(state: Localisation) -> str:
+    """A state in plain words."""
+    return state.name.lower().replace("_", " ")
+
+
+def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
+    """The configuration of a session that is localised in a saved map: source, touch and scores of `config`,
+    the rest as the map was made.
+
+    Raises:
+        InputError: the map was made by a method in whose maps nothing can be localised, or with a sensor of
+            another field of view.
+    """
+    if saved.config.backend not in LOCALISING:
+        found = f"a map made by `backend: {saved.config.backend}`"
+        reason = NOT_LOCALISED.get(saved.config.backend)
+        if reason:
+            found = f"{found}, {reason}"
+        cure = "map the place again with `backend: recall`, or by whiskers with `backend: grid`"
+        raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
+    check_same_fov(str(saved.path), saved.config, config)
+    own = {name: getattr(config, name) for name in OWN}
+    place = config.localise.model_copy(update={"map": saved.path.resolve()})
+    return saved.config.model_copy(
+        update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
+    )
+
+
+def check_assignments(assignments: Sequence[str], saved: SavedMap) -> None:
+    """Refuses settings that a session in a saved map cannot have of its own (`localising`).
+
+    Args:
+        assignments: each `a.b=value`, with names of settings.
+
+    Raises:
+        InputError: a setting would have no effect.
+    """
+    for assignment in assignments:
+        name = assignment.partition("=")[0]
+        section = name.partition(".")[0]
+        if name == "localise.map":
+            found = f"the map is {saved.path}, as given before the recording"
+        elif section in (*OWN, "localise", "include"):
+            continue
+        else:
+            found = f"without effect: {section} is as {saved.path} was made"
+        expected = f"settings of {', '.join(OWN)} or localise"
+        raise InputError(f"--set {name}", found, expected, "leave it out, or map the place anew with it")
+
+
+def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ()) -> RunConfig:
+    """The configuration of a recording by the sensor of a saved map: its readings become views as those of
+    the map did.
+
+    Args:
+        assignments: settings to replace, each `a.b=value`.
+
+    Raises:
+        InputErrors: the assignments have errors. InputError: the file is a map.
+    """
+    if is_map(file):
+        cure = "give the recording or the configuration whose poses are to be found"
+        raise InputError(str(file), "a map, which is no recording", "a recording of the map's sensor", cure)
+    refuse_other_files(file, "a recording or a configuration", (RECORDING, FOLDER))
+    like, file = saved.config.recording, file.resolve()
+    if like is not None and like.topics is None and (file.is_dir() or file.suffix in (".bag", ".db3")):
+        cure = f"`python -m ratslam doctor {file} --like {saved.path} -o FILE.yaml`, and localise FILE.yaml"
+        raise InputError(str(file), "a bag or a folder", f"such a recording as {like.file.name}", cure)
+    recording = RecordingConfig(file=file) if like is None else like.model_copy(update={"file": file})
+    sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
+    text = dump(saved.config.model_copy(update=sources))
+    return validate(override(parse(text, str(saved.path)), assignments), RunConfig)
+
+
+def localising_for_goals(config: RunConfig, saved: SavedMap, start: Start) -> RunConfig:
+    """The same for a session that drives to goals and begins at `start`.
+
+    Raises:
+        InputError: as `localising`.
+    """
+    localised = localising(config, saved)
+    settings = localised.localise.model_copy(update={"start": start})
+    return localised.model_copy(update={"localise": settings})
+
+
+def localise(
+    saved: SavedMap, config: RunConfig, directory: Path, observers: Sequence[Observer] = ()
+) -> tuple[Scorecard, LocalisationSummary, bool]:
+    """Localises the source of a configuration in a saved map, which stays as it is.
+
+    Args:
+        saved: the map. config: with absolute paths; its source and touch are used.
+        directory: the new run directory. observers: are told of the progress.
+
+    Returns:
+        the scorecard, the course of the localisation, and whether Ctrl-C ended it early.
+
+    Raises:
+        InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
+            map.
+    """
+    warnings: list[str] = []
+    with (
+        open_observations(localising(config, saved), tell, warnings) as (completed, source),
+        open_runner(completed, source, directory, observers=observers, warnings=warnings) as runner,
+        catch_interrupt(LAST_TASK),
+    ):
+        interrupted = process_source(runner, source)
+        card = runner.finish(interrupted)
+        made = runner.session.map
+        assert isinstance(made, Localiser | GridLocaliser)
+        changes = read_changes(directory / NAME) if isinstance(made, Localiser) else []
+        summary = LocalisationSummary(made.states(), made.localisation().mass, changes)
+    return card, summary, interrupted

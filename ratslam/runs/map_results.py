@@ -1,0 +1,115 @@
+"""The files of a run directory or a merged folder that follow from its map; scores and plots of these."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluation.artifacts.closure_table import write_closure_pairs
+from evaluation.artifacts.merged_map import NAME as MERGED
+from evaluation.artifacts.merged_map import is_merged, read_session_steps
+from evaluation.artifacts.pieces_table import NAME as PIECES
+from evaluation.artifacts.pieces_table import write_pieces
+from evaluation.artifacts.run_directory import has_steps, read_run
+from evaluation.metrics.energy_metric import read_relations
+from evaluation.metrics.registry import build_metrics
+from evaluation.metrics.scorecard import Scorecard, score_run
+from evaluation.metrics.trajectory import read_tum, write_tum
+from evaluation.plots.run_plots import plot_writers
+from evaluation.plots.session_plot import draw_sessions
+from ratslam.runs.settings.run_config import ScoreConfig
+from ratslam.core.backend import Map
+from ratslam.runs.report import NAME as REPORT
+from tactile.base.atomic_write import write_atomically, write_text_atomically
+from tactile.base.errors import InputError
+
+DERIVED = ("pieces.csv", "health.json", "calibration.yaml", "closures.csv")
+"""Files that only some maps have."""
+
+
+def write_map_results(folder: Path, made: Map, time: np.ndarray) -> None:
+    """Writes trajectories, pieces, health, graph, closures and calibration of a map, each atomically;
+    those of an earlier map that this one lacks are removed.
+
+    Args:
+        time: [n] s, of the last n steps, which are those of the folder.
+    """
+    first = len(made.pieces()) - len(time)
+    final, own, piece = (path[first:] for path in (made.trajectory(), made.map_trajectory(), made.pieces()))
+    write_atomically(folder / "trajectory.tum", lambda path: write_tum(path, time, final))
+    write_atomically(folder / "map.tum", lambda path: write_tum(path, time, own))
+    files: dict[str, Callable[[Path], Any]] = dict(made.files())
+    if made.pieces().any():
+        files[PIECES] = lambda path: write_pieces(path, time, piece)
+    doubt, reason, pairs = made.final_doubt(), made.unjudged(), made.closures()
+    if np.isfinite(doubt) or reason:
+        health = {"worse_than_odometry": doubt if np.isfinite(doubt) else None}
+        text = json.dumps(health | ({"reason": reason} if reason else {})) + "\n"
+        files["health.json"] = lambda path: path.write_text(text, encoding="utf-8")
+    if len(pairs):
+        files.setdefault("closures.csv", lambda path: write_closure_pairs(path, pairs))
+    for name, write in files.items():
+        write_atomically(folder / name, write)
+    for name in DERIVED:
+        if name not in files:
+            (folder / name).unlink(missing_ok=True)
+
+
+def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int]) -> None:
+    """The same for a merged map, whose steps have no times but their numbers, and its picture.
+
+    Args:
+        name: title of the picture. steps: of each session, in the order of the map.
+    """
+    path, piece = made.trajectory(), made.pieces()
+    write_map_results(folder, made, np.arange(len(path), dtype=float))
+    figure = draw_sessions(name, path, piece, steps)
+    write_atomically(folder / "map.png", figure.savefig)
+
+
+def holds_results(folder: Path) -> bool:
+    """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
+    return is_merged(folder) or has_steps(folder)
+
+
+def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:
+    """Writes the files that follow from a map that was changed in its run directory or merged folder.
+
+    Raises:
+        InputError: a file is missing or malformed, or the run has steps that its map lacks.
+    """
+    steps = len(made.pieces())
+    if is_merged(folder):
+        sessions = read_session_steps(folder)
+        if sum(sessions) != steps:
+            found = f"sessions of {sum(sessions)} steps beside a map of {steps}"
+            raise InputError(str(folder / MERGED), found, "those of the map")
+        write_merged_results(folder, made, folder.resolve().name, sessions)
+        return
+    online = folder / "online.tum"
+    time, _ = read_tum(online)
+    if len(time) > steps:
+        cure = "end it with `ratslam run --continue` first, or write the map alone to a new file with -o"
+        raise InputError(str(online), f"{len(time)} steps beside a map of {steps}", "a run that ended", cure)
+    write_map_results(folder, made, time)
+    score_and_plot(folder, config)
+    (folder / REPORT).unlink(missing_ok=True)
+
+
+def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:
+    """Scores a run directory and plots it; see `Runner.finish`.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    relations = read_relations(config.relations) if config.relations else None
+    metrics, exm = build_metrics(config.metrics), config.experience_metric
+    card = score_run(read_run(folder), folder.name, exm=exm, relations=relations, metrics=metrics)
+    write_text_atomically(folder / "scorecard.json", card.model_dump_json(indent=2) + "\n")
+    for name, save in plot_writers(folder).items():
+        write_atomically(folder / name, save)
+    return card

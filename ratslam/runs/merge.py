@@ -1,0 +1,272 @@
+"""Merges saved maps into one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.artifacts.merged_map import NAME as REPORT
+from ratslam.places.joining import Join, Stretches, join_all
+from ratslam.places.overlap import Overlap, overlap, remembered
+from ratslam.places.union import renew_experiences, unite
+from ratslam.methods.map_views import MapViews
+from ratslam.methods.recall import RecallBackend
+from ratslam.runs.settings.strict_yaml import dump
+from ratslam.core.session import Session
+from ratslam.mapping.map import KeyframeMap
+from ratslam.runs.estimate import START
+from ratslam.runs.map_archive import digest_of
+from ratslam.runs.map_results import write_merged_results
+from ratslam.runs.map_settings import assignments, differing_settings
+from ratslam.runs.saved_map import NAME, SavedMap, read_map, write_map
+from ratslam.runs.sensor import differences, settings_of_map
+from tactile.base.errors import InputError
+from tactile.base.new_file import make_new_file, new_folder
+
+
+class MergeReport(NamedTuple):
+    """What was merged.
+
+    Attributes:
+        maps: the inputs in the order of their steps in the merged map. joins: what joined pieces, in order,
+            with the numbers of the maps that had them. pieces: [n] for each piece of the merged map the
+            numbers of the maps with steps in it. steps: [n] of each map. keyframes: not merged, of the merged
+            map. before: the same of all maps together. settings: of the method, by name, that are not the
+            same in all maps, with the value in each; those of the first were taken.
+    """
+
+    maps: tuple[Path, ...]
+    joins: tuple[tuple[Join, Stretches, Stretches], ...]
+    pieces: tuple[tuple[int, ...], ...]
+    steps: tuple[int, ...]
+    keyframes: int
+    before: int
+    settings: dict[str, list[Any]]
+
+    def describe(self) -> str:
+        """Which maps were joined where, and what stayed apart, as text."""
+        lines = [f"{number + 1}  {path}, {self.steps[number]} steps" for number, path in enumerate(self.maps)]
+        for join, one, other in self.joins:
+            x, y, heading = join.start
+            sd_x, sd_y, sd_heading = join.sd
+            lines.append(
+                f"{_names(other)} joined to {_names(one)}, where it begins at {x:.2f} m, {y:.2f} m, "
+                f"{np.degrees(heading):.1f} degrees (sd {sd_x:.3f} m, {sd_y:.3f} m, "
+                f"{np.degrees(sd_heading):.1f} degrees); log-odds {join.log_odds[0]:.0f} and "
+                f"{join.log_odds[1]:.0f} (needed {join.needed[0]:.0f}); {join.closures} closures"
+            )
+        pieces = [_names(piece) for piece in self.pieces]
+        if not self.joins:
+            lines.append("Nothing in the views joins these maps: they stay pieces of the merged map.")
+        if len(pieces) > 1:
+            lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
+        lines.append(f"{self.keyframes} keyframes of {self.before}")
+        if self.settings:
+            lines.append(f"Made with different settings; the merged map has those of {self.maps[0]}:")
+        for name, (taken, *others) in self.settings.items():
+            values = (f"map {k}: {value}" for k, value in enumerate(others, 2) if value != taken)
+            lines.append(f"{name} {taken} ({', '.join(values)})")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON."""
+        return {
+            "maps": [str(path) for path in self.maps],
+            "steps": list(self.steps),
+            "joins": [
+                {
+                    "maps": [list(one), list(other)],
+                    "start": join.start.tolist(),
+                    "sd": join.sd.tolist(),
+                    "log_odds": list(join.log_odds),
+                    "needed": list(join.needed),
+                    "closures": join.closures,
+                }
+                for join, one, other in self.joins
+            ],
+            "pieces": [list(piece) for piece in self.pieces],
+            "keyframes": self.keyframes,
+            "keyframes_before": self.before,
+            "settings": self.settings,
+        }
+
+
+def merge_maps(
+    paths: Sequence[Path], output: Path, report: Callable[[str], None] = lambda _: None
+) -> MergeReport:
+    """Writes one map of several sessions with one sensor; the order of `paths` does not matter.
+
+    Args:
+        output: a new map file (`.npz`), or a new folder for it with its trajectory and graph. It appears
+            complete, at the end. report: called with sentences about the progress.
+
+    Raises:
+        InputError: a map cannot be read or merged, or the output exists.
+    """
+    maps = sorted((read_map(path, report) for path in paths), key=lambda one: one.digest)
+    check_mergeable(maps)
+    session, made = _open(maps[0])
+    backend = session.backend
+    assert isinstance(backend, RecallBackend)
+    steps, before = [maps[0].steps], made.kept_keyframes().count
+    owner = [0] * _stretches(made)
+    tried: set[tuple[Stretches, Stretches]] = set()
+    joins = _join(made, backend, tried, owner, report)
+    for number, saved in enumerate(maps[1:], 1):
+        _, other = _open(saved)
+        steps.append(saved.steps)
+        before += other.kept_keyframes().count
+        owner += [number] * _stretches(other)
+        made = unite(made, other, backend.new_map())
+        report(f"adding {saved.path}")
+        joins += _join(made, backend, tried, owner, report)
+    renew_experiences(made)
+    session.map, views = made, MapViews(backend, made.kept_keyframes())
+    session.change_rows(made.kept_keyframes().count, sum(steps), views.remember)
+    piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
+    found = MergeReport(
+        tuple(saved.path for saved in maps),
+        tuple(joins),
+        tuple(tuple(np.unique(owners[piece == k]).tolist()) for k in range(int(piece.max()) + 1)),
+        tuple(steps),
+        made.kept_keyframes().count,
+        before,
+        differing_settings([saved.config for saved in maps]),
+    )
+    _write(output, session, maps, found)
+    return found
+
+
+def _join(
+    made: KeyframeMap,
+    backend: RecallBackend,
+    tried: set[tuple[Stretches, Stretches]],
+    owner: list[int],
+    report: Callable[[str], None],
+) -> list[tuple[Join, Stretches, Stretches]]:
+    joins = join_all(made, MapViews(backend, made.kept_keyframes()), tried, report)
+    return [(join, _owners(join.stretches[0], owner), _owners(join.stretches[1], owner)) for join in joins]
+
+
+def _owners(stretches: Stretches, owner: Sequence[int]) -> tuple[int, ...]:
+    return tuple(sorted({owner[stretch] for stretch in stretches}))
+
+
+def _stretches(made: KeyframeMap) -> int:
+    return int(made.kept_keyframes().begins.rows.sum()) + 1
+
+
+def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
+    session = saved.open_session()
+    return session, keyframes_of(saved, session.map)
+
+
+def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
+    """Writes the map file, or a folder with it, its settings, trajectory, graph and the report."""
+    made, first = session.map, maps[0]
+    name = " + ".join(dict.fromkeys(saved.source.name for saved in maps))
+    estimate = START._replace(pose=made.trajectory()[-1])
+
+    def write(file: Path) -> None:
+        source = replace(first.source, name=name)
+        write_map(file, session, first.config, source, estimate=estimate)
+
+    if output.suffix == ".npz":
+        make_new_file(output, write)
+        return
+    with new_folder(output) as folder:
+        write(folder / NAME)
+        (folder / "config.yaml").write_text(dump(first.config), encoding="utf-8")
+        (folder / REPORT).write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
+        write_merged_results(folder, made, output.name, report.steps)
+
+
+def _names(maps: Sequence[int]) -> str:
+    """Maps by their numbers from 1."""
+    return " + ".join(str(number + 1) for number in maps)
+
+
+OTHERS = "maps of different sessions"
+
+
+def check_mergeable(maps: Sequence[SavedMap]) -> None:
+    """Raises `InputError` if maps cannot be merged: fewer than two, of another method, without keyframes, of
+    different sensors, or with a session that another one of them holds too."""
+    if len(maps) < 2:
+        raise InputError("merge", "one map", "two or more maps")
+    for saved in maps:
+        if saved.config.backend != "recall":
+            reason = "has no keyframes whose views could be compared"
+            found = f"a map of `backend: {saved.config.backend}`, which {reason}"
+            raise InputError(str(saved.path), found, "maps of `backend: recall`")
+        _check_sensors(maps[0], saved)
+    _check_sessions(maps)
+
+
+def keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
+    """The map restored from a saved one; raises `InputError` if it has no keyframes."""
+    if not isinstance(made, KeyframeMap) or not made.kept_keyframes().count:
+        found = f"a map of `backend: {saved.config.backend}` without keyframes"
+        raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
+    return made
+
+
+def _check_sensors(first: SavedMap, second: SavedMap) -> None:
+    different = differences(first.sensor, second.sensor)
+    if different:
+        clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
+        settings, cure = settings_of_map(different), "merge those of each sensor alone"
+        other = "another sensor"
+        if settings:
+            config = second.path.with_name("config.yaml")
+            other = "other settings of the sensor"
+            cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
+        found = f"made with {other} than {first.path}: {clauses}"
+        raise InputError(str(second.path), found, "maps of one sensor", cure)
+
+
+def _check_sessions(maps: Sequence[SavedMap]) -> None:
+    contents = [digest_of(saved.arrays) for saved in maps]
+    for (first, one), (second, other) in combinations(zip(maps, contents, strict=True), 2):
+        if one == other:
+            raise InputError(str(second.path), f"the same map as {first.path}", OTHERS, "give it once")
+    keyframes = [remembered(keyframes_of(saved, saved.open_session().map)) for saved in maps]
+    for (first, seen), (second, again) in combinations(zip(maps, keyframes, strict=True), 2):
+        common = overlap(seen, again)
+        if common is not None:
+            found = (
+                f"its steps {_span(common.other)} are the session that {first.path} holds in its steps "
+                f"{_span(common.one)}: {common.keyframes} keyframes are equal to the bit"
+            )
+            whole = [len(known.first) == common.keyframes for known in (seen, again)]
+            raise InputError(str(second.path), found, OTHERS, _cure(first.path, second, common, whole))
+        if first.recording and first.recording == second.recording:
+            found = f"its last session is of the same recording ({first.source.name}) as that of {first.path}"
+            raise InputError(str(second.path), found, OTHERS, "leave one of them out")
+
+
+def _cure(first: Path, second: SavedMap, common: Overlap, whole: Sequence[bool]) -> str:
+    """How to count a session once.
+
+    Args:
+        whole: whether all of the first and of the second map is in the other one.
+    """
+    if all(whole):
+        return "leave one of them out: each holds all of the other"
+    for path, contained in zip((first, second.path), whole, strict=True):
+        if contained:
+            return f"leave out {path}, all of which is in the other map"
+    begin, end = common.other
+    rest = f"--steps :{begin}" if begin > second.steps - 1 - end else f"--steps {end + 1}:"
+    crop = f"ratslam map crop {second.path} {rest} -o rest.npz"
+    return f"leave one of them out, or merge the rest of one of them: `{crop}`"
+
+
+def _span(steps: tuple[int, int]) -> str:
+    return f"{steps[0]} to {steps[1]}"

@@ -1,0 +1,303 @@
+"""Map files: the one place that reads and writes them.
+
+A map file (NumPy's .npz; `map.npz` of a run directory) holds the arrays of a session, the completed
+configuration, the description of the readings, and a sha256 over all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ratslam.methods.registry import BACKENDS, LOCALISING
+from ratslam.runs.settings.other_files import MAP, kind_of
+from ratslam.runs.settings.renamed_keys import with_moved_settings
+from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
+from ratslam.runs.settings.strict_yaml import dump, parse, validate
+from ratslam.core.checkpoint import fill_missing, with_prefix
+from ratslam.core.session import UNKNOWN, Session
+from ratslam.runs.build_session import build_session
+from ratslam.runs.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.runs.folder_change import unfinished_change
+from ratslam.runs.map_archive import (
+    EXPECTED,
+    FORMAT,
+    FORMATS,
+    digest_of,
+    read_arrays,
+    text_of,
+    write_arrays,
+)
+from ratslam.runs.map_settings import check_same_settings
+from ratslam.runs.sensor import Sensor, sensor_of
+from ratslam.runs.source import open_observations
+from robot.sources.description import SourceDescription, describe
+from robot.sources.source import Source
+from robot.touch_source import TouchSource, open_touch_source
+from tactile.base.atomic_write import write_atomically
+from tactile.base.bounded import malformed, reason
+from tactile.base.errors import InputError
+from tactile.base.npz import SPOILT
+
+NAME = "map.npz"
+"""The map file of a run directory."""
+TEXTS = ("format", "config", "source", "recording", "sha256")
+"""Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
+of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
+ESTIMATE, FRONTEND, STATE = "estimate/", "frontend/", "state/"
+CHANGED = ("recall", "localise")
+"""Methods whose maps of earlier versions have another state: one without the belief of the pose cells."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """A map as it was saved.
+
+    Attributes:
+        path: of the file. format: its name and version. digest: sha256 (hex) of its content.
+        config: completed for the source. source: description of the readings; its view shape is that of the
+            observations. recording: sha256 (hex) of the recording that was mapped last, '' if there is none.
+        arrays: of the session. estimate: of the last step. frontend: what the touch front end remembers of
+            earlier readings; empty if it was not saved.
+    """
+
+    path: Path
+    format: str
+    digest: str
+    config: RunConfig
+    source: SourceDescription
+    recording: str
+    arrays: Mapping[str, np.ndarray]
+    estimate: PoseEstimate = START
+    frontend: Mapping[str, np.ndarray] | None = None
+
+    @property
+    def steps(self) -> int:
+        """Number of observations in the map."""
+        return int(self.arrays["steps"])
+
+    def samples_of(self, recording: str) -> int | None:
+        """Number of samples of a recording, by its sha256, that are in the map; None if it is not the one
+        mapped last, or has no sha256.
+
+        Raises:
+            InputError: the file is of an earlier version that does not tell.
+        """
+        if not recording or recording != self.recording:
+            return None
+        earlier = int(self.arrays["earlier"])
+        if earlier == UNKNOWN:
+            found = f"{self.steps} steps of several recordings, and not how many are of the last one"
+            cure = "continue the map that this one went on from, or map the recording anew"
+            raise InputError(str(self.path), found, f"a file of the format {FORMAT}", cure)
+        return self.steps - earlier
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor that the map was made with."""
+        return sensor_of(self.config, self.source)
+
+    def open_session(self) -> Session:
+        """A session that goes on from this map, with the map in it.
+
+        Raises:
+            InputError: the arrays do not fit the configuration.
+        """
+        session = build_session(self.config, self.source)
+        self.restore(session, self.config)
+        return session
+
+    def restore(self, session: Session, config: RunConfig) -> None:
+        """Replaces the state and the map of a session by those saved.
+
+        Args:
+            config: of the session, completed; of the map's method.
+
+        Raises:
+            InputError: the session has other settings that the arrays do not fit, which are named, or another
+                view shape; or the arrays are incomplete.
+        """
+        cure = "continue with the configuration and the sensor of the map"
+        try:
+            session.restore(dict(self.arrays))
+            found = _mismatch(self.arrays, session.arrays())
+        except SPOILT as error:
+            found = reason(error)
+        if found:
+            check_same_settings(str(self.path), self.config, config)
+            expected = "a map made with this configuration"
+            if self.config.backend in LOCALISING.values():
+                place = self.config.localise.map
+                expected = f"{place} as it was when this session was localised in it"
+                cure = "restore that map from a copy, or localise the recording again"
+            raise InputError(str(self.path), found, expected, cure) from None
+
+
+def map_file(path: Path) -> Path:
+    """The map file of a run directory, or the file itself."""
+    return path / NAME if path.is_dir() else path
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path is a map by the names in its file."""
+    return kind_of(map_file(path)) == MAP
+
+
+def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMap:
+    """The map in a run directory or a map file.
+
+    Args:
+        report: called with one sentence if the file is of an earlier format and was converted, or if a change
+            of its folder was cut off.
+
+    Raises:
+        InputError: there is none; it is broken, incomplete, of an unknown format, or made by a backend that
+            is not registered.
+    """
+    file = map_file(path)
+    undone = unfinished_change(file.parent)
+    if undone is not None and report is not None:
+        cure = f"repeat `ratslam map undo {file.parent} {undone}` to complete it"
+        report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
+    arrays = read_arrays(file)
+    if "format" not in arrays:
+        return _convert(file, arrays, report)
+    texts = {name: text_of(file, arrays, name) for name in TEXTS}
+    if digest_of(arrays) != texts["sha256"]:
+        found = "damaged: the content does not match its sha256"
+        raise InputError(str(file), found, "the file as it was written", "restore it from a copy")
+    if texts["format"] == FORMATS[0]:
+        arrays["earlier"] = _earlier_steps(arrays)
+    return _saved_map(file, arrays, texts)
+
+
+def write_map(
+    path: Path,
+    session: Session,
+    config: RunConfig,
+    source: SourceDescription,
+    *,
+    recording: str = "",
+    estimate: PoseEstimate = START,
+    frontend: Mapping[str, np.ndarray] | None = None,
+    compressed: bool = True,
+) -> None:
+    """Writes a map file atomically: a reader, also after a kill or a power failure, finds the file that was
+    there or the new one.
+
+    Args, in addition to `SavedMap`:
+        source: as `describe_readings` gives it. compressed: False takes a tenth of the time and thrice the
+            space.
+    """
+    arrays: dict[str, Any] = session.arrays() | {
+        "format": np.array(FORMAT),
+        "config": np.array(dump(config.model_copy(update={"cells": None}))),  # of a run, not of its map
+        "source": np.array(source.to_json()),
+        "recording": np.array(recording),
+    }
+    arrays |= {ESTIMATE + name: value for name, value in estimate_arrays(estimate).items()}
+    arrays |= {FRONTEND + name: np.asarray(value) for name, value in (frontend or {}).items()}
+    arrays["sha256"] = np.array(digest_of(arrays))
+    write_atomically(path, lambda temporary: write_arrays(temporary, arrays, compressed))
+
+
+def describe_readings(source: Source) -> SourceDescription:
+    """The description of the readings of a source of observations: its view shape, and the information of the
+    source whose readings the observations were made of."""
+    readings = source
+    while isinstance(readings, TouchSource):
+        readings = readings.source
+    return SourceDescription(
+        source.view_shape, source.whiskers, source.rate_hz, describe(readings).info, source.name
+    )
+
+
+def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
+    config = _config_of(file, texts["config"])
+    BACKENDS.get(config.backend, f"{file}: backend")
+    with malformed(file, EXPECTED, found="{}", spoilt=SPOILT):
+        source = SourceDescription.from_json(texts["source"])
+        estimate = read_estimate(with_prefix(arrays, ESTIMATE))
+        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
+    if steps < 0:
+        raise InputError(str(file), f"{steps} steps", EXPECTED)
+    if not UNKNOWN <= earlier <= steps:
+        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
+    own = {name: value for name, value in arrays.items() if name not in TEXTS}
+    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
+    fill_missing(session)
+    if texts["format"] != FORMAT:
+        _drop_former_state(session, config.backend)
+    return SavedMap(
+        file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
+        with_prefix(arrays, FRONTEND),
+    )  # fmt: skip
+
+
+def _config_of(file: Path, text: str) -> RunConfig:
+    """The configuration in a map file, of this or an earlier version."""
+    return validate(with_moved_settings(parse(text, f"{file}: config")), LoopConfig)
+
+
+def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], None] | None) -> SavedMap:
+    """The map in a file written before there was a format: by `Slam.save`, which kept its configuration, or
+    in a run directory, where it stands beside it."""
+    if "source" in arrays:
+        config = _config_of(file, text_of(file, arrays, "config"))
+        with malformed(file, EXPECTED, found="{}"):
+            readings = SourceDescription.from_json(text_of(file, arrays, "source"))
+        source = describe_readings(open_touch_source(readings, config.touch))
+    else:
+        beside = file.with_name("config.yaml")
+        if not beside.is_file():
+            found = "a map file of an earlier version, which does not say how it was made"
+            cure = "put the config.yaml of its run beside it, or map the recording again"
+            raise InputError(str(file), found, f"a file of the format {FORMAT}", cure)
+        with open_observations(load_config(beside)) as (config, observed):
+            source = describe_readings(observed)
+    recording = str(arrays.pop("digest", ""))
+    texts = {"format": FORMATS[1], "config": dump(config), "source": source.to_json(), "recording": recording}
+    arrays["earlier"] = _earlier_steps(arrays)
+    arrays |= {name: np.array(value) for name, value in texts.items()}
+    digest = digest_of(arrays)
+    if report is not None:
+        report(f"{file}: of an earlier version; read as {FORMATS[1]}")
+    return _saved_map(file, arrays, texts | {"sha256": digest})
+
+
+def _earlier_steps(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """`Session.earlier` of a file that does not hold it: 0, or unknown if a recording began a further piece
+    of the map."""
+    names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
+    begun = any(np.any(arrays[name]) for name in names if name in arrays)
+    return np.array(UNKNOWN if begun else 0)
+
+
+def _drop_former_state(arrays: dict[str, np.ndarray], backend: str) -> None:
+    """Fits the arrays of an earlier version: they have no sides, and the state of a method that has another
+    one now goes."""
+    arrays["sides"] = np.zeros(0, np.int64)
+    if backend in CHANGED:
+        for name in [name for name in arrays if name.startswith(STATE)]:
+            del arrays[name]
+
+
+def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:
+    """How saved arrays differ from those of the session restored from them, or ''; a state that was not saved
+    does not count."""
+    if not any(name.startswith(STATE) for name in saved):
+        restored = {name: value for name, value in restored.items() if not name.startswith(STATE)}
+    for name in sorted(set(saved) | set(restored)):
+        if name not in restored:
+            return f"the unknown array {name}"
+        if name not in saved:
+            return f"without {name}"
+        for what in ("shape", "dtype"):
+            found, expected = getattr(saved[name], what), getattr(restored[name], what)
+            if found != expected:
+                return f"the array {name} of {what} {found} instead of {expected}"
+    return ""

@@ -1,0 +1,182 @@
+"""The configuration of a run. Each section is defined beside the code that it configures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
+
+from evaluation.metrics.experience_metric import ExmConfig
+from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
+from ratslam.classic.recording_config import CellsConfig
+from ratslam.runs.settings.includes import merge_includes
+from ratslam.runs.settings.packaged import PresetName, find_config
+from ratslam.runs.settings.plugin_settings import check_plugins, resolved_plugin
+from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
+from ratslam.runs.settings.strict_yaml import load, validate
+from ratslam.runs.settings.strict_yaml.document import Document
+from robot.live.config import LiveConfig
+from robot.recordings.formats import RecordingConfig
+from robot.simulation.create.session import CreateSimulationConfig
+from robot.simulation.head.session import SimulationConfig
+from robot.simulation.rat.session import RatSimulationConfig
+from robot.sources.registry import SOURCES
+from robot.touch_source import TOUCH
+from tactile.base.config import Settings
+from tactile.base.errors import InputError
+from tactile.base.plugins import PluginConfig
+from tactile.frontend import TouchConfig
+
+
+class SessionConfig(Settings):
+    """Precision, seed and memory of the session."""
+
+    precision: Literal["float64", "float32"] = "float64"
+    """Floating-point type of the kernel."""
+    seed: NonNegativeInt = 0
+    """Seed of all random streams."""
+    reserve: Annotated[int, Field(ge=0, le=2**19)] = 0
+    """Steps to allocate memory for at the start. 0: those of a source of known length of at most 4096 steps;
+    for others memory grows as needed, and each power of two compiles the kernel again."""
+
+
+class ScoreConfig(Settings):
+    """How a run is scored."""
+
+    experience_metric: ExmConfig = ExmConfig()
+    """Settings of the Experience Metric."""
+    metrics: tuple[PluginConfig, ...] = ()
+    """Registered metrics (`ratslam.metrics`) to compute besides ours."""
+    relations: Path | None = None
+    """File of true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric; null: without it."""
+
+
+SOURCE_SECTIONS = ("recording", "simulation", "create_simulation", "rat_simulation", "source", "live")
+
+
+class SourceConfig(Settings):
+    """The source of a run, exactly one of six, and the processing of whisker readings to views."""
+
+    fewest_sources: ClassVar[int] = 1
+    """Least number of sources: 0 where the caller brings the readings."""
+    recording: RecordingConfig | None = None
+    """A recording."""
+    simulation: SimulationConfig | None = None
+    """Or a simulated arm with a whisker head in a maze."""
+    create_simulation: CreateSimulationConfig | None = None
+    """Or a simulated Create with whiskers in an arena."""
+    rat_simulation: RatSimulationConfig | None = None
+    """Or a simulated rat in a box with cues."""
+    source: PluginConfig | None = None
+    """Or a registered source (`ratslam.sources`)."""
+    live: Annotated[LiveConfig | None, Field(validate_default=True)] = None
+    """Or a robot arm with a whisker head, for `python -m ratslam live`."""
+    touch: TouchConfig = TouchConfig()
+    """How whisker readings become views."""
+
+    @field_validator("live", mode="after")
+    @classmethod
+    def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
+        names = SOURCE_SECTIONS[:-1]
+        sources = {name: info.data.get(name) for name in names} | {"live": live}
+        given = [name for name, source in sources.items() if source is not None]
+        if all(name in info.data for name in names) and not cls.fewest_sources <= len(given) <= 1:
+            there = " and ".join(given) if given else f"neither {', '.join(names)} nor live"
+            raise ValueError(f"{there}; give one of these six, and null for the others")
+        return live
+
+
+class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
+    """A run: `python -m ratslam run config.yaml`. `ratslam.methods.config` has the methods' sections."""
+
+    renamed_keys = RENAMED
+    include: tuple[Path, ...] = ()
+    """Files of settings to use where this file leaves them open, such as `rig.yaml` of `fit` or
+    `calibration.yaml` of a run; a later one comes before an earlier one."""
+    backend: Annotated[str, Field(json_schema_extra={"examples": ["recall", "classic", "grid"]})] = "recall"
+    """The method: `recall` is RatSLAM with Bayesian recall and a keyframe map, `classic` RatSLAM as
+    published, `grid` a grid particle filter; or a registered one (`ratslam.backends`)."""
+    backend_settings: dict[str, Any] = Field(default_factory=dict)
+    """Settings of a registered method."""
+    presets: tuple[PresetName, ...] | None = None
+    """Presets for the settings that are left open (`ratslam.runs.settings.packaged`), the first before the others;
+    null: those that suit the source. The file in the run directory names those that were used."""
+    session: SessionConfig = SessionConfig()
+    """Precision, seed and memory."""
+    score: ScoreConfig = ScoreConfig()
+    """How the result is scored."""
+    cells: CellsConfig | None = None
+    """Recording of the pose cells to `cells.npz`, for methods that have them; null: none."""
+
+    def with_absolute_paths(self, folder: Path) -> RunConfig:
+        """The configuration with relative paths taken from `folder`, independent of the working folder."""
+        relations = self.score.relations
+        parts = {
+            name: part and part.resolved(folder)
+            for name in ("recording", "simulation", "create_simulation", "rat_simulation", "live")
+            for part in [getattr(self, name)]
+        }
+        parts["source"] = self.source and resolved_plugin(self.source, SOURCES, folder)
+        frontend = self.touch.frontend
+        frontend = frontend and resolved_plugin(frontend, TOUCH, folder)
+        touch = {"reports": self.touch.reports.resolved(folder), "frontend": frontend}
+        parts["touch"] = self.touch.model_copy(update=touch)
+        file = self.localise.map
+        parts["localise"] = self.localise.model_copy(update={"map": file and folder / file})
+        parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
+        return self.model_copy(update=parts)
+
+
+class LoopConfig(RunConfig):
+    """The configuration of one's own loop (`ratslam.Slam`): that of a run, with or without a source."""
+
+    fewest_sources = 0
+
+
+def load_config(
+    path: str | os.PathLike[str], assignments: Sequence[str] = (), *, source_required: bool = True
+) -> RunConfig:
+    """Reads a configuration file; its relative paths start at its folder, those of `assignments` at the
+    working folder.
+
+    Args:
+        path: of the file, or the name of a packaged configuration.
+        assignments: settings to replace, each `a.b=value`.
+        source_required: whether a configuration without a source is an error; `ratslam.Slam` needs none.
+
+    Raises:
+        InputErrors: all errors in it, each with file, line and column.
+    """
+    path, model = find_config(path), RunConfig if source_required else LoopConfig
+    document = merge_includes(with_moved_settings(load(path, assignments)), path.parent)
+    _check_sources(document, assignments)
+    config = validate(document, model)
+    check_plugins(document, config)
+    here = config.with_absolute_paths(Path.cwd())
+    for keys in [keys for keys, place in document.places.items() if place.value.startswith("--set")]:
+        text = document.value(keys)
+        if isinstance(text, str) and (full := str(_value_at(here, keys))) != text:  # a relative path
+            document.value(keys[:-1])[keys[-1]] = full
+    return validate(document, model).with_absolute_paths(path.parent.resolve())
+
+
+def _value_at(value: Any, keys: Sequence[str | int]) -> Any:
+    """The value at a path of keys through settings, mappings and lists."""
+    for key in keys:
+        value = getattr(value, str(key)) if isinstance(value, Settings) else value[key]
+    return value
+
+
+def _check_sources(document: Document, assignments: Sequence[str]) -> None:
+    """Raises `InputError` if an assignment sets a part of a source that the configuration does not have."""
+    there = {name for name in SOURCE_SECTIONS if document.data.get(name) is not None}
+    own = {name for name in there if document.places[(name,)].key != "--set"}
+    for assignment in assignments:
+        name = assignment.partition("=")[0]
+        if own and name.partition(".")[0] in there - own:
+            found = f"a setting of another source: this configuration has {' and '.join(sorted(own))}"
+            cure = "a seed belongs to simulated sessions" if name.endswith(".seed") else ""
+            raise InputError(f"--set {name}", found, "settings of that", cure)

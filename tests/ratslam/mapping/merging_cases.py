@@ -1,0 +1,179 @@
+"""Routes that a robot drives again and again, with recall written by hand that follows the map's merges."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ratslam.mapping.acceptance import AcceptByEvidence
+from ratslam.mapping.appearance import LabelAppearance
+from ratslam.mapping.config import KeyframeMapConfig
+from ratslam.mapping.map import KeyframeMap
+from tactile.base.se2 import compose, fit_rigid_motion, integrate
+from tactile.base.types import Odometry, observation
+from tests.ratslam.mapping.map_cases import CELL, STEP, Pose, Seen
+
+GUARD = 20
+CHUNK = 16
+"""Steps between two merges, as in a session."""
+NONE = -1
+RATIO = 4.0
+"""Evidence of what recall finds."""
+RUN, PAUSE = 15, 5
+"""Places in a row that recall finds, and that it does not find thereafter."""
+
+
+class Route(NamedTuple):
+    """A drive of N keyframes.
+
+    Attributes:
+        odometry: [N, 3] motion into each keyframe. truth: [N, 3] poses. place: [N] where each keyframe is
+            along a lap. look: [N] number of its view. recalled: [N] the place that recall finds, `NONE` for
+            none. ratio: [N] its log-likelihood ratio.
+    """
+
+    odometry: np.ndarray
+    truth: np.ndarray
+    place: np.ndarray
+    look: np.ndarray
+    recalled: np.ndarray
+    ratio: np.ndarray
+
+
+class LookAppearance(LabelAppearance):
+    """The views of a route; the ids are the numbers of the keyframes."""
+
+    def __init__(self, look):
+        super().__init__()
+        self._look = look
+
+    def unlikeness(self, frame, others, reversed):
+        return (self._look[others] != self._look[frame]).astype(float)
+
+
+class Drive:
+    """A map with the keyframe that each of its rows is, as a kernel keeps them, and the experience of each
+    keyframe."""
+
+    def __init__(self, route, acceptance=lambda *_: AcceptByEvidence(), **settings):
+        self.acceptance = acceptance
+        config, looks = KeyframeMapConfig.model_validate(settings), LookAppearance(route.look)
+        self.map = KeyframeMap(config, CELL, looks, acceptance, guard=GUARD)
+        self.route, self.settings, self.rows = route, settings, np.zeros(0, int)
+        self.experiences: list[int] = []
+
+    @property
+    def steps(self):
+        """Number of keyframes driven; each step is one."""
+        return self.map.keyframes().count
+
+    def go(self, last):
+        """Drives up to keyframe `last` - 1; at every `CHUNK`th one the map may merge."""
+        for k in range(self.steps, last):
+            if k % CHUNK == 0 and (merged := self.map.merge()) is not None:
+                assert len(merged.onto) == len(self.rows)
+                self.rows = merged.label
+            match = self._recall(int(self.route.recalled[k]))
+            self.rows = np.append(self.rows, k)
+            x, y, turn = self.route.odometry[k].tolist()
+            seen = Seen(len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k])
+            reading = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=k)
+            self.experiences.append(int(self.map.update(reading, Pose(-1, -1, 0), seen).place))
+        return self
+
+    def restored(self):
+        """The same continued from a checkpoint."""
+        other = Drive(self.route, self.acceptance, **self.settings)
+        other.map.restore(self.map.arrays())
+        other.rows, other.experiences = self.rows.copy(), list(self.experiences)
+        return other
+
+    def error(self):
+        """[T] distances of the final trajectory from the truth, m."""
+        path = self.map.map_trajectory()
+        return off(path, self.route.truth[: len(path)])
+
+    def merged_apart(self):
+        """[T] true distances of keyframes from those that they are or are merged with, m."""
+        onto = self.rows[self.map.archive.row.rows]
+        return self._apart(onto)
+
+    def experience_apart(self):
+        """[T] true distances of keyframes from the first one of their experience, m."""
+        nodes = self.map.graph().nodes
+        return self._apart([nodes[place]["keyframe"] for place in self.experiences])
+
+    def _apart(self, others):
+        truth = self.route.truth
+        return np.hypot(*(truth[: len(others)] - truth[others])[:, :2].T)
+
+    def _recall(self, place):
+        """The row of the oldest keyframe at a place, or near it."""
+        old = self.rows[: max(len(self.rows) - GUARD, 0)]
+        if place < 0 or not len(old):
+            return NONE
+        apart = np.abs(self.route.place[old] - place)
+        best = int(np.argmin(apart))
+        return best if apart[best] <= 1 else NONE
+
+
+def off(poses, truth):
+    """[N] distances of poses from the true ones, moved as a whole to fit them best, m."""
+    return np.hypot(*(compose(fit_rigid_motion(poses, truth), poses) - truth)[:, :2].T)
+
+
+def drifting(motion, seed, noise=0.02, bias=0.01):
+    """Motions [N, 3] as odometry measures them: with noise of turns (rad) and a bias (rad/m)."""
+    stream = np.random.default_rng(seed)
+    measured = motion.copy()
+    measured[:, 2] += stream.normal(0, noise, len(motion)) - bias * np.hypot(*motion[:, :2].T)
+    measured[0] = 0.0
+    return measured
+
+
+def arcs(*parts):
+    """[n, 3] motions along arcs of (steps, turn)."""
+    turn = np.concatenate([np.full(steps, whole / steps) for steps, whole in parts])
+    return np.stack([STEP * np.cos(turn / 2), STEP * np.sin(turn / 2), turn], axis=1)
+
+
+def laps(lap, count, seed):
+    """`count` laps of motions [n, 3]; most places of the first lap are recalled later, `RUN` in a row."""
+    motion = np.tile(lap, (count, 1))
+    truth = np.vstack([np.zeros(3), integrate(motion[:-1])])
+    motion = np.vstack([np.zeros(3), motion[:-1]])
+    k = np.arange(len(motion))
+    place = k % len(lap)
+    known = (k >= len(lap)) & (place % (RUN + PAUSE) < RUN)
+    return Route(
+        drifting(motion, seed), truth, place, place, np.where(known, place, NONE), np.full(len(k), RATIO)
+    )
+
+
+def circles(count, seed=0, size=80):
+    """Laps of a circle of `size` keyframes."""
+    return laps(arcs((size, 2 * np.pi)), count, seed)
+
+
+CORRIDOR = 16
+"""Keyframes of a corridor."""
+NORTH, SOUTH = 0, 74
+"""Places where the two corridors begin."""
+
+
+def corridors(count, seed=0, evidence=1.5):
+    """Laps through two parallel corridors that look the same, 1.3 m apart, heading east in both.
+
+    In the first lap recall takes the second corridor for the first one, with this evidence at each keyframe,
+    when only odometry speaks against it; later it finds nothing there.
+    """
+    ahead, back, half = (CORRIDOR, 0.0), (CORRIDOR, 0.0), np.pi
+    route = laps(arcs(ahead, (16, half), back, (26, half), ahead, (36, half), back, (26, half)), count, seed)
+    place = route.place
+    inside = (place >= SOUTH) & (place < SOUTH + CORRIDOR)
+    look = np.where(inside, place - SOUTH + NORTH, place)
+    false = (np.arange(len(place)) < SOUTH + CORRIDOR - 1) & inside & (place > SOUTH)
+    recalled = np.where(inside, NONE, route.recalled)
+    recalled[false] = look[false]
+    return route._replace(look=look, recalled=recalled, ratio=np.where(false, evidence, RATIO))

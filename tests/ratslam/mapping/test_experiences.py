@@ -1,0 +1,157 @@
+"""Laws of experiences as groups of keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.core.types import Action
+from ratslam.mapping.experiences import ExperienceChange, Experiences
+from tactile.base.se2 import between, compose, wrap
+
+RADIUS, HEADING = 1.0, 0.5
+
+
+def walk(*frames, world=None):
+    """Folds frames (x, y, heading, matched, sure); returns experiences, changes and poses."""
+    world = world or Experiences(RADIUS, HEADING)
+    poses = np.array([frame[:3] for frame in frames], float)
+    return world, [world.arrive(poses[: k + 1], k, *frames[k][3:]) for k in range(len(frames))], poses
+
+
+def at(x, y=0.0, heading=0.0, matched=-1, sure=False):
+    return (x, y, heading, matched, sure)
+
+
+def test_the_first_frame_makes_an_experience():
+    world = Experiences(RADIUS, HEADING)
+    assert world.stay() == ExperienceChange(-1, -1, Action.NONE)
+    assert world.arrive(np.zeros((1, 3)), 0, -1, False) == ExperienceChange(0, -1, Action.CREATE)
+    assert world.stay() == ExperienceChange(0, 0, Action.NONE)
+
+
+@pytest.mark.parametrize(
+    ("to", "stays"),
+    [
+        (at(0.9), True),
+        (at(1.1), False),
+        (at(0, 0.9), True),
+        (at(0, 0, 0.4), True),
+        (at(0, 0, -0.6), False),
+        (at(0.8, 0, 0.4), False),  # each deviation alone is within reach, both together are not
+    ],
+)
+@pytest.mark.parametrize("facing", [0.0, 3.0, -3.1])  # also across the wrap of angles
+def test_an_experience_reaches_as_far_as_its_radius(to, stays, facing):
+    there = (*to[:2], wrap(to[2] + facing), *to[3:])
+    _, changes, _ = walk(at(0, 0, facing), there)
+    assert changes[1] == (
+        ExperienceChange(0, 0, Action.NONE) if stays else ExperienceChange(1, 0, Action.CREATE)
+    )
+
+
+def test_the_radius_is_around_the_first_frame():
+    _, changes, _ = walk(at(0), at(0.7), at(1.4))
+    assert [s.place for s in changes] == [0, 0, 1]
+
+
+def test_a_matched_frame_reaches_its_experience_at_any_distance():
+    _, changes, _ = walk(at(0), at(5), at(10), at(15.2, matched=1), at(20), at(15, matched=1))
+    assert changes[3] == ExperienceChange(1, 2, Action.SET)  # by the link from 1 to 2, backwards
+    assert changes[5] == ExperienceChange(1, 3, Action.SET)
+
+
+def test_a_new_connection_is_a_link_and_later_a_set():
+    frames = [at(0), at(5), at(10), at(0, matched=0), at(10, matched=2), at(0, matched=0), at(0.1, matched=0)]
+    _, changes, _ = walk(*frames)
+    assert [s.action for s in changes[3:]] == [Action.LINK, Action.SET, Action.SET, Action.NONE]
+    assert [s.place for s in changes[3:]] == [0, 2, 0, 0]
+
+
+def test_a_match_reaches_the_experience_of_the_matched_frame():
+    _, changes, _ = walk(at(0), at(0.5), at(5), at(10), at(0, matched=1))
+    assert changes[4] == ExperienceChange(0, 2, Action.LINK)
+
+
+def test_only_a_reliable_pose_finds_known_experiences():
+    frames = [at(0), at(5), at(10), at(0.9, sure=True)]
+    _, changes, _ = walk(*frames)
+    assert changes[3] == ExperienceChange(0, 2, Action.LINK)
+    _, changes, _ = walk(*frames[:3], at(0.9))
+    assert changes[3] == ExperienceChange(3, 2, Action.CREATE)
+    _, changes, _ = walk(*frames[:3], at(1.1, sure=True))
+    assert changes[3] == ExperienceChange(3, 2, Action.CREATE)
+
+
+def test_the_nearest_experience_is_found_unless_the_current_one_is_in_reach():
+    _, changes, _ = walk(at(0), at(1.5), at(8), at(0.9, sure=True))
+    assert changes[3].place == 1
+    _, changes, _ = walk(at(0), at(1.5), at(0.7, sure=True), at(0.8, sure=True))
+    assert [s.place for s in changes[2:]] == [1, 1]  # 0 is nearer, 1 is the current one
+    assert changes[2].action == Action.NONE
+
+
+frames = st.lists(
+    st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3), st.integers(-30, 39), st.booleans()),
+    min_size=1,
+    max_size=40,
+)
+
+
+@given(frames, st.integers(0, 39))
+def test_the_graph_follows_from_the_changes(steps, cut):
+    steps = [(*s[:3], s[3] if s[3] < k else -1, s[4]) for k, s in enumerate(steps)]
+    steps = [(*s[:3], max(s[3], -1), s[4]) for s in steps]
+    cut = min(cut, len(steps) - 1)
+    world, changes, poses = walk(*steps)
+    made, ways, previous = [], {}, -1
+    for frame, (place, before, action) in enumerate(changes):
+        assert before == previous
+        created = place == len(made)
+        if created:
+            made.append(frame)
+        assert 0 <= place < len(made)
+        known = (before, place) in ways or (place, before) in ways
+        reached = Action.NONE if place == before else Action.SET if known else Action.LINK
+        assert action == (Action.CREATE if created else reached)
+        if steps[frame][3] >= 0:
+            assert place == changes[steps[frame][3]].place
+        if place != before and before >= 0:
+            ways[before, place] = ways.get((before, place), 0) + 1
+        previous = place
+    moved = poses + [1.0, 2.0, 0.0]  # the map is deformed after the frames were grouped
+    graph = world.graph(moved, np.arange(len(moved)), np.zeros(len(moved), int))
+    assert list(graph.nodes) == list(range(len(made)))
+    assert [graph.nodes[place]["keyframe"] for place in graph] == made
+    assert {(a, b): data["traversals"] for a, b, data in graph.edges(data=True)} == ways
+    stands = [np.array([node["x"], node["y"], node["heading"]]) for node in graph.nodes.values()]
+    np.testing.assert_allclose(stands, moved[made], rtol=0, atol=1e-12)
+    for a, b, way in graph.edges(data=True):
+        gap = compose(stands[a], np.array([way["dx"], way["dy"], way["dtheta"]])) - stands[b]
+        assert np.allclose([*gap[:2], wrap(gap[2])], 0, atol=1e-9)
+
+    half, _, _ = walk(*steps[: cut + 1])
+    again, _, _ = walk(at(0), at(9))  # its state before is replaced
+    again.restore(half.arrays())
+    for k in range(cut + 1, len(steps)):
+        assert again.arrive(poses[: k + 1], k, *steps[k][3:]) == changes[k]
+    assert again.stay() == world.stay()
+    assert all(np.array_equal(again.arrays()[name], rows) for name, rows in world.arrays().items())
+
+
+def test_an_experience_keeps_its_pose_when_its_frame_is_merged_with_one_that_faces_back():
+    world, _, poses = walk(at(0.0), at(5.0), at(5.02, 0.01, np.pi), at(0.0, 0.0, np.pi))
+    poses = poses - [0.0, 0.0, 0.1]
+    before = world.graph(poses, np.arange(4), np.zeros(4, int))
+    kept, onto = np.array([0, 1]), np.array([0, 1, 1, 0])
+    offset = between(poses[kept[onto]], poses)
+    world.merge(kept, onto, offset)
+    after = world.graph(poses[kept], kept, np.zeros(len(kept), int))
+    assert len(after) == len(before) == 4
+    for place in before:
+        for key in ("x", "y", "heading"):
+            assert after.nodes[place][key] == pytest.approx(before.nodes[place][key], abs=1e-12)
+    # The robot comes back the other way and finds the experience, not the one of its merged frame.
+    assert world.arrive(np.vstack([poses[kept], poses[2]]), 2, -1, True).place == 2

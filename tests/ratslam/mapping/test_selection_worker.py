@@ -1,0 +1,123 @@
+"""Selection beside the session: its result is taken up at a fixed keyframe, however long it takes."""
+
+from __future__ import annotations
+
+from threading import Event
+
+import numpy as np
+import pytest
+
+from ratslam.mapping import selection_worker
+from ratslam.mapping.loop_closures import Verdict
+from ratslam.mapping.selection_worker import DELAY, THREAD
+from tests.ratslam.mapping.map_cases import LAP, drive, new_map, sequence
+
+EVERY = 60
+SELECTED = {"select_every": EVERY}
+BEGUN = 4 * EVERY
+"""The first selection with closures to select from."""
+SEEN = sequence(LAP + 2, 2, 80, 5.0)
+LAST = LAP + 90
+
+
+def same(a, b):
+    first, second = a.arrays(), b.arrays()
+    assert first.keys() == second.keys()
+    return all(np.array_equal(first[name], second[name], equal_nan=True) for name in first)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The map after all keyframes, without a pause; tests only read it."""
+    return drive(new_map(**SELECTED), SEEN, last=LAST)
+
+
+@pytest.fixture
+def held():
+    """Holds the thread back until the event is set."""
+    gate = Event()
+
+    def hold():
+        THREAD.submit(gate.wait, 60)
+
+    yield hold, gate
+    gate.set()
+
+
+def test_a_slow_selection_gives_the_same_bits(held, whole):
+    hold, gate = held
+    slow = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
+    hold()
+    drive(slow, SEEN, first=BEGUN - 1, last=BEGUN + DELAY - 1)
+    assert slow.keyframes().count > BEGUN  # the session went on while the selection was held back
+    gate.set()
+    assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), whole)
+
+
+def test_a_selection_in_progress_keeps_its_views_when_the_map_is_restored(held):
+    hold, gate = held
+    map = drive(new_map(**SELECTED), SEEN, last=BEGUN)
+    expected = map.arrays()
+    again = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
+    hold()
+    drive(again, SEEN, first=BEGUN - 1, last=BEGUN)
+    selection = again.selection.job.result
+    again.restore(new_map(**SELECTED).arrays())
+    gate.set()
+    for name, value in selection.result(60).arrays().items():
+        assert np.array_equal(value, expected[f"selection/job/result/{name}"], equal_nan=True), name
+
+
+def test_the_result_is_taken_up_after_the_delay(monkeypatch):
+    taken = []
+    real = selection_worker.SelectedMap.take_up
+
+    def take_up(self, graph, log):
+        taken.append((len(self.poses), graph.count))
+        real(self, graph, log)
+
+    monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
+    drive(new_map(**SELECTED), SEEN, last=LAST)
+    assert taken == [(BEGUN, BEGUN + DELAY)]
+
+
+def test_frequent_selections_wait_for_each_other(monkeypatch):
+    taken = []
+    real = selection_worker.SelectedMap.take_up
+
+    def take_up(self, graph, log):
+        taken.append(graph.count - len(self.poses))
+        real(self, graph, log)
+
+    monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
+    drive(new_map(select_every=10), SEEN, last=LAST)
+    assert set(taken) == {10}
+    assert len(taken) > 3
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        pytest.param(BEGUN - 3, marks=pytest.mark.soak),
+        BEGUN + 1,
+        BEGUN + DELAY - 1,
+        pytest.param(BEGUN + DELAY + 1, marks=pytest.mark.soak),
+    ],
+)
+def test_a_checkpoint_during_a_selection_continues_to_the_same_bits(at, whole):
+    part = drive(new_map(**SELECTED), SEEN, last=at)
+    restored = new_map(**SELECTED)
+    restored.restore(part.arrays())
+    assert same(drive(restored, SEEN, first=at, last=LAST), whole)
+    assert same(drive(part, SEEN, first=at, last=LAST), whole)
+
+
+def test_verdicts_given_while_a_selection_works_stay():
+    """A sequence too short to be selected when the selection begins, and accepted before it is taken up."""
+    early, late = sequence(LAP + 2, 2, 20, 5.0), sequence(BEGUN - 1, BEGUN - 1 - LAP, 60, 5.0)
+    before, after = (
+        drive(new_map(**SELECTED), early | late, last=last).arrays()["log/verdict"]
+        for last in (BEGUN, BEGUN + DELAY)
+    )
+    assert before.tolist() == [Verdict.ACCEPTED, Verdict.OPEN]
+    assert after.tolist() == [Verdict.ACCEPTED, Verdict.ACCEPTED]

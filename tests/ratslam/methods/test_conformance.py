@@ -1,0 +1,162 @@
+"""Our backends pass the conformance checks; and what they do in the walks of the checks."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.core.session import CHUNK, capacity_at
+from ratslam.examples import dead_reckoning
+from ratslam.methods.grid import GridOutcome
+from ratslam.methods.localise_grid import GridLocaliseOutcome
+from ratslam.methods.registry import BACKENDS
+from ratslam.places.localiser import Localisation
+from ratslam.service.checks.backend import CHECKS
+from ratslam.service.checks.backend_trial import CIRCUIT, BackendTrial
+
+
+def pose_cells(method, source, **more):
+    """A small network."""
+    return method, {"pose_cells": {"cells_xy": 11}, "templates": {"source": source}} | more
+
+
+# Selects sequences every few frames, so that it does so throughout the session.
+TOUCH = {
+    "recall": {"sector_fov": "whiskers"},
+    "keyframes": {"select_every": 15, "may_be_carried": True, "sequence_agreement": 0.2},
+}
+SIGNED = TOUCH | {"recall": {"sector_fov": "whiskers", "images": "signed"}}
+# With large odometry noise, so that it resamples throughout the session.
+DOUBTFUL = {
+    "particles": 20,
+    "side": 1.5,
+    "drift": {"step": 0.3, "heading": 0.05},
+    "likelihood": {"free": 0.5, "contact": 4.0},
+    "resampling": {"min_effective_share": 0.9},
+}
+METHODS = {
+    "recall": pose_cells("recall", "views"),
+    "recall-labels": pose_cells("recall", "labels"),
+    "touch": pose_cells("recall", "views", **TOUCH),
+    "signed-touch": pose_cells("recall", "views", **SIGNED),
+    "classic": pose_cells("classic", "views"),
+    "classic-labels": pose_cells("classic", "labels"),
+    "grid": ("grid", {"grid": DOUBTFUL}),
+    "localise": pose_cells("localise", "views", **TOUCH),
+    "localise_grid": ("localise_grid", {"grid": DOUBTFUL}),
+}
+EXAMPLE = "dead-reckoning"
+OFTEN = {"recall", "recall-labels", "classic", "classic-labels", "signed-touch", "localise", "localise_grid"}
+"""Backends that differ from another one by the kind of views, do less, or have tests of whole sessions: for
+`make soak`."""
+
+
+def some(names):
+    """The names as parameters, those of `OFTEN` for the soak."""
+    return [pytest.param(name, marks=pytest.mark.soak) if name in OFTEN else name for name in names]
+
+
+@cache
+def trial_of(name):
+    if name == EXAMPLE:
+        return BackendTrial(dead_reckoning.ENTRY, dead_reckoning.Config())
+    method, settings = METHODS[name]
+    if name == "localise":
+        settings = settings | {"localise": {"map": str(map_of("touch")), "log_odds": 3.0}}
+    if name == "localise_grid":
+        file = str(map_of("grid"))
+        settings = settings | {"localise": {"map": file, "log_odds": 0.5, "particles": 300}}
+    entry = BACKENDS.get(method, "backend")
+    return BackendTrial(entry, entry.config_class.model_validate(settings))
+
+
+@cache
+def map_of(name):
+    """The file of the map that a method makes of the first laps of the walk of the checks."""
+    file = Path(os.environ["RATSLAM_TEST_FOLDER"]) / f"{name}_{os.getpid()}.npz"
+    session = trial_of(name).fresh()
+    list(session.replay(trial_of(name).walk(12 * CIRCUIT)))
+    np.savez(file, **session.arrays())
+    return file
+
+
+SELDOM = {"a batch equals its members": {EXAMPLE}, "single precision stays single": {"grid", EXAMPLE}}
+"""Checks that compile most, and the backends of which `make test` makes them."""
+
+
+def cases():
+    """Every backend with every check; the rare ones, and those of the backends in `OFTEN`, for the soak."""
+    for name in [*METHODS, EXAMPLE]:
+        for check in CHECKS:
+            rare = name not in SELDOM.get(check.name, {name})
+            seldom = pytest.mark.soak if rare or name in OFTEN else ()
+            yield pytest.param(name, check, id=f"{name}-{check.name}", marks=seldom)
+
+
+@pytest.mark.parametrize(("name", "check"), list(cases()))
+def test_our_backends_pass(name, check):
+    check.run(trial_of(name))
+
+
+@pytest.mark.parametrize(
+    "name", [one if one == "grid" else pytest.param(one, marks=pytest.mark.soak) for one in METHODS]
+)
+def test_the_evidence_is_finite_in_single_precision(name):
+    _, steps = trial_of(name).single
+    for step in steps:
+        # Undefined until a place is recognised.
+        known = [name for name in step.evidence._fields if name not in ("background", "error")]
+        for value in (np.asarray(getattr(step.evidence, name)) for name in known):
+            assert value.dtype.kind != "f" or np.isfinite(value).all()
+
+
+def test_touch_closes_loops_and_selects_sequences_in_these_walks():
+    # Otherwise the checks of replay, checkpoints and capacities would not cover it.
+    arrays = trial_of("touch").arrays
+    assert arrays["map/appearance/likeness/0"].any()
+    weight = arrays["map/log/weight"]
+    assert ((weight > 0) & (weight < 1)).any()
+
+
+def test_the_grid_filter_resamples_in_these_walks():
+    # Otherwise the checks of replay and checkpoints would not cover it.
+    outcomes = np.array([step.evidence.outcome for step in trial_of("grid").steps])
+    assert 10 < (outcomes == GridOutcome.RESAMPLED).sum() < 330
+
+
+@pytest.mark.soak
+def test_the_pose_is_found_and_searched_for_in_these_walks():
+    # Otherwise the checks of replay and checkpoints would not cover it.
+    states = trial_of("localise").map.states()
+    assert 100 < (states == Localisation.FOUND).sum() < 336
+
+
+@pytest.mark.soak
+def test_searches_fail_and_resample_in_these_walks():
+    # Otherwise the checks of replay and checkpoints would not cover it.
+    outcomes = np.array([step.evidence.outcome for step in trial_of("localise_grid").steps])
+    assert 5 < (outcomes == GridLocaliseOutcome.RESAMPLED).sum() < 330
+    assert (outcomes == GridLocaliseOutcome.BEGUN_ANEW).sum() > 1
+
+
+FIXED = ["classic", "classic-labels", "grid", "localise", "localise_grid", EXAMPLE]
+
+
+@pytest.mark.parametrize("name", some(FIXED))
+def test_memory_does_not_grow_on_known_ground(name):
+    """Otherwise time and memory of long sessions on known ground would grow."""
+    trial = trial_of(name)
+    session = trial.fresh()
+    list(session.replay(trial.walk(600)))
+    assert session.compilations() == 1
+
+
+def test_capacity_depends_on_the_chunk_alone():
+    assert {capacity_at(step) for step in range(256)} == {256}
+    assert capacity_at(256) == 512
+    assert len({capacity_at(step) for step in range(CHUNK * 4, CHUNK * 5)}) == 1
+    assert capacity_at(0, 1000) == 1024

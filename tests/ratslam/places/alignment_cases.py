@@ -1,0 +1,97 @@
+"""Random poses and motions, and a loop of keyframes that all look different."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ratslam.mapping.following import Motion, Supposed
+from ratslam.mapping.gain_odds import GainOdds, learn_gain_odds
+from ratslam.mapping.ground import Ground
+from tactile.base.se2 import between, compose, wrap
+
+REACH, REACH_HEADING = 0.06, 0.3
+VARIANCE = np.array([0.04, 0.04, 0.12]) ** 2
+
+POSES = st.builds(
+    lambda x, y, heading: np.array([x, y, heading]), *[st.floats(-9, 9)] * 2, st.floats(-np.pi, np.pi)
+)
+VARIANCES = arrays(np.float64, 3, elements=st.sampled_from((0.0, 1e-5, 1e-4, 1e-3, 0.01)))
+MOTIONS = st.builds(
+    lambda x, y, turn, variance: Motion(np.array([x, y, turn]), variance),
+    *[st.floats(-0.3, 0.3)] * 2, st.floats(-0.5, 0.5), VARIANCES,
+)  # fmt: skip
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def ground_at(poses: np.ndarray, turns: tuple[float, ...] = (0.0,)) -> Ground:
+    return Ground(np.atleast_2d(poses), np.array(turns), REACH, REACH_HEADING, VARIANCE)
+
+
+def supposed(pose: np.ndarray, deviation: float = 0.02) -> Supposed:
+    return Supposed(pose, np.diag(np.full(3, deviation**2)))
+
+
+def moved_by(change: np.ndarray, ground: Ground) -> Ground:
+    """The ground after a rigid motion [3] of the whole map."""
+    return ground._replace(poses=compose(change, ground.poses))
+
+
+def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-9) -> None:
+    error = np.asarray(found) - expected
+    error[..., 2] = wrap(error[..., 2])
+    np.testing.assert_allclose(error, 0, atol=tolerance)
+
+
+class Loop(NamedTuple):
+    """A square loop whose places all look different.
+
+    Attributes:
+        poses: [N, 3] of its keyframes, 0.05 m apart.
+    """
+
+    poses: np.ndarray
+
+    @property
+    def ground(self) -> Ground:
+        return ground_at(self.poses)
+
+    def drive(self, begin: int, count: int, seed: int) -> np.ndarray:
+        """[count, 3] true poses of a robot that drives along the loop, and is a little beside it."""
+        beside = np.random.default_rng(seed).normal(0, [0.005, 0.005, 0.03], (count, 3))
+        return compose(self.poses[(begin + np.arange(count)) % len(self.poses)], beside)
+
+    def gains(self, truth: np.ndarray, seed: int) -> np.ndarray:
+        """[n, 1, N] gains of views at true poses [n, 3]: high at the keyframes near by, low elsewhere."""
+        stream, ground = np.random.default_rng([seed, 1]), self.ground
+        gain = stream.normal(-0.5, 1.0, (len(truth), 1, len(self.poses)))
+        for k, pose in enumerate(truth):
+            near = ground.near(pose, 1.5 * REACH, 2 * REACH_HEADING)
+            gain[k][near] = stream.normal(2.0, 0.7, len(near[0]))
+        return gain.astype(np.float32)
+
+
+def square_loop(side: int = 20) -> Loop:
+    """A square with `side` keyframes along each edge."""
+    step, turn = np.array([0.05, 0.0, 0.0]), np.array([0.05, 0.0, np.pi / 2])
+    poses = [np.zeros(3)]
+    for k in range(1, 4 * side):
+        poses.append(compose(poses[-1], step if k % side else turn))
+    return Loop(np.array(poses))
+
+
+def odds_of(true: float = 2.0, false: float = -0.3) -> GainOdds:
+    """Log-odds of gains that were counted at these means."""
+    stream = np.random.default_rng(0)
+    return learn_gain_odds(stream.normal(true, 0.8, 2000), stream.normal(false, 1.0, 2000))
+
+
+def motions_of(truth: np.ndarray, noise: float, seed: int) -> list[Motion]:
+    """Measured motions into each of the poses [n, 3] but the first, into which there is none."""
+    variance = np.full(3, noise**2)
+    error = np.random.default_rng([seed, 2]).normal(0, noise, (len(truth) - 1, 3))
+    steps = between(truth[:-1], truth[1:]) + error
+    return [Motion(np.zeros(3), np.zeros(3)), *(Motion(step, variance) for step in steps)]

@@ -1,0 +1,233 @@
+"""Recorded pose cells: those of the network, the same bits of everything else, Ctrl-C, refusals."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import replace
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+import ratslam
+from ratslam.methods.registry import Sensors
+from ratslam.classic.cell_probe import active_cells
+from ratslam.classic.levels import to_full_torus
+from ratslam.runs.settings.run_config import LoopConfig
+from ratslam.examples import dead_reckoning
+from ratslam.runs.build_session import build_session
+from ratslam.runs.cell_plan import plan_recording
+from ratslam.runs.cell_recorder import ROWS
+from ratslam.runs.run import process_source
+from ratslam.runs.runner import open_runner
+from robot.sources.in_memory import InMemorySource
+from tactile.base.errors import InputError
+
+STEPS, RATE = 200, 50.0
+SHAPE = (36, 21, 21)
+CELLS = {"chosen": 40, "sums": {"bins": 4, "heading_bins": 8}}
+METHOD = {"backend": "classic", "templates": {"threshold": 0.02, "recent": 0}}
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Circles whose views come back, so that both window levels are used; the last poses are unknown."""
+    angle = 4 * np.pi * np.arange(STEPS) / STEPS
+    truth = np.stack([0.5 + 0.4 * np.cos(angle), 0.5 + 0.4 * np.sin(angle), angle + np.pi / 2], axis=1)
+    truth[-10:] = np.nan
+    motion = np.tile([0.06, 0.0, 4 * np.pi / STEPS, 1 / RATE], (STEPS, 1))
+    motion[0] = 0.0
+    kind = 1 + np.arange(STEPS) // 5 % 7
+    views = 0.5 + 0.5 * np.sin(np.arange(8) * kind[:, None])
+    return InMemorySource(
+        name="circles", digest="circles", time=np.arange(STEPS) / RATE, motion=motion,
+        moved=np.ones(STEPS, bool), views=views[:, None, :, None], seen=np.arange(STEPS) % 5 == 0,
+        label=np.full(STEPS, -1, np.int32), truth=truth,
+    )  # fmt: skip
+
+
+def session_of(walk, cells):
+    return build_session(LoopConfig.model_validate({**METHOD, "cells": cells}), walk)
+
+
+@pytest.fixture(scope="module")
+def live(walk):
+    """A session that records, its steps one at a time, and the whole torus after each."""
+    session = session_of(walk, CELLS)
+    whole = jax.jit(partial(to_full_torus, session.backend.window_levels))
+    steps, torus = [], []
+    for sample in walk:
+        steps.append(session.step(sample.reading))
+        torus.append(whole(session.state.cells.activity))
+    return session, steps, np.array(torus).reshape(STEPS, -1)
+
+
+def test_recorded_activity_is_that_of_the_state_after_each_step(live):
+    session, steps, torus = live
+    assert {int(step.evidence.window_level) for step in steps} == {0, 1}, "both window levels"
+    single = torus.astype(np.float32)
+    drawn = np.array([step.probed for step in steps])
+    assert drawn.shape == (STEPS, 40)
+    assert (drawn > 0).any()
+    for k, step in enumerate(steps):
+        assert set(step.probed.tolist()) <= set(single[k].tolist())
+        assert (step.seldom is not None) == (k % 5 == 4)
+        if step.seldom is not None:
+            cell, active = active_cells(session.backend.window_levels, step.seldom)
+            np.testing.assert_array_equal(np.bincount(cell, active, len(single[k])), single[k])
+
+
+def leaves(steps):
+    return [np.concatenate([np.ravel(x) for x in (*s.estimate, *s.evidence, s.pose)]) for s in steps]
+
+
+def test_replay_equals_live_and_recording_changes_no_bit(live, walk):
+    session, steps, _ = live
+    state, trajectory = session.arrays(), session.map.trajectory()
+    readings = [sample.reading for sample in walk]
+    session.restart()
+    again = list(session.replay(readings))
+    assert session.compilations() == 1
+    for one, other in zip(steps, again, strict=True):
+        np.testing.assert_array_equal(one.probed, other.probed)
+        jax.tree.map(np.testing.assert_array_equal, one.seldom, other.seldom)
+    plain = session_of(walk, None)
+    off = list(plain.replay(readings))
+    assert off[0].probed is None
+    np.testing.assert_array_equal(leaves(off), leaves(steps))
+    np.testing.assert_array_equal(plain.map.trajectory(), trajectory)
+    for name, value in plain.arrays().items():
+        np.testing.assert_array_equal(value, state[name], err_msg=name)
+
+
+def run(walk, directory, cells=CELLS, resume=None):
+    config = LoopConfig.model_validate({**METHOD, "cells": cells})
+    with open_runner(config, walk, directory, resume) as runner:
+        runner.finish(process_source(runner, walk))
+    return ratslam.Result(directory)
+
+
+@pytest.fixture(scope="module")
+def result(walk, tmp_path_factory):
+    return run(walk, tmp_path_factory.mktemp("cells") / "run")
+
+
+def test_a_run_records_its_steps(result, live, walk):
+    _, steps, torus = live
+    cells = result.cells
+    assert (cells.shape, cells.cell_size) == (SHAPE, 0.1)
+    np.testing.assert_array_equal(cells.time, walk.time)
+    np.testing.assert_array_equal(cells.truth, walk.truth)
+    np.testing.assert_array_equal(cells.packet, [step.evidence.packet for step in steps])
+    np.testing.assert_array_equal(cells.energy, [step.evidence.energy for step in steps])
+    np.testing.assert_array_equal(cells.place, [step.estimate.place for step in steps])
+    np.testing.assert_array_equal(cells.activity, torus.astype(np.float32)[:, cells.cell])
+    assert (cells.energy > 0).any()
+    assert not (result.directory / ROWS).exists()
+
+
+def test_sums_are_those_of_the_whole_recording(result, live, walk):
+    _, _, torus = live
+    sums, due = result.cells.sums, np.arange(4, STEPS - 10, 5)
+    pose, seconds = walk.truth[due], np.diff(walk.time[due], prepend=0.0)
+    edges = [sums.y_edges, sums.x_edges]
+    at = [pose[:, 1], pose[:, 0]]
+    expected = np.array([np.histogram2d(*at, edges, weights=seconds * one)[0] for one in torus[due].T])
+    np.testing.assert_allclose(sums.seconds, np.histogram2d(*at, edges, weights=seconds)[0], rtol=1e-9)
+    np.testing.assert_allclose(sums.place, expected, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(sums.place.sum(axis=0), sums.seconds, rtol=1e-5)
+    headings = np.round(pose[:, 2] / (2 * np.pi) * 8).astype(int) % 8
+    expected = np.array([np.bincount(headings, seconds * one, 8) for one in torus[due].T])
+    np.testing.assert_allclose(sums.heading, expected, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(sums.heading.sum(axis=0), sums.heading_seconds, rtol=1e-5)
+    assert (sums.x_edges[0], sums.x_edges[-1]) == (np.nanmin(walk.truth[:, 0]), np.nanmax(walk.truth[:, 0]))
+
+
+def test_a_run_without_cells_has_the_same_files_and_no_cells(result, walk, tmp_path):
+    plain = run(walk, tmp_path / "plain", None)
+    assert plain.cells is None
+    names = [{path.name for path in one.directory.iterdir()} for one in (result, plain)]
+    assert names[0] - names[1] == {"cells.npz", "cells.png"}
+    for name in ("steps.csv", "trajectory.tum", "map.json", "map.npz"):
+        assert (plain.directory / name).read_bytes() == (result.directory / name).read_bytes(), name
+
+
+class Interrupting(InMemorySource):
+    """Presses Ctrl-C."""
+
+    def __iter__(self):
+        for number, sample in enumerate(super().__iter__()):
+            if number == 70:
+                signal.raise_signal(signal.SIGINT)
+            yield sample
+
+
+def test_an_interrupted_run_has_its_cells_and_a_continued_one_the_rest(result, walk, tmp_path, capsys):
+    first = run(Interrupting(**vars(walk)), tmp_path / "first")
+    assert first.interrupted
+    second = run(walk, tmp_path / "second", resume=tmp_path / "first")
+    assert len(first.cells.time) == 80
+    whole, parts = result.cells, (first.cells, second.cells)
+    for name in ("time", "truth", "packet", "energy", "place", "activity"):
+        found = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(found, getattr(whole, name), err_msg=name)
+    # The first due step of the second part counts from the part's first step on: 4 steps instead of 5.
+    lost = whole.sums.seconds.sum() - sum(part.sums.seconds.sum() for part in parts)
+    assert lost == pytest.approx(1 / RATE)
+
+
+def test_an_unfinished_run_has_rows_and_no_recording(walk, tmp_path):
+    config = LoopConfig.model_validate({**METHOD, "cells": CELLS})
+    with open_runner(config, walk, tmp_path / "run") as runner:
+        runner.process(list(walk)[:16])
+    assert (tmp_path / "run" / ROWS).exists()
+    assert not (tmp_path / "run" / "cells.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cells": {"chosen": 15_877}}, "cells.chosen: 15877; expected at most 15876"),
+        ({"cells": {"sums": {"bins": 500}}}, "cells.sums: sums of 15876 cells, which need 29.6 GiB"),
+    ],
+)
+def test_bad_settings_are_one_error_before_the_run_directory_is_made(walk, tmp_path, settings, message):
+    config = LoopConfig.model_validate({**METHOD, "cells": CELLS, **settings})
+    with pytest.raises(InputError, match=message), open_runner(config, walk, tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_method_without_pose_cells_is_refused(walk):
+    backend = dead_reckoning.ENTRY.build(dead_reckoning.Config(), Sensors((1, 8, 1)), np.dtype(float))
+    config = LoopConfig.model_validate({"backend": "dead_reckoning", "cells": {}})
+    with pytest.raises(InputError, match="cells: `backend: dead_reckoning`, a method without pose cells"):
+        plan_recording(config, walk, backend)
+
+
+def test_an_unknown_extent_is_an_error_and_a_given_one_is_used(walk, tmp_path):
+    unknown = replace(walk, truth=None)
+    with pytest.raises(InputError, match=r"cells.sums.extent: missing, and circles does not tell"):
+        session_of(unknown, CELLS)
+    given = {**CELLS, "sums": {**CELLS["sums"], "extent": [0.0, 0.0, 0.5, 1.0]}}
+    sums = run(walk, tmp_path / "run", given).cells.sums
+    assert (sums.x_edges[-1], sums.y_edges[-1]) == (0.5, 1.0)
+    inside = np.flatnonzero(walk.truth[:, 0] <= 0.5)
+    assert sums.seconds.sum() == pytest.approx(5 / RATE * np.sum(inside % 5 == 4))
+
+
+def test_steps_of_an_unknown_pose_are_recorded_and_not_summed(walk, tmp_path):
+    sums = {**CELLS["sums"], "extent": [0.0, 0.0, 1.0, 1.0]}
+    cells = run(replace(walk, truth=None), tmp_path / "run", {**CELLS, "sums": sums}).cells
+    assert np.isnan(cells.truth).all()
+    assert len(cells.activity) == STEPS
+    assert cells.sums.seconds.sum() == cells.sums.place.sum() == 0
+
+
+def test_a_loop_of_ones_own_has_the_chosen_cells_of_each_step(result, walk):
+    slam = ratslam.Slam(LoopConfig.model_validate({**METHOD, "cells": CELLS}), walk)
+    assert slam.cells is None
+    for sample, activity in zip(walk, result.cells.activity[:20], strict=False):
+        slam.step(sample)
+        np.testing.assert_array_equal(slam.cells, activity)

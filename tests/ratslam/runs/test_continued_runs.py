@@ -1,0 +1,220 @@
+"""Runs that go on from a map after another recording: none of their samples is left out or mapped twice."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ratslam
+import ratslam.runs.runner
+from ratslam.runs.settings.run_config import LoopConfig
+from ratslam.core.session import Session
+from ratslam.runs.build_session import build_session
+from ratslam.runs.continuation import resume_session
+from ratslam.runs.map_archive import digest_of
+from ratslam.runs.run import process_source
+from ratslam.runs.runner import open_runner
+from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map
+from robot.recordings.formats import RecordingConfig, open_recording
+from robot.sources.in_memory import InMemorySource
+from robot.sources.source import Sample
+from tactile.base.errors import InputError
+
+TRACE = Path(__file__).parents[2] / "golden" / "a_square3.npz"
+METHOD = {
+    "pose_cells": {"cells_xy": 11, "cells_heading": 12, "cell_size": 0.1},
+    "attractor": {"engine": "dense"},
+}
+FIRST, SECOND = 60, 100
+"""Samples of the two recordings; the first ends amid a chunk of the session."""
+
+
+class Killed(Exception):
+    """The end of a process, without results."""
+
+
+def kill() -> None:
+    raise Killed
+
+
+interrupt = partial(signal.raise_signal, signal.SIGINT)
+
+
+@dataclass(frozen=True, eq=False)
+class Stopping(InMemorySource):
+    """A recording at one of whose samples something happens."""
+
+    number: int = -1
+    happens: Callable[[], None] = interrupt
+
+    def __iter__(self) -> Iterator[Sample]:
+        for number, sample in enumerate(super().__iter__()):
+            if number == self.number:
+                self.happens()
+            yield sample
+
+
+def part(name: str, rows: slice) -> InMemorySource:
+    """Rows of the square as a recording of their own."""
+    with open_recording(RecordingConfig(file=TRACE)) as whole:
+        assert isinstance(whole, InMemorySource)
+        names = ("time", "motion", "moved", "views", "seen", "label", "truth")
+        return replace(whole, name=name, digest=name, **{each: getattr(whole, each)[rows] for each in names})
+
+
+def first() -> InMemorySource:
+    return part("monday", slice(FIRST))
+
+
+def second() -> InMemorySource:
+    return part("tuesday", slice(FIRST, FIRST + SECOND))
+
+
+def stopping(number: int, happens: Callable[[], None]) -> Stopping:
+    """The second recording, at one of whose samples something happens."""
+    return Stopping(**vars(second()), number=number, happens=happens)
+
+
+@cache
+def compiled() -> Session:
+    return build_session(LoopConfig.model_validate(METHOD), first())
+
+
+def run(source: InMemorySource, directory: Path, resume: Path | None = None, *warned: str) -> SavedMap:
+    config, session = LoopConfig.model_validate(METHOD), compiled()
+    session.restart()
+    with open_runner(config, source, directory, resume, session, warnings=list(warned)) as runner:
+        runner.finish(process_source(runner, source))
+    return read_map(directory)
+
+
+@pytest.fixture(scope="module")
+def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("continued") / "monday"
+    run(first(), directory)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def expected(monday: Path) -> SavedMap:
+    """The map of both recordings, without an interruption."""
+    return run(second(), monday.with_name("whole"), monday)
+
+
+def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of readers and of the judge of motion, those of the map first, each once."""
+    told = iter((["a gap"], ["a gap", "a jump"]))
+    found: list[tuple[np.ndarray, np.ndarray, str]] = []
+    monkeypatch.setattr(
+        ratslam.runs.runner, "judge_motion", lambda *args: found.append(args) or next(told)
+    )
+    for name, source, resume, wanted in (
+        ("a", first(), None, ["cut off", "a gap"]),
+        ("b", second(), tmp_path / "a", ["cut off", "a gap", "late", "a jump"]),
+    ):
+        run(source, tmp_path / name, resume, *(["cut off", "late"] if resume else ["cut off"]))
+        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
+        assert manifest["input"] == {"verdict": "warned", "warnings": wanted}
+        result = ratslam.Result(tmp_path / name)
+        assert list(result.warnings) == list(result.scorecard.health.warnings) == wanted
+        assert result.health.input == "warned"
+    time, motion, where = found[1]
+    assert where == "tuesday"
+    np.testing.assert_array_equal(time, second().time)
+    np.testing.assert_allclose(motion[:, :3], second().motion[:, :3], atol=1e-12)
+    np.testing.assert_allclose(motion[1:, 3], np.diff(time))
+
+
+def assert_same(found: SavedMap, expected: SavedMap) -> None:
+    assert found.steps == FIRST + SECOND
+    assert found.arrays.keys() == expected.arrays.keys()
+    for name, array in expected.arrays.items():
+        np.testing.assert_array_equal(found.arrays[name], array, err_msg=name)
+    assert found.digest == expected.digest
+
+
+def test_an_interrupted_run_goes_on_after_its_own_samples(
+    monday: Path, expected: SavedMap, tmp_path: Path
+) -> None:
+    """Twice: at a sample within a chunk of the session, and before the end."""
+    parts = [run(stopping(30, interrupt), tmp_path / "a", monday)]
+    parts.append(run(stopping(70, interrupt), tmp_path / "b", tmp_path / "a"))
+    assert FIRST < parts[0].steps < parts[1].steps < FIRST + SECOND
+    assert [each.samples_of("tuesday") for each in parts] == [each.steps - FIRST for each in parts]
+    assert [each.samples_of("monday") for each in parts] == [None, None]
+    assert_same(run(second(), tmp_path / "c", tmp_path / "b"), expected)
+    times = [np.loadtxt(tmp_path / each / "online.tum", usecols=0) for each in "abc"]
+    np.testing.assert_array_equal(np.concatenate(times), second().time)
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(
+    monday: Path, expected: SavedMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ratslam.runs.runner, "CHECKPOINT_EVERY", 16)
+    with pytest.raises(Killed):
+        run(stopping(45, kill), tmp_path / "killed", monday)
+    assert 0 < read_map(tmp_path / "killed").steps - FIRST < 45
+    assert_same(run(second(), tmp_path / "rest", tmp_path / "killed"), expected)
+
+
+def test_a_recording_that_is_mapped_whole_is_refused(expected: SavedMap, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"already holds all {SECOND} samples of tuesday"):
+        run(second(), tmp_path / "again", expected.path)
+
+
+def of_first_format(file: Path, path: Path) -> Path:
+    """A copy of a map file in the format that does not tell which steps are of the last recording."""
+    with np.load(file) as archive:
+        arrays = {name: archive[name] for name in archive.files if name != "earlier"}
+    arrays["format"] = np.array("ratslam-map-1")
+    np.savez(path, **arrays | {"sha256": np.array(digest_of(arrays))})
+    return path
+
+
+def test_a_map_of_one_recording_in_the_first_format_goes_on(tmp_path: Path) -> None:
+    whole = run(second(), tmp_path / "whole")
+    run(stopping(45, interrupt), tmp_path / "a")
+    old = of_first_format(tmp_path / "a" / "map.npz", tmp_path / "old.npz")
+    found = run(second(), tmp_path / "b", old)
+    assert found.steps == whole.steps
+    maps = [saved.open_session().map for saved in (found, whole)]
+    np.testing.assert_array_equal(*(map.trajectory() for map in maps))
+
+
+def test_a_map_in_the_first_format_that_does_not_tell_its_samples_is_refused(
+    expected: SavedMap, tmp_path: Path
+) -> None:
+    old = of_first_format(expected.path, tmp_path / "old.npz")
+    message = r"old\.npz: 160 steps of several recordings.*continue the map that this one went on from"
+    with pytest.raises(InputError, match=message):
+        run(second(), tmp_path / "refused", old)
+    assert run(part("wednesday", slice(160, 170)), tmp_path / "other", old).samples_of("wednesday") == 10
+
+
+@pytest.mark.parametrize("recording", ["tuesday", ""])
+def test_another_recording_cannot_go_on_in_a_map_of_one_piece(recording: str, tmp_path: Path) -> None:
+    config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
+    session, source = build_session(config, first()), describe_readings(first())
+    write_map(tmp_path / "map.npz", session, config, source, recording="monday")
+    assert resume_session(session, tmp_path, config, first())[0] == 0
+    message = (
+        rf"map\.npz: a map of `backend: classic`, which is one piece; {recording or 'loop'} is not the "
+        "recording that was mapped last.*expected that recording, which goes on.*by itself, or map both with"
+    )
+    other = replace(second(), name=recording or "loop", digest=recording)
+    with pytest.raises(InputError, match=message):
+        resume_session(session, tmp_path, config, other)
+    assert session.steps == session.earlier == 0
+
+
+def test_another_method_is_refused_before_its_pieces(monday: Path, tmp_path: Path) -> None:
+    config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
+    with pytest.raises(InputError, match=r"backend is classic and was recall.*`--set backend=recall`"):
+        resume_session(build_session(config, first()), monday, config, second())

@@ -1,0 +1,61 @@
+"""Whisker curves, verdicts and the schedule of whole maps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ratslam.runs.progress import MapSchedule
+from ratslam.service.viewer.drawing import POINTS, VerdictLog, whisker_curves
+from tactile.whiskers.head_geometry import HeadConfig, tip_points, ur10_head
+
+HEAD = ur10_head(HeadConfig())
+WHISKERS = len(HEAD.length)
+
+
+def parts(curve):
+    return np.diff(curve, axis=0)
+
+
+def test_free_whiskers_are_straight_to_their_tips():
+    free = np.zeros(WHISKERS, bool)
+    curves = whisker_curves(HEAD, free, np.full((WHISKERS, 2), 9.0), np.full(WHISKERS, 9.0))
+    assert curves.shape == (WHISKERS, POINTS, 3)
+    assert np.allclose(curves[:, 0], HEAD.base, atol=1e-12)
+    assert np.allclose(curves[:, -1], tip_points(HEAD, np.zeros(WHISKERS)), atol=1e-12)
+    along = curves - HEAD.base[:, None]
+    assert np.allclose(np.cross(along, HEAD.rest[:, None]), 0.0, atol=1e-12)
+
+
+def test_a_whisker_in_contact_ends_at_the_contact_and_leaves_its_base_as_at_rest():
+    contact = np.arange(WHISKERS) == 4
+    point = np.zeros((WHISKERS, 2))
+    point[4] = 0.03, 0.04
+    height = np.full(WHISKERS, 0.02)
+    curves = whisker_curves(HEAD, contact, point, height)
+    assert np.allclose(curves[4, -1], [0.03, 0.04, 0.02], atol=1e-12)
+    turns = [np.linalg.norm(np.cross(part / np.linalg.norm(part), HEAD.rest[4])) for part in parts(curves[4])]
+    assert turns[0] < 0.5 * turns[-1]  # it bends away from its direction at rest
+
+
+def test_verdicts_are_told_once_and_an_accepted_one_that_falls_is_dropped():
+    log = VerdictLog()
+    assert [tuple(change) for change in log.changes(np.array([[0, 9, 0]]))] == [(0, 9, "open")]
+    assert log.changes(np.array([[0, 9, 0]])) == []
+    found = log.changes(np.array([[0, 9, 1], [1, 10, 1]]))
+    assert [tuple(change) for change in found] == [(0, 9, "accepted"), (1, 10, "accepted")]
+    assert [tuple(c) for c in log.changes(np.array([[0, 9, 0], [1, 10, -1]]))] == [
+        (0, 9, "dropped"),
+        (1, 10, "dropped"),
+    ]
+    assert log.changes(np.zeros((0, 3), int)) == []
+
+
+def test_whole_maps_cost_a_small_multiple_of_the_last_one():
+    """If a report costs as much as the map has steps."""
+    for first in (0, 5000):
+        schedule = MapSchedule(first)
+        steps = range(first + 16, first + 20_000, 16)
+        due = [count for count in steps if schedule.is_due(count)]
+        assert due[0] == first + 16
+        assert len(due) > 20
+        assert sum(due) < 20 * steps[-1]
