@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.studies.study import check_study, read_study
 from ratslam.cli import build_parser, main
-from ratslam.experiments.studies.study import check_study, read_study
 from ratslam.runs.settings.packaged import find_config, packaged_configs
 from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import override, parse, validate
@@ -88,7 +88,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 LONG = {
     "docs/cells.md", "ratslam/README.md", "ratslam/classic/README.md", "ratslam/core/README.md",
-    "ratslam/experiments/studies/README.md", "ratslam/experiments/trials/README.md",
+    "evaluation/studies/README.md", "evaluation/papers/trials/README.md",
     "ratslam/service/export/README.md", "ratslam/grid/README.md", "ratslam/runs/README.md",
     "ratslam/service/rats/README.md", "ratslam/service/viewer/README.md",
 }  # fmt: skip

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import entry_points
 from types import FrameType
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
@@ -24,35 +25,25 @@ from ratslam.cli import (
     maps,
     merge,
     path,
-    reproduce,
     run,
-    studies,
     tools,
 )
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
 from tactile.base.atomic_write import FULL
-from tactile.base.errors import InputError, printable
+from tactile.base.errors import InputError, printable, tell
 
-MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, studies, reproduce, files, check, tools)
-"""The commands, in the order of the help."""
+MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, files, check, tools)
+"""The commands that are always there, in the order of the help."""
+INSTALLED = "ratslam.commands"
+"""Group of the entry points of further commands: functions that take `Commands` and register theirs."""
 GROUPS = ("run", "live", "maps", "look", "study", "papers", "files")
 """Headings of the help, in this order."""
 DESCRIPTION = "Maps an area and localises a robot by whiskers, camera or laser (RatSLAM)."
-RETIRED = {
-    "tune": "reproduce threshold",
-    "train-templates": "reproduce templates",
-    **studies.REPLACED,
-    **tools.MOVED,
-}
-"""Commands of earlier versions, and the replacement of each."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Parses the arguments and runs one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv and argv[0] in RETIRED:
-        print(f"ratslam: error: `{argv[0]}` is now `ratslam {RETIRED[argv[0]]}`", file=sys.stderr)
-        return INPUT_ERROR
     arguments = build_parser().parse_args(argv)
     with _sigterm_as_interrupt() as terminated:
         code = _run_command(arguments)
@@ -129,7 +120,8 @@ class Program(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         lines = ["usage: ratslam COMMAND ...", DESCRIPTION, ""]
-        for group in GROUPS:
+        groups = dict.fromkeys([*GROUPS, *(parser.group for parser in self.commands.parsers.values())])
+        for group in groups:
             heading = group
             for name, parser in self.commands.parsers.items():
                 if parser.group == group:
@@ -145,4 +137,10 @@ def build_parser() -> Program:
     parser.commands = Commands(parser)
     for module in MODULES:
         module.add_commands(parser.commands)
+    for point in sorted(entry_points(group=INSTALLED), key=lambda point: point.name):
+        try:
+            point.load()(parser.commands)
+        except Exception as error:  # whatever a package does; it harms no other command
+            cause = f"{type(error).__name__}: {error}"
+            tell(f"the commands '{point.name}' ({point.value}) cannot be loaded: {cause}; repair them")
     return parser

@@ -14,9 +14,6 @@ from ratslam.runs.settings import SCHEMA_START
 from tactile.base.atomic_write import write_text_atomically
 from tactile.base.new_file import make_new_file, require_new_file
 
-MOVED = {name: f"tools {name}" for name in ("recover", "convert", "schema", "version", "completion")}
-"""Commands that stood beside the others before, and what each is now."""
-
 
 def add_commands(commands: Commands) -> None:
     """Registers `tools` with its commands."""

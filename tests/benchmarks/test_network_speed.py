@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from ratslam.experiments.tables.speed import (
+from evaluation.papers.tables.speed import (
     MOTION,
     interleaved_medians,
     network_calls,

@@ -39,7 +39,7 @@ HALL_BASELINE = BaselineConfig(colour=1.0, colour_time=0.005, drift=1.5, creep=0
 """Fitted to magnetic (Hall) whiskers that an arm pushes through clutter (arXiv 2406.06038): colour and drift
 to the free whiskers left 4 and 5, creep to left 0, 1 and 3. Others agree: left 6 and 7 (5 ms, drift 1.7),
 right 0, 1 and 2 (creep 0.02). A whisker read by a camera shows neither colour nor drift (0.2). See
-`ratslam/experiments/real/drift.py`."""
+`evaluation/papers/whiskers/drift.py`."""
 
 
 class Baseline:

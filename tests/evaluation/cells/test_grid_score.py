@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from evaluation.cells.autocorrelogram import autocorrelogram, centre_radii
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
-from ratslam.experiments.cells.agreement import grid_score, quiet
+from evaluation.papers.cells.agreement import grid_score, quiet
 from tactile.base.errors import InputError
 from tests.evaluation.cells.lattice_maps import lattice_map, mixed_maps
 

@@ -23,7 +23,7 @@ from evaluation.cells.information import (
 )
 from evaluation.cells.rate_map import bin_activity, rate_maps, smooth_plane, smooth_rates, tuning_curves
 from evaluation.cells.recording import BinnedSums
-from ratslam.experiments.cells.agreement import border_score, mutual_information, quiet
+from evaluation.papers.cells.agreement import border_score, mutual_information, quiet
 from tactile.base.random_streams import stream
 from tests.evaluation.cells.box_walk import EDGES, mixed_cells, random_walk
 

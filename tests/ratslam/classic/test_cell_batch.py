@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from evaluation.studies.machine import compilations
 from ratslam.classic import pose_cells
 from ratslam.classic.batch import Network
 from ratslam.classic.cell_batch import SEGMENT, CellCourse, CellSets, walk
 from ratslam.classic.levels import to_full_torus, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from ratslam.classic.window import ring_difference
-from ratslam.experiments.studies.machine import compilations
 from tactile.base.types import Odometry
 
 CONFIG = NetworkConfig(cells_xy=21)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from importlib.metadata import version
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
 import pytest
 
-from ratslam.cli import GROUPS, RETIRED, build_parser, main
-from ratslam.experiments.atlas.registry import ROWS
+from evaluation.papers.maps.registry import ROWS
+from ratslam.cli import GROUPS, build_parser, main
+from ratslam.cli.common import Commands
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = build_parser()
@@ -55,18 +56,29 @@ def test_every_command_has_an_example_that_is_understood(name: str) -> None:
     assert callable(build_parser().parse_args(words[1:]).command)
 
 
+def test_commands_of_a_broken_package_harm_no_others(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = EntryPoint("broken", "no_such_package.commands:add_commands", "ratslam.commands")
+    monkeypatch.setattr("ratslam.cli.entry_points", lambda group: [broken])
+    assert "run" in build_parser().commands.parsers
+    assert "the commands 'broken' (no_such_package" in capsys.readouterr().err
+
+
+def test_commands_of_an_own_group_are_in_the_help(monkeypatch) -> None:
+    mine = EntryPoint("mine", f"{__name__}:add_commands", "ratslam.commands")
+    monkeypatch.setattr(EntryPoint, "load", lambda self: add_commands)
+    monkeypatch.setattr("ratslam.cli.entry_points", lambda group: [mine])
+    assert "\nmine    survey " in build_parser().format_help()
+
+
+def add_commands(commands: Commands) -> None:
+    commands.add("survey", None, "measure a field", "survey field", "mine")
+
+
 def test_an_unknown_command_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         main(["runn"])
     assert left.value.code == 2
     assert "invalid choice: 'runn'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("name", "now"), RETIRED.items())
-def test_a_command_that_moved_answers_with_its_place(name: str, now: str, capsys) -> None:
-    assert main([name]) == 2
-    assert capsys.readouterr().err == f"ratslam: error: `{name}` is now `ratslam {now}`\n"
-    assert now.split()[0] in COMMANDS
 
 
 def test_the_version_names_python_and_jax(capsys: pytest.CaptureFixture[str]) -> None:

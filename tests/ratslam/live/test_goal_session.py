@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import write_tum
-from ratslam.experiments.atlas.sessions import Recipe, touch_config
-from ratslam.experiments.atlas.stored_maps import store_map
-from ratslam.experiments.tables.touch import MAIN
+from evaluation.papers.maps.sessions import Recipe, touch_config
+from evaluation.papers.maps.stored_maps import store_map
+from evaluation.papers.tables.touch import MAIN
 from ratslam.live.goal_steering import plan_goals
 from ratslam.runs.settings.run_config import load_config
 from robot.live.route import plan_path

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.experiments.atlas.scenarios import ten_circuits
-from ratslam.experiments.atlas.stored_maps import store_map
+from evaluation.papers.maps.scenarios import ten_circuits
+from evaluation.papers.maps.stored_maps import store_map
 from ratslam.mapping.calibration import HeadingNoise
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT, STEPS, SelectionProblem, select_closures
 from ratslam.mapping.map_solution import NOISY, reconsidered, seems_noisy

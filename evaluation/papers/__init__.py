@@ -1,0 +1,1 @@
+"""Figures of papers and tables of results; nothing else imports them."""

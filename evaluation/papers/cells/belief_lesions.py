@@ -1,0 +1,510 @@
+"""Figures of lesions and of sizes: what of its network `backend: recall` cannot do without.
+
+A lesion replaces functions of `ratslam.network.pose_cells` from outside while a session runs, so that the
+product has no setting for it. Sessions are those of the table of whisker mazes (`reproduce tables touch`)
+and, where the real recordings are at hand, Intel's laser recording. The control is the intact network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
+from evaluation.papers.cells.figure import CellFigure, CellTask
+from evaluation.papers.cells.panel_grid import head_panel, panel_grid
+from evaluation.papers.cells.timing import time_call
+from evaluation.papers.tables.buildings import FALSE_DISTANCE
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.recordings import Recording
+from evaluation.papers.tables.touch import SessionFigures, TouchTask, run_and_measure, task_config
+from evaluation.papers.trials.recording_trial import closure_claims, run_recording
+from evaluation.papers.trials.touch_trial import collect_session, new_session
+from evaluation.plots import style
+from evaluation.studies.executor import run_tasks
+from ratslam.core.backend import Backend
+from ratslam.core.session import Session
+from ratslam.methods.recall import RecallBackend
+from ratslam.network import pose_cells
+from ratslam.network.config import Network, PoseCellConfig
+from ratslam.network.pose_cells import Belief, Ties, ViewCells
+from ratslam.recall import filter
+from ratslam.runs.settings.run_config import RunConfig
+from robot.sources.in_memory import InMemorySource
+from robot.touch_source import observation_of
+from tactile.base.random_streams import stream
+from tactile.base.types import Array
+
+INTACT, EXCHANGED = "intact (control)", "activity of another session"
+ROWS = ("main", "exploration")
+"""Rows of the touch table."""
+USUAL = 2
+"""Mazes; each gives the seed of its lesions too."""
+AWAY = 50
+"""From the number of a maze to that of the maze whose activity replaces its own."""
+EVERY = 16
+"""View cells after which the activity of another session is taken anew."""
+SPAN = 2.0
+"""Side of the square over which random ties are spread, m."""
+SILENT = (0.05, 0.1, 0.2, 0.3)
+"""Shares of silent cells."""
+INTEL = Recording("Intel", "configs/intel_laser.yaml", real=True)
+COLOURS = (style.VERMILLION, style.BLUE)
+COLUMNS = (
+    "lesion", "sessions", "revisits closed", "closures, false", "of the intact closures", "EM", "ARR",
+    "true closures on Intel",
+)  # fmt: skip
+
+Functions = Mapping[str, Callable[..., Any]]
+"""Functions of `pose_cells` by name."""
+
+
+def constant_prediction() -> Functions:
+    """Every view cell is reached by the same share of the activity, wherever that is."""
+
+    def predict(network: Network, belief: Belief, cells: ViewCells, motion: Array) -> tuple[Array, Array]:
+        del network, motion
+        share = jnp.sum(belief.activity) / jnp.maximum(jnp.sum(cells.used), 1.0)
+        return share * cells.used, jnp.zeros_like(share)
+
+    return {"predict": predict}
+
+
+def permuted_together(seed: int) -> Functions:
+    """Cells change places, and all that is tied to them goes with them: a network of other names."""
+    tie, excite = pose_cells.tie, pose_cells.excite
+
+    def tie_moved(network: Network, shape: tuple[int, ...], cells: ViewCells) -> Ties:
+        ties = tie(network, shape, cells)
+        return ties._replace(index=jnp.asarray(_order(seed, shape), jnp.int32)[ties.index])
+
+    def excite_moved(network: Network, activity: Array) -> Array:
+        order = _order(seed, activity.shape)
+        sheet = activity.reshape(-1)[order].reshape(activity.shape)
+        return excite(network, sheet).reshape(-1)[np.argsort(order)].reshape(activity.shape)
+
+    return {"tie": tie_moved, "excite": excite_moved}
+
+
+def permuted_cells(seed: int) -> Functions:
+    """After every view the activities of all cells change places; the ties stay."""
+    anchor = pose_cells.anchor
+
+    def anchor_moved(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
+        belief = anchor(network, belief, cells, mass)
+        flat = belief.activity.reshape(-1)[_order(seed, belief.activity.shape)]
+        return belief._replace(activity=flat.reshape(belief.activity.shape))
+
+    return {"anchor": anchor_moved}
+
+
+def permuted_ties(seed: int) -> Functions:
+    """Every view cell is tied to the cells around a random pose, always the same; the cells stay."""
+    predict, anchor = pose_cells.predict, pose_cells.anchor
+
+    def elsewhere(cells: ViewCells) -> ViewCells:
+        rows = stream(seed, "cells.random_ties").random((cells.x.shape[1], 3))
+        x, y, heading = (
+            jnp.broadcast_to(jnp.asarray(row, cells.x.dtype), cells.x.shape)
+            for row in (rows * [SPAN, SPAN, 2 * np.pi]).T
+        )
+        return ViewCells(x, y, heading, jnp.cos(heading), jnp.sin(heading), cells.used)
+
+    return {
+        "predict": lambda network, belief, cells, motion: predict(network, belief, elsewhere(cells), motion),
+        "anchor": lambda network, belief, cells, mass: anchor(network, belief, elsewhere(cells), mass),
+    }
+
+
+def no_path_integration() -> Functions:
+    """Odometry moves no cell."""
+    return {"integrate_path": lambda cells, motion: cells}
+
+
+def silent_cells(share: float, seed: int) -> Functions:
+    """A random share of the cells never becomes active."""
+    anchor = pose_cells.anchor
+
+    def anchor_silent(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
+        belief = anchor(network, belief, cells, mass)
+        lively = stream(seed, "cells.silent").random(belief.activity.shape) >= share
+        return belief._replace(activity=belief.activity * lively.astype(np.float32))
+
+    return {"anchor": anchor_silent}
+
+
+def foreign_activity(recorded: np.ndarray) -> Functions:
+    """After every view the activity is that of another session at about as many view cells.
+
+    Args:
+        recorded: [n, H, Y, X] its activity, each after `EVERY` steps; repeated over a larger network.
+    """
+    anchor = pose_cells.anchor
+
+    def anchor_foreign(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
+        belief = anchor(network, belief, cells, mass)
+        at = jnp.minimum(jnp.sum(cells.used[0]).astype(jnp.int32) // EVERY, len(recorded) - 1)
+        sheets = [
+            np.arange(n) % size for n, size in zip(belief.activity.shape, recorded.shape[1:], strict=True)
+        ]
+        return belief._replace(activity=jnp.asarray(recorded)[at][np.ix_(*sheets)])
+
+    return {"anchor": anchor_foreign}
+
+
+LESIONS: dict[str, Callable[[int], Functions]] = {
+    INTACT: lambda seed: {},
+    "prediction constant": lambda seed: constant_prediction(),
+    "cells and ties permuted together": permuted_together,
+    "cells permuted alone": permuted_cells,
+    "ties permuted alone": permuted_ties,
+    "no path integration": lambda seed: no_path_integration(),
+    **{f"{share:.0%} silent": partial(silent_cells, share) for share in SILENT},
+}
+"""The lesions by name; `EXCHANGED` needs a session of its own. Each makes functions from a seed."""
+GOALS = {
+    "prediction constant": "no closure",
+    "cells and ties permuted together": "those of the intact network",
+    "cells permuted alone": "no closure",
+    "ties permuted alone": "no closure",
+    EXCHANGED: "no closure",
+    "no path integration": "ARR below 0.1",
+}
+
+
+class LesionTask(NamedTuple):
+    """A session with a lesion. row: of the touch table; "": Intel's recording."""
+
+    lesion: str
+    row: str
+    maze: int
+
+
+class LesionFigures(NamedTuple):
+    """Figures of a session. figures: None for Intel. closures: [K, 2] steps. true: closures that are true."""
+
+    figures: SessionFigures | None
+    closures: np.ndarray
+    true: int
+
+
+class LesionResult(NamedTuple):
+    """Figures of each session."""
+
+    found: Mapping[LesionTask, LesionFigures]
+
+    def of(self, lesion: str, row: str) -> list[tuple[LesionFigures, LesionFigures]]:
+        """The sessions of a row with a lesion, each beside that of the intact network."""
+        return [
+            (one, self.found[task._replace(lesion=INTACT)])
+            for task, one in self.found.items()
+            if (task.lesion, task.row) == (lesion, row)
+        ]
+
+
+def measure_lesions(
+    task: CellTask, lesions: Sequence[str] = (*LESIONS, EXCHANGED), rows: Sequence[str] = ROWS
+) -> LesionResult:
+    """The sessions of all lesions; those on Intel where it is at hand."""
+    tasks = [
+        LesionTask(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions
+    ]
+    if not INTEL.missing(Path()):
+        tasks += [LesionTask(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
+    return LesionResult(dict(zip(tasks, run_tasks(run_lesion, tasks, workers=task.workers), strict=True)))
+
+
+def run_lesion(task: LesionTask) -> LesionFigures:
+    """Runs one session with its lesion."""
+    if task.lesion == EXCHANGED:
+        functions = foreign_activity(record_activity(task._replace(maze=task.maze + AWAY)))
+    else:
+        functions = LESIONS[task.lesion](task.maze)
+    with replaced(functions):
+        if not task.row:
+            claims = closure_claims(run_recording(INTEL.configuration(Path())))
+            true = claims.accepted & (claims.distance <= FALSE_DISTANCE)
+            return LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], int(true.sum()))
+        result, figures = run_and_measure(TouchTask(task.row, task.maze), new_session)
+    return LesionFigures(figures, result.closures, _true(result))
+
+
+@contextmanager
+def replaced(functions: Functions) -> Iterator[None]:
+    """Functions of `pose_cells` replaced; what is compiled within has them."""
+    with ExitStack() as stack:
+        for name, function in functions.items():
+            stack.enter_context(patch.object(pose_cells, name, function))
+        yield
+
+
+def record_activity(task: LesionTask) -> np.ndarray:
+    """[n, H, Y, X] activity of the intact network after every `EVERY` steps of a session."""
+    config, log = collect_session(task_config(TouchTask(task.row, task.maze)))
+    session = new_session(config, log)
+    recorded: list[np.ndarray] = []
+    for k, sample in enumerate(log):
+        session.step(observation_of(sample))
+        if (k + 1) % EVERY == 0:
+            recorded.append(np.array(session.state.belief.activity))
+    return np.stack([one for one in recorded if one.shape == recorded[-1].shape])
+
+
+def _true(result: SessionResult) -> int:
+    return int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
+
+
+@cache
+def _order(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """A permutation of the cells of a network."""
+    return stream(seed, f"cells.permuted.{'x'.join(map(str, shape))}").permutation(int(np.prod(shape)))
+
+
+def same_closures(one: LesionFigures, other: LesionFigures) -> float:
+    """Share of the closures of another session that are in this one, pair for pair; NaN if there are none."""
+    pairs, others = ({tuple(pair) for pair in each.closures.tolist()} for each in (one, other))
+    return len(pairs & others) / len(others) if others else np.nan
+
+
+def table_lesions(result: LesionResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    lesions = list(dict.fromkeys(task.lesion for task in result.found))
+    rows = [row for row in dict.fromkeys(task.row for task in result.found) if row]
+    mazes = len(result.of(INTACT, rows[0]))
+    lines = [
+        f"Medians over {mazes} mazes a row, closures are sums. Goal: "
+        + "; ".join(f"{lesion}: {goal}" for lesion, goal in GOALS.items() if lesion in lesions)
+        + ".",
+        "",
+        *markdown_header(COLUMNS).splitlines(),
+    ]
+    for row in rows:
+        lines += [markdown_row([lesion, row, *_cells(result, lesion, row)]) for lesion in lesions]
+    return [*lines, "", NOT_SHOWN]
+
+
+NOT_SHOWN = (
+    "Not shown: cells that fall silent in an intact network learn nothing new here, because the ties are"
+    " computed from the map; EM without closures is that of odometry. Intel's recording is one session, and"
+    " `-` means that RATSLAM_DATA is not set."
+)
+
+
+def _cells(result: LesionResult, lesion: str, row: str) -> list[str]:
+    sessions = result.of(lesion, row)
+    figures = [one.figures for one, _ in sessions if one.figures is not None]
+    same = [same_closures(*pair) for pair in sessions]
+    closures = sum(one.metrics.closures for one in figures)
+    intel = result.of(lesion, "")
+    return [
+        f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
+        f"{closures}, {sum(one.metrics.false_closures for one in figures)}",
+        f"{np.nanmedian(same):.0%}" if np.isfinite(same).any() else "-",
+        f"{np.median([one.metrics.em for one in figures]):.3f}",
+        f"{np.median([one.metrics.arr for one in figures]):.3f}",
+        str(intel[0][0].true) if intel else "-",
+    ]
+
+
+def draw_lesions(result: LesionResult, png: Path) -> None:
+    """Share of revisits closed, and EM, of every lesion."""
+    lesions = list(dict.fromkeys(task.lesion for task in result.found))
+    rows = [row for row in dict.fromkeys(task.row for task in result.found) if row]
+    panels = (
+        ("revisits closed", "share", lambda one: one.revisits_closed),
+        ("EM", "m² + rad²", lambda one: one.metrics.em),
+    )
+    line = f"Median, dots: mazes. {lesions[0]}: the network as it is."
+    figure, axes = panel_grid("Lesions of the network", line, 1, 2, height=3.0)
+    at = np.arange(len(lesions))
+    for panel, (title, across, value) in zip(axes[0], panels, strict=True):
+        for k, row in enumerate(rows):
+            colour = COLOURS[k % len(COLOURS)]
+            found = [[value(one.figures) for one, _ in result.of(lesion, row)] for lesion in lesions]
+            up = at + 0.2 - 0.4 * k
+            panel.barh(up, np.nanmedian(found, axis=1), 0.36, color=colour, alpha=0.35, label=row)
+            for y, group in zip(up, found, strict=True):
+                panel.plot(group, [y] * len(group), "o", ms=3.5, mew=0, color=colour, alpha=0.7)
+        panel.set_ylim(len(lesions) - 0.5, -0.5)
+        panel.set_yticks([])
+        head_panel(panel, title)
+        style.name_axes(panel, across, "")
+    for y, lesion in enumerate(lesions):
+        inside = axes[0][0].get_yaxis_transform()
+        axes[0][0].text(0.02, y, lesion, transform=inside, va="center", fontsize=7, color=style.INK)
+    axes[0][1].set_xscale("log")
+    style.add_legend(figure, axes[0][0])
+    figure.savefig(png)
+
+
+CELL, SIDE = 0.05, 21
+"""Size of a cell, m, and cells along x and y in sessions of the touch table."""
+SIDES = (7, 11, 15, 21, 31, 42)
+"""Cells along x and along y."""
+SIZES = (0.025, 0.035, 0.07, 0.1)
+"""Of a cell, m, each with the sides that cover what the usual network covers."""
+CALLS = 20
+"""Of which the fastest counts."""
+
+
+class SizeTask(NamedTuple):
+    """A session of a network of `side` cells of `size` m along x and y, and whether it grows with the map."""
+
+    row: str
+    maze: int
+    side: int
+    size: float
+    grows: bool
+
+
+class SizeFigures(NamedTuple):
+    """figures: of the session. sides: cells along x and y at its end. update: time of the network's part of
+    an update with the keyframes at its end, us."""
+
+    figures: SessionFigures
+    sides: tuple[int, int]
+    update: float
+
+
+class SizeResult(NamedTuple):
+    """Figures of each session."""
+
+    found: Mapping[SizeTask, SizeFigures]
+
+
+def measure_sizes(
+    task: CellTask,
+    row: str = "exploration",
+    sides: Sequence[int] = SIDES,
+    sizes: Sequence[float] = SIZES,
+) -> SizeResult:
+    """Sessions of networks of all sides, growing and not, and of all sizes of a cell, growing."""
+    chosen = [(side, CELL, grows) for grows in (False, True) for side in sides]
+    chosen += [(int(np.ceil(SIDE * CELL / size)), size, True) for size in sizes]
+    tasks = [SizeTask(row, maze, *each) for each in dict.fromkeys(chosen) for maze in task.seeds(1)]
+    return SizeResult(dict(zip(tasks, run_tasks(run_size, tasks, workers=task.workers), strict=True)))
+
+
+def run_size(task: SizeTask) -> SizeFigures:
+    """Runs one session. Only the network has other cells: the lengths of recall and of the map, which the
+    product counts in cells, stay what they are with the usual ones."""
+    unit = CELL / task.size  # so much longer is a length in the network's cells
+    sessions: list[Session] = []
+
+    def change(backend: Backend) -> None:
+        assert isinstance(backend, RecallBackend)
+        assert backend.cell == CELL
+        cells = PoseCellConfig(cells_xy=task.side, cell_size=task.size)
+        backend.network = backend.network._replace(cells=cells, excite=backend.network.excite * unit)
+        lengths = {
+            "local_sd": backend.recall.local_sd * unit,
+            "local_heading_rate": backend.recall.local_heading_rate / unit,
+        }
+        backend.recall = backend.recall.model_copy(update=lengths)
+
+    def start(config: RunConfig, log: InMemorySource) -> Session:
+        sessions.append(new_session(config, log, change))
+        return sessions[-1]
+
+    functions: Functions = {} if task.grows else {"sides_for": lambda network, poses: (task.side, task.side)}
+    with replaced(functions), patch.object(filter, "BASIN", filter.BASIN * unit):
+        _, figures = run_and_measure(TouchTask(task.row, task.maze), start)
+    _, y, x = sessions[0].state.belief.activity.shape
+    return SizeFigures(figures, (x, y), _update_time(sessions[0]))
+
+
+def _update_time(session: Session) -> float:
+    """Processor time of the network's part of an update, us: the least of `CALLS`."""
+    backend, memory, belief = session.backend, session.state.memory, session.state.belief
+    assert isinstance(backend, RecallBackend)
+    cells = filter.view_cells(backend.recall, memory)
+
+    @jax.jit
+    def update(belief: Belief, cells: ViewCells, motion: Array) -> Belief:
+        found, lost = pose_cells.predict(backend.network, belief, cells, motion)
+        mass, _ = pose_cells.inhibit(found, lost + jnp.float32(0.01))
+        return pose_cells.anchor(backend.network, belief, cells, mass)
+
+    run = partial(update, belief, cells, memory.motion)
+    jax.block_until_ready(run())
+    return 1e6 * min(time_call(lambda: jax.block_until_ready(run())).processor for _ in range(CALLS))
+
+
+def table_sizes(result: SizeResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    columns = (
+        "cells a side", "cell, m", "grows", "cells at the end", "revisits closed", "closures, false", "EM",
+        "ARR", "us per update",
+    )  # fmt: skip
+    mazes = len({task.maze for task in result.found})
+    lines = [
+        f"Free exploration, {mazes} maze{'s' * (mazes > 1)}: medians, closures are sums. The usual network"
+        f" has {SIDE} cells of {CELL:g} m and grows. Goal: fewer cells than the map needs close less; finer"
+        " cells close as much.",
+        "",
+        *markdown_header(columns).splitlines(),
+    ]
+    for network, sessions in _networks(result).items():
+        side, size, grows = network
+        metrics = [one.figures.metrics for one in sessions]
+        closures = sum(one.closures for one in metrics), sum(one.false_closures for one in metrics)
+        cells = [
+            " x ".join(map(str, sessions[0].sides)),
+            f"{np.nanmedian([one.figures.revisits_closed for one in sessions]):.2f}",
+            "{}, {}".format(*closures),
+            f"{np.median([one.em for one in metrics]):.3f}",
+            f"{np.median([one.arr for one in metrics]):.3f}",
+            f"{np.median([one.update for one in sessions]):.0f}",
+        ]
+        lines.append(markdown_row([side, f"{size:g}", "yes" if grows else "no", *cells]))
+    return [
+        *lines,
+        "",
+        "An update's time is of the network alone, of all threads, the least of"
+        f" {CALLS} calls. Not shown: other headings; maps of several hundred metres.",
+    ]
+
+
+def _networks(result: SizeResult) -> dict[tuple[int, float, bool], list[SizeFigures]]:
+    """The sessions of each network: side, size of a cell, whether it grows."""
+    found: dict[tuple[int, float, bool], list[SizeFigures]] = {}
+    for task, figures in result.found.items():
+        found.setdefault((task.side, task.size, task.grows), []).append(figures)
+    return found
+
+
+def draw_sizes(result: SizeResult, png: Path) -> None:
+    """Share of revisits closed against the cells a side and against the time of an update."""
+    networks = _networks(result)
+    groups = {
+        f"{CELL:g} m, fixed": {key: one for key, one in networks.items() if not key[2]},
+        f"{CELL:g} m, grows": {key: one for key, one in networks.items() if key[1] == CELL and key[2]},
+        "other cells, grows": {key: one for key, one in networks.items() if key[1] != CELL},
+    }
+    line = f"The usual network has {SIDE} cells of {CELL:g} m along x and y, and grows."
+    figure, axes = panel_grid("Numbers and sizes of cells", line, 1, 2, height=2.6)
+    for (label, group), colour in zip(groups.items(), COLOURS + (style.GREEN,), strict=True):
+        closed = [np.nanmedian([one.figures.revisits_closed for one in each]) for each in group.values()]
+        update = [np.median([one.update for one in each]) for each in group.values()]
+        axes[0][0].plot([side for side, *_ in group], closed, "o-", ms=4, color=colour, label=label)
+        axes[0][1].plot(update, closed, "o", ms=5, color=colour)
+    for panel, across in zip(axes[0], ("cells a side", "time of an update (us)"), strict=True):
+        panel.set_ylim(bottom=0)
+        style.name_axes(panel, across, "revisits closed")
+    axes[0][1].set_xscale("log")
+    style.add_legend(figure, axes[0][0])
+    figure.savefig(png)
+
+
+FIGURES = {
+    "lesions": CellFigure("Lesions of the belief network", measure_lesions, table_lesions, draw_lesions),
+    "scale": CellFigure("Numbers and sizes of cells", measure_sizes, table_sizes, draw_sizes),
+}

@@ -1,0 +1,571 @@
+"""Figures of the belief of `backend: recall`: how good a posterior the activity of its pose cells is.
+
+Worlds are synthetic, so that exact inference is possible (`evaluation.papers.cells.belief_world`); the
+control is an attractor of fixed amplitude with additive injection, as RatSLAM has it, but at settings chosen
+on the same sessions. A network whose inhibition grows with its activity as a Bayesian filter, with the loss
+against 1,000 particles as its measure: Kutschireiter, Basnak, Wilson & Drugowitsch 2023. Cues in conflict:
+Basnak et al. 2025. Several pose hypotheses in RatSLAM: Milford, Wiles & Wyeth 2010.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.papers.cells.belief_world import (
+    AROUND,
+    CELLS,
+    LOOKS,
+    PARTICLES,
+    RoomClosures,
+    World,
+    additive,
+    circles,
+    exact,
+    network,
+    pace,
+    particles,
+    random_looks,
+    random_world,
+    room_closures,
+    see,
+)
+from evaluation.papers.cells.figure import CellFigure, CellTask
+from evaluation.papers.cells.panel_grid import head_panel, panel_grid
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.plots import style
+from evaluation.studies.executor import run_tasks
+from ratslam.mapping.config import KeyframeMapConfig
+from ratslam.network.config import PoseCellConfig
+from ratslam.recall.filter import BASIN
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, wrap
+
+NETWORK, FINER, EXACT, MANY = (
+    "network",
+    "network, cells of half the side",
+    "exact",
+    f"{PARTICLES:,} particles",
+)
+CONTROL = "additive injection (control)"
+COLOURS = {
+    EXACT: style.INK, MANY: style.GREEN, NETWORK: style.BLUE, FINER: style.SKY, CONTROL: style.VERMILLION,
+}  # fmt: skip
+UPDATES = 500
+"""Updates of a session."""
+CLOSE_ENOUGH = 0.001
+"""Share of the score by which halving the cells of the histogram may still move it."""
+ONE_PACKET = 0.9
+"""Exact probability of the places near the best one from which there is one packet."""
+REGIONS = (0.5, 0.9)
+CANDIDATE = KeyframeMapConfig().candidate_posterior
+"""Probability of a packet from which the keyframe map takes it for a candidate of a closure."""
+ADDITIVE = tuple(product((0.03, 0.1, 0.3, 1.0), (0.0, 0.5, 1.0), (0.05, 0.1, 0.2)))
+"""Strength, inhibition and share that is unsure, of which the control has the best."""
+
+
+class Scores(NamedTuple):
+    """Scores of n sessions by belief.
+
+    Attributes:
+        score: [n] mean over updates of the log probability of the true state over that of a uniform guess,
+            nats. single: the same over updates with one packet. inside: [n, 2] share of updates whose truth
+            is in the smallest region with the probability of `REGIONS`.
+    """
+
+    score: np.ndarray
+    single: np.ndarray
+    inside: np.ndarray
+
+
+class PosteriorResult(NamedTuple):
+    """By belief its scores; side of the histogram's cells, in those of the network, and the share of the
+    score by which the last halving moved it; settings of the control."""
+
+    scores: Mapping[str, Scores]
+    side: float
+    moved: float
+    control: tuple[float, ...]
+
+
+def measure_posterior(task: CellTask, updates: int = UPDATES) -> PosteriorResult:
+    """The scores of the network, of its references and of the control."""
+    seeds = task.seeds(8)
+    worlds = [random_world(seed, updates) for seed in seeds]
+    side, moved, best = converged(worlds)
+    alone = [_packet(world, belief) > ONE_PACKET for world, belief in zip(worlds, best, strict=True)]
+    novel = max(float(np.mean([world.truth < 0 for world in worlds])), 1 / updates)
+
+    def scores(beliefs: Sequence[np.ndarray]) -> Scores:
+        gains = [log_gain(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]
+        return Scores(
+            np.array([gain.mean() for gain in gains]),
+            np.array([gain[one].mean() for gain, one in zip(gains, alone, strict=True)]),
+            np.array([inside(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]),
+        )
+
+    controls = {
+        setting: scores([additive(world, *setting, novel) for world in worlds]) for setting in ADDITIVE
+    }
+    control = max(controls, key=lambda setting: float(controls[setting].score.mean()))
+    found = {
+        EXACT: scores(best),
+        MANY: scores([particles(world, seed) for world, seed in zip(worlds, seeds, strict=True)]),
+        NETWORK: scores([network(world).belief for world in worlds]),
+        FINER: scores([network(world, cells=finer()).belief for world in worlds]),
+        CONTROL: controls[control],
+    }
+    return PosteriorResult(found, side, moved, control)
+
+
+def finer() -> PoseCellConfig:
+    """Cells of half the side in x, y and heading."""
+    return PoseCellConfig(
+        cells_xy=2 * CELLS.cells_xy, cell_size=CELLS.cell_size / 2, cells_heading=2 * CELLS.cells_heading
+    )
+
+
+def converged(worlds: Sequence[World]) -> tuple[float, float, list[np.ndarray]]:
+    """Side of the cells of the histogram whose halving moves the score by less than `CLOSE_ENOUGH`, the share
+    by which it moves it, and the beliefs at half the side."""
+
+    def score(beliefs: Sequence[np.ndarray]) -> float:
+        return float(np.mean([log_gain(*pair).mean() for pair in zip(worlds, beliefs, strict=True)]))
+
+    side, beliefs = 1.0, [exact(world, 1.0) for world in worlds]
+    while True:
+        halved = [exact(world, side / 2) for world in worlds]
+        moved = abs(score(halved) / score(beliefs) - 1)
+        if moved < CLOSE_ENOUGH:
+            return side, moved, halved
+        side, beliefs = side / 2, halved
+
+
+def log_gain(world: World, belief: np.ndarray) -> np.ndarray:
+    """[T] log probability of the true state over that of a uniform guess, nats."""
+    held = belief[np.arange(len(belief)), world.truth]
+    return np.log(np.maximum(held, np.finfo(np.float32).tiny) * belief.shape[1])
+
+
+def inside(world: World, belief: np.ndarray) -> np.ndarray:
+    """[2] share of updates whose truth is in the smallest region of each probability of `REGIONS`. A state at
+    its edge counts by the part of it that the region needs."""
+    held = belief[np.arange(len(belief)), world.truth][:, None]
+    before = np.where(belief > held, belief, 0.0).sum(axis=1)
+    shares = [(region - before) / np.maximum(held[:, 0], np.finfo(float).tiny) for region in REGIONS]
+    return np.array([np.clip(share, 0, 1).mean() for share in shares])
+
+
+def _packet(world: World, belief: np.ndarray) -> np.ndarray:
+    """[T] probability of the view cells within two pose cells of the best, as candidates have it."""
+    best = world.poses[belief[:, :-1].argmax(axis=1)]
+    return (belief[:, :-1] * _near(world, best)).sum(axis=1)
+
+
+def _near(world: World, places: np.ndarray) -> np.ndarray:
+    """[T, N] bool, the view cells within two pose cells of places [T, 3]."""
+    apart = np.hypot(*(world.poses[None, :, :2] - places[:, None, :2]).transpose(2, 0, 1))
+    return apart < BASIN * CELLS.cell_size
+
+
+def table_posterior(result: PosteriorResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    best = result.scores[EXACT]
+    strength, inhibition, unsure = result.control
+    columns = (
+        "belief", "score, nats", "loss", "loss while there is one packet", "truth in its 50 % region",
+        "in its 90 % region",
+    )  # fmt: skip
+    lines = [
+        f"{len(best.score)} sessions. Score: mean log probability of the true state over that of a uniform"
+        " guess. Goal: the network loses 1 % at most, its regions hold what they say to 5 %; control: loses"
+        " more.",
+        f"The histogram's cells are {result.side:g} of the network's; half of that moves its score by"
+        f" {result.moved:.2%}. The control has the best of {len(ADDITIVE)} settings: injects {strength:g},"
+        f" subtracts {inhibition:g} of the mean, spreads {unsure:g}.",
+        "",
+        *markdown_header(columns).splitlines(),
+    ]
+    for name, scores in result.scores.items():
+        loss = [
+            1 - mine.mean() / its.mean()
+            for mine, its in ((scores.score, best.score), (scores.single, best.single))
+        ]
+        cells = [f"{scores.score.mean():.3f}", *(f"{each:.2%}" for each in loss)]
+        lines.append(markdown_row([name, *cells, *(f"{each:.1%}" for each in scores.inside.mean(axis=0))]))
+    return [
+        *lines,
+        "",
+        "Not shown: likelihoods that are wrong; on a robot they are, and no inference makes up for it.",
+    ]
+
+
+def draw_posterior(result: PosteriorResult, png: Path) -> None:
+    """Loss by session, and the regions."""
+    best = result.scores[EXACT].score
+    loss = {name: 100 * (1 - scores.score / best) for name, scores in result.scores.items() if name != EXACT}
+    overall = 1 - result.scores[NETWORK].score.mean() / best.mean()
+    line = f"The network loses {overall:.1%} of the score of exact inference. Dots: sessions."
+    figure, axes = panel_grid("The activity as a posterior", line, 1, 2, height=2.6)
+    for k, (name, values) in enumerate(loss.items()):
+        axes[0][0].plot([k] * len(values), values, "o", ms=4, mew=0, alpha=0.6, color=COLOURS[name])
+    axes[0][0].set_xticks([])
+    axes[0][0].set_yscale("symlog", linthresh=1)
+    head_panel(axes[0][0], "loss against exact inference")
+    style.name_axes(axes[0][0], "", "loss (%)")
+    for name, scores in result.scores.items():
+        held = 100 * scores.inside.mean(axis=0)
+        axes[0][1].plot(np.array(REGIONS) * 100, held, "o-", ms=4, color=COLOURS[name], label=name)
+    axes[0][1].plot([40, 100], [40, 100], "--", color=style.GREY, lw=0.9)
+    head_panel(axes[0][1], "truth in the region")
+    style.name_axes(axes[0][1], "probability of the region (%)", "updates with the truth in it (%)")
+    style.add_legend(figure, axes[0][1], columns=3)
+    figure.savefig(png)
+
+
+DIFFERENCE = 24
+"""Update at which the robot comes to the first view cell whose look tells the rooms apart."""
+COURSE = 48
+"""Updates after the robot appears in one of two rooms."""
+ROOM = np.array([[0.0, 0.0], [0.45, 0.0]])
+"""Centres of the circles of a room, m."""
+SIGN, DECIDED = 0.01, 0.95
+"""Departure from 1/2 that shows evidence; share from which a belief has decided."""
+
+
+class RoomsResult(NamedTuple):
+    """Beliefs in n pairs of rooms.
+
+    Attributes:
+        share: by belief, [n, T] probability of the true room over that of both. packet: by belief, [n, T] of
+            the best packet. found: by belief, [n] probability of the true room at the end. told: [n, T] bool,
+            whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`. closures,
+            unlike: of sessions of the whole product, in rooms that look alike and in others.
+    """
+
+    share: Mapping[str, np.ndarray]
+    packet: Mapping[str, np.ndarray]
+    found: Mapping[str, np.ndarray]
+    told: np.ndarray
+    closures: Sequence[RoomClosures]
+    unlike: Sequence[RoomClosures]
+
+
+def alike_rooms(seed: int) -> World:
+    """Two rooms, alike until `DIFFERENCE`: the robot stands at the beginning of the first circle of one of
+    them, with equal probability of either, and goes round it. It is in the first; the second lies elsewhere,
+    at any angle."""
+    random = stream(seed, "cells.alike_rooms")
+    room = circles(ROOM)
+    turn = random.uniform(-np.pi, np.pi)
+    away = random.uniform(1.8, 2.6) * np.array([np.cos(turn), np.sin(turn)])
+    other = compose(np.array([*away, random.uniform(-np.pi, np.pi)]), room)
+    looks = np.tile(random_looks(seed, len(room)), 2)
+    other_looks = looks[DIFFERENCE + 1 : AROUND] + random.integers(1, LOOKS, AROUND - DIFFERENCE - 1)
+    looks[len(room) + DIFFERENCE + 1 : len(room) + AROUND] = other_looks % LOOKS
+    truth = (1 + np.arange(COURSE)) % AROUND
+    likelihood, novelty = see(looks, truth, random)
+    start = np.zeros(2 * len(room))
+    start[[0, len(room)]] = 0.49
+    return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
+
+
+def measure_rooms(task: CellTask, sessions: int = 3) -> RoomsResult:
+    """The probabilities of the two rooms, and closures of so many sessions of the whole product."""
+    found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {}
+    for seed in task.seeds(20):
+        world = alike_rooms(seed)
+        half = len(world.poses) // 2
+        for name, belief in _beliefs(world):
+            own, other = belief[:, :half].sum(axis=1), belief[:, half:-1].sum(axis=1)
+            row = own / (own + other), _packet(world, belief), float(own[-1])
+            found.setdefault(name, []).append(row)
+    share, packet, last = (
+        {name: np.array([row[k] for row in rows]) for name, rows in found.items()} for k in range(3)
+    )
+    told = np.cumsum(np.abs(share[EXACT] - 0.5) > SIGN, axis=1) > 0
+    seeds = range(task.first, task.first + sessions)
+    closures, unlike = (
+        list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
+        for alike in (True, False)
+    )
+    return RoomsResult(share, packet, last, told, closures, unlike)
+
+
+def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
+    """Exact inference, the network, and the control at settings that suit `measure_posterior`."""
+    yield EXACT, exact(world)
+    yield NETWORK, network(world).belief
+    yield CONTROL, additive(world, *USUAL_CONTROL)
+
+
+USUAL_CONTROL = (0.3, 0.5, 0.1, 0.1)
+"""Of `additive`."""
+
+
+def table_rooms(result: RoomsResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    columns = (
+        "belief", "before: farthest from 1/2", "best packet, largest", "decided too early",
+        "at the end: median", "worst", "probability of the true room, median",
+        "farthest from exact inference, any time",
+    )  # fmt: skip
+    pairs, early = len(result.told), ~result.told
+    lines = [
+        f"{pairs} pairs of rooms, {COURSE} updates; the first difference is after {DIFFERENCE}. Share of the"
+        f" true room in what the belief holds in both. Before: until exact inference leaves 1/2 by {SIGN:g}."
+        f" Decided: a share beyond {DECIDED:g}. Goal: 1/2 before, none decided too early, 1 at the end;"
+        " control: keeps both.",
+        "",
+        *markdown_header(columns).splitlines(),
+    ]
+    for name, share in result.share.items():
+        before, after = np.abs(share[early] - 0.5), share[:, -1]
+        decided = (np.abs(share - 0.5) > DECIDED - 0.5) & early
+        apart = np.abs(share - result.share[EXACT]).max()
+        cells = [
+            f"{before.max():.3f}",
+            f"{result.packet[name][early].max():.3f}",
+            decided.any(axis=1).sum(),
+            *(
+                f"{each:.3f}"
+                for each in (np.median(after), after.min(), np.median(result.found[name]), apart)
+            ),
+        ]
+        lines.append(markdown_row([name, *cells]))
+    both = (result.closures, result.unlike)
+    alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in both)
+    return [
+        *lines,
+        "",
+        f"{len(result.closures)} sessions of the whole product with given place ids. Until the first"
+        f" difference: {alike[0]} closures (goal: 0; control, rooms that do not look alike: {unlike[0]}). At"
+        f" the end of the lap: {alike[1]} into the room of the robot, {alike[2]} elsewhere (control:"
+        f" {unlike[1]}, {unlike[2]}).",
+        f"A packet of more than {CANDIDATE:g} is a candidate; the keyframe map judges sequences of them, so"
+        " two equal packets are at the edge of one. Not shown: a room that is not in the map, for which any"
+        " belief takes one that is.",
+    ]
+
+
+def draw_rooms(result: RoomsResult, png: Path) -> None:
+    """Share of the true room over time."""
+    line = "Share of the true room in what the belief holds in both; dashed: the first difference."
+    figure, axes = panel_grid("Two rooms that look alike", line, 1, len(result.share), height=2.4)
+    for panel, (name, share) in zip(axes[0], result.share.items(), strict=True):
+        panel.plot(share.T, color=COLOURS[name], lw=0.9, alpha=0.5)
+        panel.axvline(DIFFERENCE, color=style.GREY, ls="--", lw=0.9)
+        panel.set_ylim(-0.02, 1.02)
+        head_panel(panel, name)
+        style.name_axes(panel, "update", "share of the true room")
+    figure.savefig(png)
+
+
+KIDNAP, AFTER = 40, 80
+"""Updates before and after a kidnap."""
+
+
+class KidnapResult(NamedTuple):
+    """steps: by belief, [n] updates from the kidnap until more than half of the belief is at the true place;
+    inf: not within `AFTER`. novelty: by belief, [n, T]."""
+
+    steps: Mapping[str, np.ndarray]
+    novelty: Mapping[str, np.ndarray]
+
+
+def kidnap_world(seed: int) -> World:
+    """A robot that knows where it is goes round a circle, and is then set down on another one."""
+    random, poses = stream(seed, "cells.kidnap"), circles()
+    rings = random.permutation(len(poses) // AROUND)[:2]
+    first = random.integers(0, AROUND, 2)
+    arcs = [(first[k] + 1 + np.arange(count)) % AROUND for k, count in enumerate((KIDNAP, AFTER))]
+    truth = np.concatenate([ring * AROUND + arc for ring, arc in zip(rings, arcs, strict=True)])
+    likelihood, novelty = see(random_looks(seed, len(poses)), truth, random)
+    start = np.zeros(len(poses))
+    start[rings[0] * AROUND + first[0]] = 1.0
+    return World(poses, pace(np.ones(len(truth))), likelihood, novelty, truth, start)
+
+
+def measure_kidnaps(task: CellTask) -> KidnapResult:
+    """Kidnaps of the network, of exact inference, and of both controls."""
+    found: dict[str, list[tuple[float, np.ndarray]]] = {}
+    for seed in task.seeds(40):
+        world = kidnap_world(seed)
+        near = _near(world, world.poses[world.truth])
+        for name, belief in (*_beliefs(world), (NO_ENTRY, network(world, enter=0.0).belief)):
+            held = (belief[KIDNAP:, :-1] * near[KIDNAP:]).sum(axis=1) > 0.5
+            steps = float(held.argmax()) + 1 if held.any() else np.inf
+            found.setdefault(name, []).append((steps, belief[:, -1]))
+    return KidnapResult(
+        {name: np.array([steps for steps, _ in each]) for name, each in found.items()},
+        {name: np.array([novelty for _, novelty in each]) for name, each in found.items()},
+    )
+
+
+NO_ENTRY = "network without re-entry (control)"
+
+
+def table_kidnaps(result: KidnapResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    columns = (
+        "belief", "found again", "updates until then: median", "slowest tenth", "novelty before", "its peak",
+        "novelty at the end",
+    )  # fmt: skip
+    count = len(result.steps[EXACT])
+    lines = [
+        f"{count} kidnaps, {AFTER} updates each. Found: more than half of the belief within two pose cells of"
+        " the true place. Goal: as fast as exact inference; controls: later or never.",
+        "",
+        *markdown_header(columns).splitlines(),
+    ]
+    for name, steps in result.steps.items():
+        novelty = np.median(result.novelty[name], axis=0)
+        late = [np.median(steps), np.quantile(steps, 0.9, method="higher")]
+        cells = [f"{each:.0f}" if np.isfinite(each) else "never" for each in late]
+        levels = [novelty[KIDNAP - 1], novelty[KIDNAP:].max(), novelty[-1]]
+        found = f"{np.isfinite(steps).sum()} of {count}"
+        lines.append(markdown_row([name, found, *cells, *(f"{each:.3f}" for each in levels)]))
+    return [
+        *lines,
+        "",
+        "Novelty is the median over kidnaps; that of additive injection is a constant, and at the settings of"
+        " its best score it holds half of its activity nowhere. Without re-entry, what is left of the belief"
+        " spreads along the path. Not shown: kidnaps to places outside the map.",
+    ]
+
+
+def draw_kidnaps(result: KidnapResult, png: Path) -> None:
+    """Novelty over time, and how many are found again."""
+    line = f"Found again by the network: {np.isfinite(result.steps[NETWORK]).mean():.0%}. Dashed: the kidnap."
+    figure, axes = panel_grid("Kidnap", line, 1, 2, height=2.6)
+    colours = {**COLOURS, NO_ENTRY: style.PURPLE}
+    for name, steps in result.steps.items():
+        within = [(steps <= k).mean() for k in range(AFTER + 1)]
+        axes[0][1].plot(range(AFTER + 1), within, color=colours[name], lw=1.6, label=name)
+        if name == CONTROL:
+            continue
+        novelty = np.median(result.novelty[name], axis=0)
+        axes[0][0].plot(np.arange(len(novelty)) - KIDNAP, novelty, color=colours[name], lw=1.6)
+    axes[0][0].axvline(0, color=style.GREY, ls="--", lw=0.9)
+    head_panel(axes[0][0], "novelty, median")
+    style.name_axes(axes[0][0], "updates since the kidnap", "novelty")
+    head_panel(axes[0][1], "found again")
+    style.name_axes(axes[0][1], "updates since the kidnap", "share of kidnaps")
+    style.add_legend(figure, axes[0][1], columns=2)
+    figure.savefig(png)
+
+
+HEADINGS, WIDTH = 72, 20.0
+"""Number of headings of the view cells at one place; concentration of a cue."""
+ANGLES = (30, 60, 90, 120, 150, 180)
+"""Between the cues, degrees."""
+LONG, READ = 8, 4
+"""Updates, and that of the table."""
+CASES: Mapping[str, tuple[tuple[float, ...], bool]] = {
+    "view 0.3 against odometry": ((0.3,), True),
+    "view 0.6 against odometry": ((0.6,), True),
+    "view 0.6 against view 0.3": ((0.6, 0.3), False),
+}
+"""Reliabilities of views at the angle and at 0; whether the belief is at 0 before."""
+
+
+class ConflictResult(NamedTuple):
+    """weight: by case, angle and belief, [n, LONG] share of what the belief holds that is nearer to the cue
+    at the angle than to the one at 0, after each update."""
+
+    weight: Mapping[tuple[str, int, str], np.ndarray]
+
+
+def conflict_world(seed: int, reliable: Sequence[float], sure: bool, angle: float) -> World:
+    """A robot that stands still, with view cells of all headings.
+
+    Args:
+        reliable: probability that a view tells the heading, else any: of the cue at `angle`, and of one at 0.
+            sure: whether the belief is at 0 at first, where odometry has it; else it is spread.
+    """
+    heading = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    turn = stream(seed, "cells.conflict").uniform(0, 2 * np.pi)
+
+    def bump(at: float) -> np.ndarray:
+        raised = np.exp(WIDTH * (np.cos(heading - at) - 1))
+        return raised / raised.mean()
+
+    cues = [1 - share + share * bump(at) for share, at in zip(reliable, (angle, 0.0), strict=False)]
+    start = 0.95 * bump(0.0) / HEADINGS if sure else np.full(HEADINGS, 0.5 / HEADINGS)
+    still = np.zeros((LONG, 3))
+    poses = np.column_stack([np.zeros((HEADINGS, 2)), wrap(heading + turn)])
+    likelihood = np.tile(np.prod(cues, axis=0), (LONG, 1))
+    return World(poses, still, likelihood, np.ones(LONG), np.zeros(LONG, int), start)
+
+
+def measure_conflicts(task: CellTask) -> ConflictResult:
+    """Weights of the cues in all cases and at all angles; seeds turn the headings against the cells."""
+    found: dict[tuple[str, int, str], list[np.ndarray]] = {}
+    for (case, (reliable, sure)), angle, seed in product(CASES.items(), ANGLES, task.seeds(4)):
+        world = conflict_world(seed, reliable, sure, np.radians(angle))
+        away = np.abs(wrap(np.arange(HEADINGS) * 2 * np.pi / HEADINGS - np.radians(angle)))
+        home = np.abs(wrap(np.arange(HEADINGS) * 2 * np.pi / HEADINGS))
+        nearer = np.where(np.isclose(away, home), 0.5, away < home)
+        for name, belief in _beliefs(world):
+            held = belief[:, :-1]
+            found.setdefault((case, angle, name), []).append(held @ nearer / held.sum(axis=1))
+    return ConflictResult({key: np.array(weights) for key, weights in found.items()})
+
+
+def table_conflicts(result: ConflictResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    names = list(dict.fromkeys(name for *_, name in result.weight))
+    columns = (
+        "cues, with their reliability", "degrees apart", *(f"weight of the first: {name}" for name in names),
+        "network - exact, largest",
+    )  # fmt: skip
+    lines = [
+        f"Weight after {READ} views; largest difference over {LONG} updates and all turns of the headings"
+        " against the cells. Goal: the network's weights are those of exact inference.",
+        "",
+        *markdown_header(columns).splitlines(),
+    ]
+    for case, angle in product(CASES, ANGLES):
+        weights = [result.weight[case, angle, name] for name in names]
+        apart = np.abs(result.weight[case, angle, NETWORK] - result.weight[case, angle, EXACT]).max()
+        cells = [f"{each[:, READ - 1].mean():.3f}" for each in weights]
+        lines.append(markdown_row([case, angle, *cells, f"{apart:.3f}"]))
+    return [
+        *lines,
+        "",
+        "A view is of all headings with the rest of its reliability. Not shown: cues that turn slowly.",
+    ]
+
+
+def draw_conflicts(result: ConflictResult, png: Path) -> None:
+    """Weight of the first cue against the angle, by case."""
+    names = list(dict.fromkeys(name for *_, name in result.weight))
+    line = f"Weight of the first cue after {READ} views; exact inference and the network beside the control."
+    figure, axes = panel_grid("Cues in conflict", line, 1, len(CASES))
+    for panel, case in zip(axes[0], CASES, strict=True):
+        for name in names:
+            weights = [result.weight[case, angle, name][:, READ - 1].mean() for angle in ANGLES]
+            mark = "o" if name == NETWORK else "-"
+            panel.plot(ANGLES, weights, mark, color=COLOURS[name], lw=1.6, ms=5, label=name)
+        panel.set_ylim(-0.02, 1.02)
+        head_panel(panel, case)
+        style.name_axes(panel, "degrees apart", "weight")
+    style.add_legend(figure, axes[0][0])
+    figure.savefig(png)
+
+
+FIGURES = {
+    "posterior": CellFigure(
+        "Belief: score against exact inference", measure_posterior, table_posterior, draw_posterior
+    ),
+    "alike_rooms": CellFigure("Belief: two rooms that look alike", measure_rooms, table_rooms, draw_rooms),
+    "kidnap": CellFigure("Belief: kidnap", measure_kidnaps, table_kidnaps, draw_kidnaps),
+    "cue_conflict": CellFigure(
+        "Belief: cues in conflict", measure_conflicts, table_conflicts, draw_conflicts
+    ),
+}

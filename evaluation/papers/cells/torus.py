@@ -1,0 +1,343 @@
+"""The figure of the torus: rate maps in a box larger than the torus, and in a smaller one.
+
+In the larger box a cell has a place in every copy of the torus: on a square lattice whose spacing is the side
+of the torus. The grid cells of the entorhinal cortex lie on a hexagonal one (Hafting et al. 2005, Nature
+436:801). Odometry is exact and there are no views, so that the maps show the network and no drift.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.cells.autocorrelogram import autocorrelogram
+from evaluation.cells.fields import count_by_cell, find_fields
+from evaluation.cells.grid_score import (
+    HEXAGONAL,
+    SQUARE,
+    Lattice,
+    LatticeShape,
+    lattice_scores,
+    measure_lattice,
+)
+from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
+from evaluation.cells.recording import CellRecording
+from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
+from evaluation.papers.cells.boxes import choose_columns, one_of_each, sum_columns
+from evaluation.papers.cells.figure import CellFigure, CellTask
+from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.plots import style
+from ratslam.core.precision import prepare_precision
+
+RATE = 10.0
+"""Steps per second."""
+LARGE, SMALL = (3.5, 2.5), (0.7, 0.7)
+"""Boxes, m."""
+BINS = 0.1, 0.05
+"""Bins of maps in the large and in the small box, m."""
+SECONDS = 900.0, 200.0
+"""In the large and in the small box."""
+SMOOTHING = 0.075
+"""Standard deviation of the Gaussian over rate maps, m."""
+FIELD = 0.02
+"""Smallest field that counts, m^2."""
+COLUMNS = 64
+"""Places on the torus whose cells are recorded."""
+SHUFFLES = 100
+"""Of each cell."""
+DARK = {"speed_white": 0.0, "heading_white": 0.0}
+"""Exact odometry."""
+
+
+class LatticeFigures(NamedTuple):
+    """Figures of n cells in one box.
+
+    Attributes:
+        size: of the box, m. bin: m. maps: [n, H, W] rates. hexagonal, square: lattice scores and shuffles.
+            shape: spacing and orientation of the square lattice. fields: [n] number.
+    """
+
+    size: tuple[float, float]
+    bin: float
+    maps: np.ndarray
+    hexagonal: ShuffledScores
+    square: ShuffledScores
+    shape: LatticeShape
+    fields: np.ndarray
+
+
+class TorusResult(NamedTuple):
+    """Columns in the large box, one cell of each, and columns in the small box. torus: its side, m."""
+
+    large: LatticeFigures
+    single: LatticeFigures
+    small: LatticeFigures
+    torus: float
+
+
+def measure_torus(
+    task: CellTask, seconds: tuple[float, float] = SECONDS, columns: int = COLUMNS, shuffles: int = SHUFFLES
+) -> TorusResult:
+    """The figures of a session in each box; the path is that of the first seed.
+
+    Args:
+        seconds: in the large and in the small box. columns: places on the torus. shuffles: of each.
+    """
+    prepare_precision("float64")
+    network = rat_config().pose_cells
+    chosen = choose_columns(network, columns, task.first)
+    config = rat_config(f"rat_simulation.rate_hz={RATE}", f"cells={{chosen: {json.dumps(chosen)}}}")
+    rats = RatSessions(config)
+    recordings = [
+        rats.run(
+            rat_source(
+                config, task.first, walk={"speed": 0.3, "speed_sd": 0.15}, seconds=time, odometry=DARK,
+                box={"width": size[0], "height": size[1]}, phases=[{"start": 0, "dark": True}],
+            )
+        ).recording
+        for size, time in zip((LARGE, SMALL), seconds, strict=True)
+    ]  # fmt: skip
+    measure = partial(measure_cells, shuffles=shuffles, seed=task.first)
+    large, small = recordings
+    return TorusResult(
+        measure(large, sum_columns(large.activity, columns), LARGE, BINS[0]),
+        measure(large, one_of_each(large.activity, columns), LARGE, BINS[0]),
+        measure(small, sum_columns(small.activity, columns), SMALL, BINS[1]),
+        network.cells_xy * network.cell_size,
+    )
+
+
+def measure_cells(
+    recording: CellRecording, activity: np.ndarray, size: tuple[float, float], bin: float, shuffles: int,
+    seed: int,
+) -> LatticeFigures:  # fmt: skip
+    """The figures of activity [T, n] along the path of a recording.
+
+    Args:
+        size: of the box, m, with a corner at the origin. bin: m. shuffles: of each cell, at least 19.
+
+    Raises:
+        InputError: see `shuffled_scores`.
+    """
+    x_edges, y_edges = (np.linspace(0.0, side, round(side / bin) + 1) for side in size)
+    shape = len(y_edges) - 1, len(x_edges) - 1
+    place = place_index(recording.truth, x_edges, y_edges)
+    bins = PathBins(place, shape, sample_seconds(recording.time))
+
+    def score(lattice: Lattice, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+        return lattice_scores(autocorrelogram(smooth_rates(rates, seconds, SMOOTHING / bin)), lattice)
+
+    hexagonal, square = (
+        shuffled_scores(activity, bins, partial(score, lattice), shuffles, seed)
+        for lattice in (HEXAGONAL, SQUARE)
+    )
+    maps = _maps(activity, bins, bin)
+    lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
+    fields = find_fields(maps, least_bins=round(FIELD / bin**2))
+    return LatticeFigures(size, bin, maps, hexagonal, square, lattice, count_by_cell(fields, len(maps)))
+
+
+def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:
+    """[n, H, W] smoothed rates."""
+    inside, count = bins.flat >= 0, int(np.prod(bins.shape))
+    at, weight = bins.flat[inside], bins.seconds[inside]
+    seconds = np.bincount(at, weight, count)
+    sums = np.array([np.bincount(at, weight * cell, count) for cell in activity[inside].T])
+    rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *bins.shape)
+    return smooth_rates(rates, seconds.reshape(bins.shape), SMOOTHING / bin)
+
+
+def table_torus(result: TorusResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    lines = [
+        f"{len(result.large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
+        "control: median of the 95th percentile of each cell's shuffles, and the share above theirs.",
+        "",
+        *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
+    ]
+    large, single, small, torus = result
+    lines.append(markdown_row(["larger box over torus", "above 1", _ratio(large, torus), "-"]))
+    for name, found in (("columns", large), ("single cells", single)):
+        spacing = markdown_row([
+            f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.shape.spacing, 3),
+            f"shuffles have none; found in {np.isfinite(found.shape.spacing).sum()} of {len(found.maps)}",
+        ])  # fmt: skip
+        square, hexagonal = _control(found.square), _control(found.hexagonal)
+        lines += [
+            spacing,
+            markdown_row([f"{name}: square score", "above control", _spread(found.square.score), square]),
+            markdown_row([f"{name}: grid score", "no grid cell", _spread(found.hexagonal.score), hexagonal]),
+        ]
+    lines += [
+        markdown_row(["columns: fields", "several", _counts(large.fields), "-"]),
+        markdown_row(["smaller box over torus", "below 1", _ratio(small, torus), "-"]),
+        markdown_row(["columns: fields", "one or none", _counts(small.fields), "-"]),
+    ]
+    for name, scores in (("square", small.square), ("grid", small.hexagonal)):
+        text = f"columns in the smaller box: {name} score"
+        lines.append(markdown_row([text, "no lattice", _spread(scores.score), _control(scores)]))
+    return [*lines, "", NOT_SHOWN]
+
+
+NOT_SHOWN = (
+    "Not shown: entorhinal grid cells, whose lattice is hexagonal, with several spacings; this torus is "
+    "rigid and square, its activity a rate without spikes and theta, and its path integration here exact."
+)
+
+
+def draw_result(result: TorusResult, png: Path) -> None:
+    """Maps and autocorrelograms in both boxes, and the scores beside their controls."""
+    large, _, small, torus = result
+    values = (large.shape.spacing, large.square.score, large.hexagonal.score)
+    spacing, square, hexagonal = (float(np.nanmedian(each)) for each in values)
+    line = (
+        f"Torus {torus:.2f} m. Larger box, medians: spacing {spacing:.2f} m, square score {square:.2f}, "
+        f"grid score {hexagonal:.2f}."
+    )
+    boxes = [
+        BoxMaps(f"box {_ratio(each, torus)} of the torus", each.size, each.bin, each.maps)
+        for each in (large, small)
+    ]
+    scores = {"square score": large.square, "grid score": large.hexagonal}
+    draw_torus("A torus cell in boxes of two sizes", line, boxes, scores, large.shape.spacing, torus, png)
+
+
+def _ratio(found: LatticeFigures, torus: float) -> str:
+    x, y = found.size
+    return f"{x:g} x {y:g} m / {torus:.2f} m = {x / torus:.2f} x {y / torus:.2f}"
+
+
+def _spread(values: np.ndarray, digits: int = 2) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "none"
+    middle, low, high = np.percentile(known, [50, 2.5, 97.5])
+    return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _control(scores: ShuffledScores) -> str:
+    return f"{_spread(scores.percentile).split(' ')[0]}; {100 * scores.above.mean():.0f} % above"
+
+
+def _counts(fields: np.ndarray) -> str:
+    numbers, cells = np.unique(fields.astype(int), return_counts=True)
+    return ", ".join(f"{number}: {count} cells" for number, count in zip(numbers, cells, strict=True))
+
+
+FIGURE = CellFigure("A torus cell in boxes of two sizes", measure_torus, table_torus, draw_result)
+
+
+SHOWN = 4
+"""Columns drawn."""
+WIDE, GAP, BAR = 1.45, 0.16, 0.08
+"""Inches: width of a map, between maps, width of a colour bar."""
+HEIGHT, LOW, HEAD = 1.6, 0.95, 0.42
+"""Inches: of a histogram, below it, above a row of maps."""
+
+
+class BoxMaps(NamedTuple):
+    """Maps in a box. name: with its size. size: m. bin: m. maps: [n, H, W] rates."""
+
+    name: str
+    size: tuple[float, float]
+    bin: float
+    maps: np.ndarray
+
+
+SCORES = np.linspace(-1.5, 1.5, 61).tolist()
+"""Limits of the bins of lattice scores."""
+
+
+def draw_torus(
+    title: str, line: str, boxes: Sequence[BoxMaps], scores: Mapping[str, ShuffledScores],
+    spacing: np.ndarray, torus: float, png: Path,
+) -> None:  # fmt: skip
+    """Draws for each box a row of maps and one of autocorrelograms, and histograms below.
+
+    Args:
+        scores: of the first box, by name. spacing: [n] in the first box, m. torus: its side, m.
+    """
+    rows = [WIDE * box.size[1] / box.size[0] for box in boxes for _ in range(2)]
+    height = style.TOP + sum(rows) + HEAD * len(rows) + 0.6 + HEIGHT + LOW
+    figure = style.new_figure(height, title, line)
+    top = height - style.TOP
+    for box in boxes:
+        tall = WIDE * box.size[1] / box.size[0]
+        shown = box.maps[:SHOWN]
+        peak = np.nanmax(shown, axis=(1, 2), keepdims=True)
+        rates = shown / np.maximum(peak, np.finfo(float).tiny)  # a silent column stays 0
+        lags = autocorrelogram(shown)
+        x, y = box.size
+        reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
+        for name, images, extent, colours in (
+            (f"rates, {box.name}", rates, (0, x, 0, y), ("viridis", 0, 1)),
+            (
+                "autocorrelograms over lags of x and y (m)",
+                lags,
+                (-reach_x, reach_x, -reach_y, reach_y),
+                ("RdBu_r", -1, 1),
+            ),
+        ):
+            top -= HEAD
+            figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
+            top -= tall
+            _draw_row(figure, top, tall, images, extent, colours)
+    axes = _draw_histograms(figure, scores, spacing, torus)
+    style.add_legend(figure, axes, columns=2)
+    figure.savefig(png)
+
+
+def _draw_row(
+    figure: style.Figure, bottom: float, tall: float, images: np.ndarray,
+    extent: tuple[float, float, float, float],
+    colours: tuple[str, float, float],
+) -> None:  # fmt: skip
+    name, low, high = colours
+    for column, values in enumerate(images):
+        axes = style.add_axes(figure, style.LEFT + column * (WIDE + GAP), bottom, WIDE, tall)
+        image = axes.imshow(values, origin="lower", extent=extent, cmap=name, vmin=low, vmax=high)
+        axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
+        axes.tick_params(labelsize=7, pad=1)
+        labels = axes.get_xticklabels()
+        labels[0].set_horizontalalignment("left")
+        labels[-1].set_horizontalalignment("right")
+        if column == 0:
+            axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
+    left = style.LEFT + len(images) * (WIDE + GAP)
+    bar = style.add_axes(figure, left, bottom, BAR, tall)
+    figure.colorbar(image, cax=bar, ticks=(low, high))
+    label = "rate / peak" if low == 0 else "correlation"
+    bar.yaxis.set_label_position("right")
+    bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
+
+
+def _draw_histograms(
+    figure: style.Figure, scores: Mapping[str, ShuffledScores], spacing: np.ndarray, torus: float
+) -> style.Axes:
+    gap, count = 0.5, len(scores) + 1
+    width = (style.WIDTH - style.LEFT - style.RIGHT - (count - 1) * gap) / count
+    panels = [
+        style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT) for k in range(count)
+    ]
+    for axes, (name, found) in zip(panels, scores.items(), strict=False):
+        known = found.score[np.isfinite(found.score)]
+        shuffled = found.shuffled[np.isfinite(found.shuffled)]
+        axes.hist(shuffled, SCORES, density=True, color=style.GREY, label="shuffled")
+        axes.hist(known, SCORES, density=True, color=style.BLUE, alpha=0.7, label="columns")
+        axes.set_xlim(-1.5, 1.5)
+        style.name_axes(axes, f"{name}, larger box", "density" if axes is panels[0] else "")
+    known = spacing[np.isfinite(spacing)]
+    near = np.linspace(torus - 0.1, torus + 0.1, 41)
+    panels[-1].hist(np.clip(known, near[0], near[-1]), near.tolist(), color=style.BLUE)
+    panels[-1].axvline(torus, color=style.VERMILLION, lw=1.4)
+    panels[-1].set_title("red: side of the torus", fontsize=8, color=style.LABEL_GREY, loc="left")
+    style.name_axes(panels[-1], "spacing, larger box (m)", "columns")
+    for axes in panels:
+        axes.grid(color=style.LINE_GREY, lw=0.7)
+    return panels[0]

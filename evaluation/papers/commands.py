@@ -1,0 +1,443 @@
+"""The command `reproduce`, for figures of the whisker papers and tables of results."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+from evaluation.papers.cells.reproduction import NAMES as CELL_ROWS
+from evaluation.papers.maps.registry import ROWS as MAP_ROWS
+from evaluation.papers.whiskers.reproduction import NAMES as REAL_ROWS
+from ratslam.cli.common import (
+    INTERRUPTED,
+    CommandParser,
+    Commands,
+    add_config,
+    add_count,
+    add_set,
+    add_workers,
+    own_folder,
+    positive_integer,
+    prepare_jax,
+    read_config,
+)
+from ratslam.runs.settings.packaged import find_config
+from tactile.base.errors import InputError
+from tactile.base.new_file import require_new_file
+
+SALMAN2016 = {
+    "fig2": "odometry drift over three clockwise laps",
+    "fig3": "experience history",
+    "fig4": "with and without kidnaps",
+    "fig5": "clockwise and anticlockwise laps",
+    "fig6": "open loop against RCP, max_angle",
+    "fig7": "contact_angle against max_angle",
+    "reverse": "driving forwards and backwards (added)",
+    "controls": "the contribution of the images (added)",
+    "matched": "conditions at matched ARCR, classic matcher",
+}
+"""Reproductions of Salman & Pearson 2016."""
+FOX2012 = {
+    "fox-fig4": "mean maps of three mappers",
+    "fox-fig5": "maps of single trials",
+    "fox-fig6": "a larger arena at two levels of odometry noise",
+}
+"""Reproductions of Fox et al. 2012."""
+SETS = {"fox-fig4": 20, "fox-fig5": 2}
+"""Default number of sets of figures that do not use `USUAL_SETS`."""
+USUAL_SETS = 3
+
+
+def add_commands(commands: Commands) -> None:
+    """Registers `reproduce` with a command for each figure and table, and for strain templates."""
+    reproduce = commands.add(
+        "reproduce", None, "reproduce a figure or table, with controls", "reproduce fig2 --sets 1", "papers"
+    )
+    names = Commands(reproduce)
+    for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
+        for name, title in figures.items():
+            add_figure(names, name, f"{paper}: {title}")
+    threshold = names.add(
+        "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
+        "reproduce threshold whisker_maze -o runs/threshold",
+    )  # fmt: skip
+    add_config(threshold)
+    add_workers(threshold, 1)
+    threshold.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new folder for threshold.png and threshold.csv"
+    )
+    tables = names.add(
+        "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
+    )
+    add_tables(Commands(tables))
+    real = names.add(
+        "real", _real, "figures on recordings of real whiskers and wheels",
+        "reproduce real --rows contact -o runs/real",
+    )  # fmt: skip
+    add_row_names(real, REAL_ROWS)
+    real.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
+        check=own_folder("real.md"),
+        help="folder for real.md and a picture per figure (default runs/real)",
+    )  # fmt: skip
+    title = "maps found again, continued, merged and changed"
+    maps = add_rows(names, "maps", _maps, title, MAP_ROWS, 32000)
+    add_against(maps, "maps.csv")
+    title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
+    add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
+    train = names.add(
+        "templates", _train, "Fox et al.: strain templates of a simulated Create",
+        "reproduce templates create_arena -o runs/templates.npz",
+    )  # fmt: skip
+    add_config(train)
+    train.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="NPZ",
+        check=partial(require_new_file, parents=True), help="the new file",
+    )  # fmt: skip
+
+
+def add_rows(
+    names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
+) -> CommandParser:
+    """Registers a set of tables and figures, of which each is a row; its parser.
+
+    Args:
+        title: line of the help. rows: names of the rows; the first is in the example. first: default seed of
+            the first session.
+    """
+    example = f"reproduce {name} --rows {next(iter(rows))} --sessions 1 -o runs/{name}"
+    parser = names.add(name, command, title, example)
+    add_row_names(parser, rows)
+    parser.add_argument(
+        "--sessions", type=positive_integer, metavar="N",
+        help="sessions or repeats per row (default: of the row)",
+    )  # fmt: skip
+    add_count(parser, "--first", first, "seed of the first session; each has the next one")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
+        check=own_folder(f"{name}.md", name),
+        help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
+    )  # fmt: skip
+    add_workers(parser, 1)
+    return parser
+
+
+def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
+    """Registers `--rows`, whose help lists the names of all rows."""
+    listed = ", ".join(f"'{name}'" if " " in name else name for name in rows)
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed} (default: all)")
+
+
+def add_figure(names: Commands, name: str, title: str) -> None:
+    """Registers a figure."""
+    parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
+    sets = SETS.get(name, USUAL_SETS)
+    add_count(parser, "--sets", sets, "mazes or trials per condition")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
+        check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
+        help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
+    )  # fmt: skip
+    add_set(parser)
+    add_workers(parser)
+    parser.set_defaults(name=name)
+
+
+def _figure(arguments: argparse.Namespace) -> int:
+    if arguments.seed < 0:
+        raise InputError("--seed", str(arguments.seed), "a non-negative integer")
+    prepare_jax(keep_compiled=False)
+    if arguments.name in FOX2012:
+        from evaluation.papers.fox2012.reproduction import PAPER
+    else:
+        from evaluation.papers.salman2016.reproduction import PAPER
+    from evaluation.papers.trials.reproduction import reproduce
+
+    name, folder = arguments.name, arguments.output
+    text, interrupted = reproduce(
+        PAPER,
+        name,
+        folder,
+        sets=arguments.sets,
+        workers=arguments.workers,
+        seed=arguments.seed,
+        assignments=arguments.set,
+    )
+    print(f"{text}\n\nwrote {folder / name}.csv" + ("" if interrupted else f" and {folder / name}.png"))
+    return INTERRUPTED if interrupted else 0
+
+
+def _threshold(arguments: argparse.Namespace) -> int:
+    prepare_jax(keep_compiled=False)
+    from evaluation.papers.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
+    from ratslam.runs.settings.strict_yaml import load, override
+
+    path = find_config(arguments.config)
+    tuning = tune_threshold(override(load(path), arguments.set), path.parent, arguments.workers)
+    print(render_tuning(tuning))
+    if arguments.output:
+        plot, table = save_tuning(tuning, arguments.output)
+        print(f"\nwrote {plot} and {table}")
+    return 0
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from robot.simulation.create.template_training import drive_held_out, render_drives, train_to_file
+
+    create_simulation = read_config(arguments).create_simulation
+    if create_simulation is None:
+        where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` gives the default"
+        raise InputError(where, "missing", "the Create to train", cure)
+    templates = train_to_file(create_simulation, arguments.output)
+    print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
+    print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
+    return 0
+
+
+def _real(arguments: argparse.Namespace) -> int:
+    from evaluation.papers.tables.markdown import select_rows
+    from evaluation.papers.tables.recordings import DATA, real_recordings
+    from evaluation.papers.whiskers.reproduction import reproduce_real
+
+    data = real_recordings()
+    if data is None:
+        raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
+    prepare_jax(keep_compiled=False)
+    names = select_rows(arguments.rows, dict.fromkeys(REAL_ROWS), REAL_ROWS)
+    for line in reproduce_real(names, data, arguments.output):
+        print(line, flush=True)
+    print(f"wrote {arguments.output / 'real.md'}")
+    return 0
+
+
+def _maps(arguments: argparse.Namespace) -> int:
+    prepare_jax(keep_compiled=False)
+    from evaluation.papers.maps.product import PRODUCT
+    from evaluation.papers.maps.reproduction import reproduce_maps
+    from evaluation.papers.tables.markdown import select_rows
+
+    names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
+    lines = reproduce_maps(
+        names,
+        PRODUCT,
+        arguments.output,
+        arguments.first,
+        arguments.sessions,
+        arguments.workers,
+        arguments.against,
+    )
+    for line in lines:
+        print(line, flush=True)
+    print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
+    return 0
+
+
+def _cells(arguments: argparse.Namespace) -> int:
+    prepare_jax(keep_compiled=False)
+    from evaluation.papers.cells.figure import CellTask
+    from evaluation.papers.cells.reproduction import reproduce_cells
+    from evaluation.papers.tables.markdown import select_rows
+
+    names = select_rows(arguments.rows, dict.fromkeys(CELL_ROWS), CELL_ROWS)
+    task = CellTask(arguments.first, arguments.sessions, arguments.workers)
+    for line in reproduce_cells(names, task, arguments.output):
+        print(line, flush=True)
+    print(f"wrote {arguments.output / 'cells.md'}")
+    return 0
+
+
+BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
+SESSION_FILES = ("touch.csv", "buildings.csv")
+"""Files of the sessions of tables, which may be in one folder."""
+
+Lines = Callable[[argparse.Namespace], Iterator[str]]
+
+
+def add_tables(tables: Commands) -> None:
+    """Registers the tables."""
+
+    def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
+        parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
+        parser.set_defaults(lines=lines, file="")
+        return parser
+
+    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
+    add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
+    touch.add_argument(
+        "--sessions",
+        type=positive_integer,
+        metavar="N",
+        help="sessions per row (default: of the row, 12 to 40)",
+    )
+    touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
+    add_session_file(touch, "touch.csv")
+    grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
+    add_count(grid, "--arenas", 10, "arenas per row")
+    add_count(grid, "--first", 9000, "seed of the first arena")
+    grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
+    laser = add("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
+    add_count(laser, "--copies", 10, "perturbed copies per recording")
+    buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
+    add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    add_session_file(buildings, "buildings.csv")
+    health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
+    add_count(health, "--sessions", 2, "sessions per row")
+    add_workers(health)
+    closures = add(
+        "closures", _closures_lines, "fits and tests the log-odds of closure sequences", "--sessions 2"
+    )
+    add_count(closures, "--sessions", 6, "sessions per row")
+    add_workers(closures)
+    closures.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder for closure_judge.json, the weights"
+    )
+    closures.set_defaults(file="closure_judge.json")
+    for parser in (touch, grid, laser, buildings):
+        parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
+        add_workers(parser)
+    speed = add("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
+    speed.add_argument(
+        "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
+    )
+    add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
+    cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
+    cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
+    add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
+    cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
+    batches = add("batches", _batch_lines, "many sets or sessions in one call, on a GPU too", "--steps 160")
+    add_count(batches, "--sets", 1000, "parameter sets in one call")
+    add_count(batches, "--sessions", 256, "sessions in one call")
+    add_count(batches, "--steps", 1600, "steps of a session")
+    add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
+    precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
+    add_count(precision, "--seeds", 20, "sessions per method")
+    precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
+    precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="new folder for BACKEND.npz")
+    add_workers(precision, 1)
+    chaos = add("chaos", _chaos_lines, "divergence of two almost equal pose-cell networks", "--steps 1000")
+    add_count(chaos, "--steps", 100_000, "steps per walk")
+    add_count(chaos, "--walks", 3, "walks per row")
+    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of networks")
+    chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
+
+
+def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `-o` and `--against` of a table whose sessions are written to a file."""
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
+        help=f"folder for {file}, the figures of each session as soon as it is done",
+    )  # fmt: skip
+    add_against(parser, file)
+    parser.set_defaults(file=file)
+
+
+def add_against(parser: argparse.ArgumentParser, file: str) -> None:
+    """Registers `--against`."""
+    parser.add_argument(
+        "--against", type=Path, metavar="DIR",
+        help=f"compare with the same sessions in {file} of an earlier run, given -o DIR",
+    )  # fmt: skip
+
+
+def _print_table(arguments: argparse.Namespace) -> int:
+    prepare_jax(keep_compiled=False)
+    for line in arguments.lines(arguments):
+        print(line, flush=True)
+    if arguments.file and arguments.output is not None:
+        print(f"\nwrote {arguments.output / arguments.file}")
+    return 0
+
+
+def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.comparison import Files
+    from evaluation.papers.tables.markdown import select_rows
+    from evaluation.papers.tables.touch import DEFAULT_ROWS, ROWS, touch_table
+
+    rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
+    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
+
+
+def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.grid import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
+    from evaluation.papers.tables.markdown import select_rows
+
+    if arguments.rows or arguments.worlds:
+        names = select_rows(arguments.rows, ROWS, tuple(ODOMETRY_ERRORS))
+        rows = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
+    else:
+        rows = DEFAULT_ROWS
+    return grid_table(rows, arguments.arenas, arguments.first, arguments.workers)
+
+
+def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.laser import ROWS, laser_table
+    from evaluation.papers.tables.markdown import select_rows
+
+    return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
+
+
+def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.buildings import buildings_table, choose_rows
+    from evaluation.papers.tables.comparison import Files
+
+    files = Files(arguments.output, arguments.against)
+    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers, files=files)
+
+
+def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.health import health_table
+
+    return health_table(arguments.sessions, arguments.workers)
+
+
+def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.closures import closures_table
+
+    return closures_table(arguments.sessions, arguments.workers, arguments.output)
+
+
+def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.metrics.resources import one_core
+
+    with one_core():
+        from evaluation.papers.tables.speed import SIZES, speed_table
+
+        yield from speed_table(arguments.rows or SIZES, arguments.rounds)
+
+
+def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.metrics.resources import one_core
+
+    with one_core():
+        from evaluation.papers.tables.cycles import cycle_table, profile_table
+
+        if arguments.profile:
+            yield from profile_table(arguments.rows)
+        else:
+            yield from cycle_table(arguments.rows, arguments.rounds)
+
+
+def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.metrics.resources import one_core
+
+    with one_core():
+        from evaluation.papers.tables.batches import batch_table
+
+        yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
+
+
+def _precision_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.precision import precision_table
+
+    return precision_table(arguments.backends, arguments.seeds, arguments.workers, arguments.output)
+
+
+def _chaos_lines(arguments: argparse.Namespace) -> Iterator[str]:
+    from evaluation.papers.tables.chaos import PAIRS, chaos_table
+    from evaluation.papers.tables.markdown import select_rows
+
+    pairs = select_rows(arguments.pairs, PAIRS, tuple(PAIRS))
+    return chaos_table(pairs, arguments.motions, arguments.steps, arguments.walks)

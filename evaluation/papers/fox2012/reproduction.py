@@ -1,0 +1,366 @@
+"""Runs a protocol: each session through all mappers and methods.
+
+A set is a session: an arena, a start, the behaviour of the robot and the errors of its odometry, all from one
+seed. All mappers and methods run on the same sets, so their differences are paired.
+
+The result of a reproduction as text: metrics of paths and maps, then equation 6 under all conventions.
+
+Tests of the paper's ranking of its mappers, on the same sets and under all ways to score a map.
+
+The paper ranks its mappers by one number. Two baselines show what that number means: the best constant map,
+which needs no contact, and the same marks drawn along dead reckoning and along the true path. A ranking that
+holds there too is one of the marks, not of the filters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.grid_error import CONVENTIONS, DISTINCT_CONVENTIONS, MAIN_CONVENTION, Convention
+from evaluation.metrics.grid_score import GridScore, pool_grids, render_grid_scores, score_grid
+from evaluation.metrics.occupancy_grid import OccupancyGrid, mean_grid
+from evaluation.metrics.revisits import CLOSED_GAP, path_metrics
+from evaluation.metrics.statistics import bootstrap
+from evaluation.metrics.trajectory import position_error
+from evaluation.papers.fox2012.protocols import (
+    FILTERED,
+    PAPERS,
+    PROTOCOLS,
+    RECKONED,
+    TRUE,
+    Protocol,
+    session_config,
+)
+from evaluation.papers.trials.arena_trial import (
+    ArenaSession,
+    FilterResult,
+    collect_marks,
+    draw_map,
+    observe_session,
+    run_filter,
+    simulate_session,
+)
+from evaluation.papers.trials.reproduction import Paper, ResultRow, column, count_sets, run_with_progress
+from evaluation.plots import style
+from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
+from ratslam.runs.artifacts import true_grid
+from ratslam.runs.settings.run_config import RunConfig
+from robot.touch_source import report_config_of
+from robot.world.arena import Arena, wall_segments
+from tactile.base.random_streams import stream
+
+KEY = ("world", "method", "mapper", "along")
+"""Names of a result; the map is drawn `along` the scored path: `FILTERED`, `RECKONED` or `TRUE`."""
+MAP_METRICS = (
+    "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
+    "map_chamfer_walls",
+)  # fmt: skip
+FIELDS = (
+    "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
+    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *MAP_METRICS,
+)  # fmt: skip
+"""Columns of metrics in NAME.csv."""
+
+HEAD = (
+    f"{'':<30}{'online':>7}{'final':>7}{'heading':>9}{'/ dead r.':>11}{'better in':>11}{'gap':>7}"
+    f"{'closed':>8}{'eq. 6':>8}{'Brier sk.':>11}{'AUC':>7}{'Chamfer':>15}"
+)
+LEGEND = (
+    "online, final: mean position error of the online and the final poses, m, with known start, not aligned; "
+    "heading: online,\ndegrees; / dead r.: online error over dead reckoning's, and in how many sets it is "
+    "smaller; gap, closed: error of the final path\nbetween the visits of a place, m, and share of the "
+    f"revisits with less than {CLOSED_GAP:g} m (- without revisits); eq. 6: all cells, unknown\n"
+    "outside, raw; Brier skill, wall AUC and Chamfer (map to walls, walls to map, m): over the cells that "
+    "whiskers can sense. Means over sets."
+)
+
+PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
+
+
+def render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
+    """All metrics of a reproduction, then the tests of the paper's order of mappers."""
+    done = len({row.number for row in rows})
+    lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
+    for world, stop in product(protocol.worlds, range(len(protocol.stops))):
+        these = [row for row in rows if row.key[0] == world.name and row.session.stop == stop]
+        lines += _metric_lines(world.name, these, protocol)
+    lines += [LEGEND, ""]
+    if set(PAPERS) <= set(protocol.mappers) and done > 1:
+        for method in protocol.methods:
+            scores = [
+                pool_grids(
+                    [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)], mapper
+                )
+                for mapper in protocol.mappers
+            ]
+            lines += [f"{method.capitalize()}:", render_grid_scores(scores), ""]
+            lines += [*render_rankings(method, rows), ""]
+    return "\n".join([*lines, protocol.note])
+
+
+def _metric_lines(world: str, rows: Sequence[ResultRow], protocol: Protocol) -> list[str]:
+    if not rows:
+        return []
+    counts = [row.values["reports"] for row in rows]
+    spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+    lines = [f"{world}, {spread} reports", HEAD]
+    for method, along, mapper in product(protocol.methods, PREFIXES, protocol.mappers):
+        these = [row for row in rows if row.key[1:] == (method, mapper, along)]
+        lines += [_line(PREFIXES[along].format(method) + mapper, these)] if these else []
+    return [*lines, ""]
+
+
+def _line(name: str, rows: Sequence[ResultRow]) -> str:
+    def mean(field: str, digits: int = 3) -> str:
+        values = [value for row in rows if (value := row.values.get(field)) is not None]
+        return f"{np.mean(values):.{digits}f}" if values else "-"
+
+    fields = ("online_error", "odometry_error")
+    online, odometry = (np.array([row.values[field] for row in rows], float) for field in fields)
+    filtered = rows[0].key[3] == FILTERED
+    ratio = f"{online.mean() / odometry.mean():.2f}" if filtered and odometry.mean() > 0 else "-"
+    better = f"{(online < odometry).sum()} of {len(rows)}" if filtered else "-"
+    ways = f"{mean('map_chamfer_map')}, {mean('map_chamfer_walls')}"
+    error, heading = mean(MAIN_CONVENTION.column), mean("online_heading_error_deg", 1)
+    return (
+        f"{name:<30}{mean('online_error'):>7}{mean('final_error'):>7}{heading:>9}{ratio:>11}{better:>11}"
+        f"{mean('revisit_gap'):>7}{mean('revisits_closed', 2):>8}{error:>8}"
+        f"{mean('map_brier_skill', 2):>11}{mean('map_auc', 2):>7}{ways:>15}"
+    )
+
+
+FEW = 6  # number of sets below which the intervals are too narrow
+
+
+class Measure(NamedTuple):
+    """A way to score a map.
+
+    Attributes:
+        key: of `reproduction.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
+            information, or the convention of which it is the best constant map's.
+    """
+
+    name: str
+    key: str
+    sign: int
+    trivial: float | Convention
+
+
+class Ranking(NamedTuple):
+    """The test of the paper's ranking under one measure.
+
+    Attributes:
+        steps: for each pair of neighbours from worst to best, the mean difference and its 95 % interval.
+            word: `holds`, `does not hold` or `not decided`. beaten: whether a map without information is as
+            good as the best mapper.
+    """
+
+    steps: tuple[tuple[float, float, float], ...]
+    word: str
+    beaten: bool
+
+
+MEASURES = (
+    *(
+        Measure("eq. 6  {:<5}{:<7}{}".format(*each.words), each.column, 1, each)
+        for each in DISTINCT_CONVENTIONS
+    ),
+    Measure("Brier skill", "map_brier_skill", -1, 0.0),
+    Measure("wall AUC", "map_auc", -1, 0.5),
+    Measure("Chamfer, map to walls", "map_chamfer_map", 1, 0.0),
+    Measure("Chamfer, walls to map", "map_chamfer_walls", 1, 0.0),
+)
+"""All measures. A map without information wins either Chamfer distance alone: with few cells, or with all."""
+
+
+def rank_mappers(
+    rows: Sequence[ResultRow], method: str, measure: Measure, along: str = FILTERED
+) -> Ranking | None:
+    """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
+    score = measure.sign * np.array([column(rows, (method, name, along), measure.key) for name in PAPERS])
+    score = score[:, np.isfinite(score).all(axis=0)]
+    if score.shape[1] < 2:
+        return None
+    name = f"{method} {along} {measure.key}"
+    steps = tuple((float((a - b).mean()), *bootstrap(a - b, name)) for a, b in pairwise(score))
+    holds, fails = all(low > 0 for _, low, _ in steps), any(high <= 0 for *_, high in steps)
+    word = "holds" if holds else "does not hold" if fails else "not decided"
+    trivial = measure.trivial
+    if isinstance(trivial, Convention):
+        trivial = float(np.mean([row.session.score.under(trivial).best for row in rows]))
+    return Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
+
+
+def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
+    """A line for each measure."""
+    first, second, third = PAPERS
+    lines = [
+        f"{first} worse than {second} worse than {third}? {method}: paired differences, 95 % intervals",
+        f"{'scored by':<29}{f'{first} - {second}':<29}{f'{second} - {third}':<29}{'verdict':<15}"
+        f"{f'on {RECKONED}':<19}on the {TRUE}",
+    ]
+    for measure in MEASURES:
+        held = rank_mappers(rows, method, measure)
+        if held is None:
+            lines.append(f"{measure.name:<29}too few sets with a score of all three")
+            continue
+        steps = "".join(f"{f'{d:+.4f} [{low:+.4f}, {high:+.4f}]':<29}" for d, low, high in held.steps)
+        others = (rank_mappers(rows, method, measure, along) for along in (RECKONED, TRUE))
+        words = [other.word if other else "-" for other in others]
+        beaten = "a map without information is as good" if held.beaten else ""
+        lines.append(f"{measure.name:<29}{steps}{held.word:<15}{words[0]:<19}{words[1]:<18}{beaten}".rstrip())
+    if len({row.number for row in rows}) < FEW:
+        lines.append(f"Intervals of fewer than {FEW} sets are too narrow.")
+    return lines
+
+
+Rows = Sequence[ResultRow]
+
+
+def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
+    """The figure of a reproduction."""
+    draw, explanation = {
+        "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
+        "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
+        "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
+    }[name]
+    panels, lines = draw(protocol, [row for row in rows if row.key[3] == FILTERED])
+    first_only = name == "fox-fig6" and any(row.number for row in rows)
+    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}  ·  {explanation}"
+    return draw_grids(f"{name}: {protocol.title}", line, panels, across=len(panels) // lines)
+
+
+def _means(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A mean map for each mapper, and the number of lines: method below method."""
+    panels = []
+    for method, mapper in product(protocol.methods, protocol.mappers):
+        these = [row for row in rows if row.key[1:3] == (method, mapper)]
+        error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
+        mean = mean_grid([row.session.grid for row in these])
+        panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
+    return panels, len(protocol.methods)
+
+
+def _singles(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A map with the paths for each mapper, and the number of lines: method below method, set below set."""
+    method, mapper = protocol.methods.index, protocol.mappers.index
+    rows = sorted(rows, key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
+    panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in rows]
+    return panels, len(panels) // len(protocol.mappers)
+
+
+def _worlds(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
+    """A map of the first set for each world and length, and the number of lines: method below method."""
+    first = [row for row in rows if row.number == 0]
+    first.sort(key=lambda row: (protocol.methods.index(row.key[1]), row.key[0], row.values["reports"]))
+    panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
+    return panels, len(protocol.methods)
+
+
+def _with_paths(name: str, row: ResultRow) -> GridPanel:
+    line = f"{row.key[1]}, {row.values['online_error']:.3f} ({row.values['odometry_error']:.3f})"
+    paths = GridPaths(row.session.truth, row.session.online, row.session.odometry)
+    return _panel(name, line, row)._replace(paths=paths)
+
+
+def _panel(name: str, line: str, row: ResultRow) -> GridPanel:
+    return GridPanel(name, line, row.session.grid, wall_segments(row.session.arena))
+
+
+class SessionJob(NamedTuple):
+    """A session to simulate and filter.
+
+    Attributes:
+        seed: of the session. training: seed of the strain templates. stops: numbers of reports after which
+            the result is scored; 0: all. variants: configurations by method and mapper.
+    """
+
+    world: str
+    number: int
+    seed: int
+    training: int
+    stops: tuple[int, ...]
+    variants: Mapping[tuple[str, str], RunConfig]
+
+
+class MapResult(NamedTuple):
+    """The map and the paths [T, 3] of a row, in the frame of the arena; `stop` is the index of its stop."""
+
+    stop: int
+    score: GridScore
+    grid: OccupancyGrid
+    arena: Arena
+    truth: np.ndarray
+    odometry: np.ndarray
+    online: np.ndarray
+
+
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[SessionJob]:
+    """All sessions of a reproduction, set by set.
+
+    Raises:
+        InputError: an invalid assignment.
+    """
+    jobs = []
+    for number, world in product(range(sets), protocol.worlds):
+        own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
+        arena = seed if protocol.one_arena else own
+        session, where = f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}"
+        settings = (session, where, f"session.seed={own}", *assignments)
+        variants = {
+            (method, mapper): session_config(world, method, mapper, settings)
+            for method, mapper in product(protocol.methods, protocol.mappers)
+        }
+        jobs.append(SessionJob(world.name, number, own, seed, protocol.stops, variants))
+    return jobs
+
+
+def run_job(job: SessionJob) -> list[ResultRow]:
+    """The results of all variants on a session, and of their marks along paths without a filter.
+
+    Raises:
+        InputError: the session cannot be simulated.
+    """
+    some = next(iter(job.variants.values()))
+    assert some.create_simulation is not None
+    session = simulate_session(some.create_simulation)
+    count = len(session.truth)
+    stops = tuple(min(stop, count) if stop else count for stop in job.stops)
+    found: list[ResultRow] = []
+    for variant, config in job.variants.items():
+        reports = observe_session(config, session, job.training)
+        marks = collect_marks(reports)
+        feelers = report_config_of(session.source.info, config.touch.reports).feelers
+        for stop, filtered in enumerate(run_filter(config, session, reports, stops)):
+            found.append(_score(job, session, (*variant, FILTERED), stop, filtered))
+            for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
+                path = whole[: stops[stop]]
+                drawn = FilterResult(path, path, draw_map(config.grid, feelers, session.arena, path, marks))
+                found.append(_score(job, session, (*variant, name), stop, drawn))
+    return found
+
+
+def _score(
+    job: SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
+) -> ResultRow:
+    count = len(one.path)
+    truth, odometry = session.truth[:count], session.odometry[:count]
+    score = score_grid(one.grid, true_grid(session.arena._replace(start=np.zeros(3)), one.grid), key[1])
+    values = {
+        "reports": count,
+        "odometry_error": position_error(odometry, truth),
+        **path_metrics(one.online, one.path, truth),
+        **{error.convention.column: error.error for error in score.errors},
+        **{name: score.quantities[name].value for name in MAP_METRICS},
+    }
+    result = MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
+    return ResultRow((job.world, *key), job.number, job.seed, values, result)
+
+
+_run = partial(run_with_progress, run_job)
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, draw_reproduction, render_results)

@@ -1,0 +1,453 @@
+"""Row: an emulated arm drives to goals on a map, and finds a wall in its way.
+
+Drives an emulated arm to goals on a map made in replay, in closed loop and in virtual time.
+
+Each goal is an experience drawn at random at most 1 m away along driven cells; a drive starts where the one
+before ended. In further drives a wall is put across the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import networkx
+import numpy as np
+
+from evaluation.metrics.localisation import RIGHT, localisation_errors, true_places
+from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
+from evaluation.papers.maps.row import Line, MapRow, MapTask, count, median, spread
+from evaluation.papers.maps.scenarios import open_world, ten_circuits
+from evaluation.papers.maps.sessions import Recipe
+from evaluation.papers.maps.stored_maps import StoredMap
+from evaluation.papers.tables.comparison import Record
+from ratslam.places.localiser import Localiser
+from ratslam.runs.goal_planner import GoalPlanner, contact_map, felt_points
+from ratslam.runs.localise import localising_for_goals
+from ratslam.runs.saved_map import read_map
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.slam import Slam
+from robot.live.config import LiveConfig
+from robot.live.goal_config import GoalConfig
+from robot.live.goal_drive import DriveState, GoalDrive
+from robot.live.goal_route import GoalRoute
+from robot.live.virtual_arm import VirtualArm
+from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
+from robot.world.scene import Scene, make_scene, maze_seed
+from robot.world.walls import Surroundings, Walls
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between, compose
+from tactile.base.segments import segment_distances
+from tactile.frontend import Frontend
+from tactile.whiskers.head_geometry import ur10_head
+
+PAIRS, WALLS = 20, 5
+"""Number of drives without and with a wall put in the way."""
+RATIO, MINUTES = 1.15, 60
+"""Goals: length of the paths over that of the shortest ways; duration of all drives."""
+
+NEAREST, FARTHEST = 0.18, 1.0
+"""Range of a goal's distance along driven cells, m: from one cell side."""
+LONGEST = 400
+"""Whisks after which a drive is given up."""
+
+
+class Drive(NamedTuple):
+    """A drive to one goal.
+
+    Attributes:
+        state, reason: its end. whisks: their number. replans: new ways.
+        error: true distance from the goal at the end, m, by the nearest step of the map
+            (`evaluation.metrics.localisation`). reckoned: true distance, m, from where the noisy odometry
+            puts the robot, summed from the start of the first drive on. by_arm: distance from the goal,
+            m, at which exact motion from the end of the map to the goal's pose in the map would have ended.
+        length: of the true path, m. shortest: way over driven cells, m. clearance: least distance of the
+            head's axis from a wall on the way, m. clear: whether no whisker at rest was inside a wall.
+        path: [n, 2] true, m. goal: [2] its true place, m.
+    """
+
+    state: DriveState
+    reason: str
+    goal: np.ndarray
+    whisks: int
+    replans: int
+    error: float
+    reckoned: float
+    by_arm: float
+    length: float
+    shortest: float
+    clearance: float
+    clear: bool
+    path: np.ndarray
+
+    @property
+    def reached(self) -> bool:
+        """Whether it ended at its goal, by the truth too."""
+        return self.said_reached and self.error <= RIGHT.distance
+
+    @property
+    def said_reached(self) -> bool:
+        """Whether it said that it ended there."""
+        return self.state is DriveState.REACHED
+
+
+class DrivenMap(NamedTuple):
+    """A map with the world in which it was made.
+
+    Attributes:
+        config: of the session that made it. scene: of that session. stored: the map.
+    """
+
+    config: RunConfig
+    scene: Scene
+    stored: StoredMap
+
+    @property
+    def end(self) -> np.ndarray:
+        """[3] true pose at its end."""
+        return self.stored.arrays.truth[-1]
+
+
+def driven_map(recipe: Recipe, stored: StoredMap) -> DrivenMap:
+    """The map of a session in a simulated maze."""
+    plan = recipe.config.simulation
+    assert plan is not None
+    head = ur10_head(recipe.config.touch.head)
+    scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
+    return DrivenMap(recipe.config, scene, stored)
+
+
+def live_config(config: RunConfig) -> LiveConfig:
+    """The arm's session in the world of a simulated one, with its odometry errors."""
+    plan = config.simulation
+    assert plan is not None
+    settings = {"plan": plan.model_dump(), "noise": plan.odometry.model_dump(), "seed": plan.seed}
+    return LiveConfig.model_validate(settings)
+
+
+class ClosedLoop:
+    """The arm in its maze, its mapper and its drives, one after the other."""
+
+    def __init__(self, made: DrivenMap) -> None:
+        self._made = made
+        self._live = live_config(made.config)
+        # Localises a robot that stands where a map ended, in that map.
+        saved = read_map(made.stored.path)
+        self._slam = Slam(localising_for_goals(saved.config, saved, "here"), saved.source)
+        self._frontend = Frontend(made.config.touch)
+        self._arm = VirtualArm(self._live, walls_of(made), made.end)
+        self._cell = made.config.pose_cells.cell_size
+        localiser = self._slam.map
+        assert isinstance(localiser, Localiser)
+        finished = localiser.place.map
+        self._route: GoalRoute | None = None
+        self._head = ur10_head(made.config.touch.head)
+        self._contacts = contact_map(finished, made.config.touch.image, self._head)
+        self.experiences: networkx.DiGraph = finished.graph()
+        self._reckoned = made.end
+
+    @property
+    def time(self) -> float:
+        """Duration of all drives so far, s."""
+        return self._arm.time
+
+    @property
+    def pose(self) -> np.ndarray:
+        """[3] true pose."""
+        return self._arm.poses[-1]
+
+    def place_of(self, experience: int) -> np.ndarray:
+        """[2] where an experience is in the world, m, by the step of the map that is nearest to it."""
+        return true_places(self._made.stored.arrays.steps, self._pose_of(experience)[None, :2])[0]
+
+    def _pose_of(self, experience: int) -> np.ndarray:
+        node = self.experiences.nodes[experience]
+        return np.array([node["x"], node["y"], node["heading"]])
+
+    def put_walls(self, walls: Surroundings) -> None:
+        """Replaces the walls."""
+        self._arm.surroundings = walls
+
+    def drive(self, experience: int) -> Drive:
+        """Drives to an experience."""
+        drive, first, whisks = self._begin(experience), len(self._arm.poses) - 1, 0
+        assert self._route is not None
+        while whisks < LONGEST and not self._route.advance(self._arm):
+            self._route.see(*self._sight())
+            whisks += 1
+        poses, place = np.array(self._arm.poses[first:]), self.place_of(experience)
+        path, walls = poses[:, :2], self._arm.surroundings
+        error, reckoned, by_arm = self._errors(experience)
+        return Drive(
+            drive.state, drive.reason, place, whisks, drive.replans, error, reckoned, by_arm,
+            float(np.hypot(*np.diff(path, axis=0).T).sum()),
+            shortest_driven(self._made.scene.loop, path[0], place),
+            clearance(walls.walls, path),
+            not (walls.contact(poses).angle <= 0).any(),
+            path,
+        )  # fmt: skip
+
+    def _begin(self, experience: int) -> GoalDrive:
+        goal = GoalConfig(map=self._made.stored.path, to=(experience,))
+        planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
+        drive = GoalDrive(goal, planner, self._cell, 1)
+        if self._route is None:
+            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast, self._contacts)
+        self._route.drive = drive
+        return drive
+
+    def _errors(self, experience: int) -> tuple[float, float, float]:
+        """True distance from an experience now; that of where odometry, and of where the exact motion of the
+        arm would have led on the way to it, m."""
+        steps, pose = self._made.stored.arrays.steps, self._pose_of(experience)
+        error = localisation_errors(steps, pose[None], self.pose[None], RIGHT.distance)[0, 0]
+        # Odometry would end where it takes its pose for that of the robot.
+        reckoned = np.hypot(*(self._reckoned - self.pose)[:2])
+        by_arm = compose(self._made.end, between(self._made.stored.arrays.trajectory[-1], pose))
+        return float(error), float(reckoned), float(np.hypot(*(by_arm[:2] - self.place_of(experience))))
+
+    def _sight(self) -> tuple[np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]:
+        """Estimate and contacts of the next whisk, and the arm's poses in it and after it."""
+        sample = self._arm.whisk()
+        seen = self._frontend.observe(sample.reading)
+        estimate = self._slam.step(seen)
+        assert sample.truth is not None
+        motion = sample.reading.odometry
+        self._reckoned = compose(self._reckoned, np.array([motion.dx, motion.dy, motion.dtheta]))
+        pose = None if estimate.lost else estimate.pose
+        points = felt_points(seen, self._made.config.touch.image, self._head)
+        return pose, points, sample.truth, self.pose
+
+
+def drive_pairs(
+    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
+) -> Iterator[Drive]:
+    """Drives to goals drawn at random, each from where the last one ended."""
+    for _ in range(count):
+        yield loop.drive(draw_goal(loop, made, random))
+
+
+def drive_blocked(
+    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
+) -> Iterator[Drive]:
+    """The same with a wall across the shortest way, half-way; it is taken away after each drive."""
+    for _ in range(count):
+        while True:
+            goal = draw_goal(loop, made, random)
+            cells = cells_between(made.scene.loop, loop.pose[:2], loop.place_of(goal))
+            if len(cells) >= 2:  # the wall is between centres that the way passes
+                break
+        middle = len(cells) // 2
+        loop.put_walls(walls_of(made, (cells[middle - 1], cells[middle])))
+        yield loop.drive(goal)
+        loop.put_walls(walls_of(made))
+
+
+def draw_goal(loop: ClosedLoop, made: DrivenMap, random: np.random.Generator) -> int:
+    """An experience in the range of goals from the present true pose."""
+    far = {
+        place: shortest_driven(made.scene.loop, loop.pose[:2], loop.place_of(place))
+        for place in loop.experiences
+    }
+    return int(random.choice([place for place, length in far.items() if NEAREST <= length <= FARTHEST]))
+
+
+def walls_of(made: DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surroundings:
+    """The walls of the maze, with one more between two neighbouring cells."""
+    maze, plan = made.scene.maze, made.config.simulation
+    assert plan is not None
+    maze = Maze(maze.across.copy(), maze.along.copy())
+    if across is not None:
+        wall, place = between_cells(maze, *across)
+        wall[place] = True
+    heights = stream(maze_seed(plan.maze, plan.seed), "maze.heights")
+    return Surroundings(wall_boxes(maze, heights, plan.maze.heights), made.scene.surroundings.head)
+
+
+def _driven_graph(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> networkx.Graph:
+    """Cells of the loop, joined in its order, with two points joined to both ends of the nearest link."""
+    links = list(zip(loop, [*loop[1:], loop[0]], strict=True))
+    ends = np.array([[cell_centre(cell), cell_centre(other)] for cell, other in links])
+    graph: networkx.Graph = networkx.Graph()
+    for (cell, other), (p, q) in zip(links, ends, strict=True):
+        graph.add_edge(cell, other, length=float(np.hypot(*(p - q))))
+    nearest = [int(np.argmin(segment_distances(point, ends[:, 0], ends[:, 1]))) for point in (a, b)]
+    for name, point, link in zip(("from", "to"), (a, b), nearest, strict=True):
+        for cell in links[link]:
+            graph.add_edge(name, cell, length=float(np.hypot(*(cell_centre(cell) - point))))
+    if nearest[0] == nearest[1]:
+        graph.add_edge("from", "to", length=float(np.hypot(*(a - b))))
+    return graph
+
+
+def shortest_driven(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> float:
+    """Length of the shortest way between two points [2] over the cells of the loop, m: along the lines
+    between their centres, which were driven."""
+    return float(networkx.dijkstra_path_length(_driven_graph(loop, a, b), "from", "to", weight="length"))
+
+
+def cells_between(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> list[Cell]:
+    """The cells whose centres that way passes, in order."""
+    way = networkx.dijkstra_path(_driven_graph(loop, a, b), "from", "to", weight="length")
+    return way[1:-1]
+
+
+def clearance(walls: Walls, path: np.ndarray) -> float:
+    """Least distance of points of a path [N, 2 or 3] from the walls, in plan, m."""
+    low, high = walls.box[:, :2], walls.box[:, 2:]
+    place = path[:, None, :2]
+    out = np.maximum(np.maximum(low - place, place - high), 0.0)
+    return float(np.linalg.norm(out, axis=-1).min())
+
+
+class GoalFigures(NamedTuple):
+    """The drives on one map.
+
+    Attributes:
+        seed: of the maze. free, walled: drives without and with a wall put in the way. seconds: duration of
+            all, by the arm. mapped: [n, 2] true path of the session that made the map, m. clearance: least
+            distance of the head's axis from a wall on that path, m.
+    """
+
+    seed: int
+    free: list[Drive]
+    walled: list[Drive]
+    seconds: float
+    mapped: np.ndarray
+    clearance: float
+
+
+def measure_goals(task: MapTask) -> GoalFigures:
+    """Drives on one map, each from where the last one ended."""
+    return measure_drives(task, PAIRS, WALLS)
+
+
+def measure_drives(task: MapTask, pairs: int, walls: int) -> GoalFigures:
+    """The same with these numbers of drives."""
+    recipe = ten_circuits(task.seed)
+    made = driven_map(recipe, task.map_of(recipe))
+    loop, random = ClosedLoop(made), stream(task.seed, "atlas.goals")
+    mapped = made.stored.arrays.steps.truth[:, :2]
+    return GoalFigures(
+        seed=task.seed,
+        free=list(drive_pairs(loop, made, pairs, random)),
+        walled=list(drive_blocked(loop, made, walls, random)),
+        seconds=loop.time,
+        mapped=mapped,
+        clearance=clearance(made.scene.surroundings.walls, mapped),
+    )
+
+
+def goal_record(one: GoalFigures) -> Record:
+    """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
+    drives, done = one.free + one.walled, [drive for drive in one.free if drive.said_reached]
+    lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
+    return {
+        "not_reached": sum(not drive.reached for drive in one.free),
+        "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
+        "error": median(np.array([drive.error for drive in done])),
+        "path_ratio": lengths[0] / lengths[1] if done else np.nan,
+        "clearance": min(drive.clearance for drive in drives),
+        "in_wall": sum(not drive.clear for drive in drives),
+        "seconds": one.seconds,
+        "wall_not_solved": sum(not _is_solved(drive) for drive in one.walled),
+    }
+
+
+def _is_solved(drive: Drive) -> bool:
+    """Whether a drive with a wall in its way ended at its goal by a new way, or as blocked."""
+    return drive.state is DriveState.BLOCKED or (drive.replans > 0 and drive.reached)
+
+
+def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
+    """The lines of drives to goals."""
+    free, walled = all_free(found), all_walled(found)
+    n, done = len(free), [one for one in free if one.said_reached]
+    yield Line(
+        f"reached (truly within {RIGHT.distance:g} m)",
+        f"{n} of {n}",
+        count([one.reached for one in free]),
+        f"{count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone, "
+        f"{count([one.by_arm <= RIGHT.distance for one in free])} by the arm's exact motion alone",
+    )
+    yield Line(
+        "said to be reached at a wrong place",
+        f"0 of {n + len(walled)}",
+        count([one.said_reached and not one.reached for one in free + walled]),
+        "-",
+    )
+    yield Line(
+        "error where reached, m, median (worst)",
+        "-",
+        spread([one.error for one in done], 3),
+        f"{spread([one.reckoned for one in free], 3)} odometry, "
+        f"{spread([one.by_arm for one in free], 3)} the arm's exact motion",
+    )
+    short = np.array([one.shortest for one in done])
+    ratio = np.array([one.length for one in done]).sum() / max(short.sum(), 1e-9)
+    yield Line("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-")
+    least = min((one.clearance for one in free + walled), default=np.nan)
+    mapping = min(one.clearance for one in found)
+    yield Line(
+        "least distance of the head's axis from a wall, m",
+        "-",
+        f"{least:.3f}",
+        f"{mapping:.3f} while mapping",
+    )
+    yield Line(
+        "no whisker at rest inside a wall on the way",
+        f"{n + len(walled)} of {n + len(walled)}",
+        count([one.clear for one in free + walled]),
+        "-",
+    )
+    minutes = max(one.seconds for one in found) / 60
+    yield Line("duration of all drives, min", f"{MINUTES}", f"{minutes:.0f}", "-")
+    yield _wall_line(free, walled)
+
+
+def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> Line:
+    return Line(
+        "wall in the way: reached by a new way, or blocked",
+        f"{len(walled)} of {len(walled)}",
+        count([_is_solved(one) for one in walled]),
+        f"{sum(one.state is DriveState.BLOCKED for one in free)} of {len(free)} blocked without a wall",
+    )
+
+
+def all_free(found: Sequence[GoalFigures]) -> list[Drive]:
+    """Drives without a wall in the way."""
+    return [drive for one in found for drive in one.free]
+
+
+def all_walled(found: Sequence[GoalFigures]) -> list[Drive]:
+    """Drives with one."""
+    return [drive for one in found for drive in one.walled]
+
+
+def draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
+    """Draws the drives of one maze, and how far from the goals all of them ended."""
+    one, free = found[0], all_free(found)
+    paths = PathPanel(
+        "drives to goals, without a wall in the way",
+        open_world(one.seed).maze,
+        {"map": one.mapped, "drives": _joined(one.free)},
+        goals=np.array([drive.goal for drive in one.free]).reshape(-1, 2),
+    )
+    dots = {
+        "whiskers": [drive.error for drive in free if drive.said_reached],
+        "odometry": [drive.reckoned for drive in free],
+        "exact arm": [drive.by_arm for drive in free],
+    }
+    panel = Panel("distance from the goal at the end, m", "", dots=dots, limits={"right": RIGHT.distance})
+    line = f"One map, then goal after goal: reached {count([drive.reached for drive in free])}."
+    draw_panels(png, "Driving to goals on a map of touch", line, paths, panel)
+
+
+def _joined(drives: Sequence[Drive]) -> np.ndarray:
+    """[n, 2] the paths with rows of NaN between them."""
+    gap = np.full((1, 2), np.nan)
+    return np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in drives)])
+
+
+GOALS = MapRow("Drive to goals on a map", 1, measure_goals, goal_record, goal_lines, draw_goals)

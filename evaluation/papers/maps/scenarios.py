@@ -1,0 +1,358 @@
+"""Sessions of one maze, each derived from the seed of the maze alone.
+
+The map is that of ten circuits of the touch table. Later sessions have random streams of their own: another
+calibration of the odometry, other noise, another start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import networkx
+import numpy as np
+
+from evaluation.papers.maps.sessions import Recipe, draw_seed, record, touch_config
+from evaluation.papers.tables.touch import KIDNAPS, MAIN
+from ratslam.runs.settings.run_config import RunConfig
+from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, is_open, neighbours
+from robot.world.maze_routes import exploration_route
+from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+
+LOCALISED = 120
+"""Length of a session that starts somewhere in a known maze, whisks."""
+FOREIGN = 300
+"""Length of a session in another maze, whisks."""
+REENTERED = 60
+"""Time for which a session that was carried stays in the known part, whisks."""
+PART = 150
+"""Length of an exploration of a part of a maze, in steps from cell to cell; about 1000 whisks."""
+LEAD = 4
+"""Largest number of unknown cells before a known part."""
+NEAR_WALL = 2.0
+"""Largest distance over which a wall is moved, in cells."""
+AFTER = "CAAC"
+"""Circuits of a session in a changed maze."""
+
+TRIES = 1000
+"""Largest number of random parts that are drawn until some fit."""
+SMALLEST = 4
+"""Fewest cells of a part."""
+
+
+class TwoParts(NamedTuple):
+    """Two lists of cells of a maze, each connected, in order of growth."""
+
+    one: tuple[Cell, ...]
+    other: tuple[Cell, ...]
+
+
+def maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
+    """The cells that can be reached from `start`, with an edge between neighbours without a wall."""
+    graph: networkx.Graph = networkx.Graph()
+    edge = [start]
+    graph.add_node(start)
+    while edge:
+        here = edge.pop()
+        for cell in neighbours(maze, here):
+            if cell not in graph:
+                edge.append(cell)
+            graph.add_edge(here, cell)
+    return graph
+
+
+def grow_part(
+    graph: networkx.Graph,
+    part: Sequence[Cell],
+    count: int,
+    avoid: Collection[Cell],
+    random: np.random.Generator,
+) -> list[Cell] | None:
+    """A connected part with `count` further cells, none of `avoid`, each a random neighbour of those before;
+    None if it has no room."""
+    grown = list(part)
+    for _ in range(count):
+        rim = sorted({b for a in grown for b in graph[a] if b not in grown and b not in avoid})
+        if not rim:
+            return None
+        grown.append(rim[int(random.integers(len(rim)))])
+    return grown
+
+
+def overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> TwoParts:
+    """Two connected parts of equal size that share half the cells of each, as large as they are found to fit.
+
+    Raises:
+        InputError: the graph has no room for two parts of `SMALLEST` cells.
+    """
+    cells = sorted(graph)
+    for half in range(len(cells) // 3, SMALLEST // 2 - 1, -1):
+        for _ in range(TRIES):
+            first = cells[int(random.integers(len(cells)))]
+            shared = grow_part(graph, [first], half - 1, (), random)
+            one = shared and grow_part(graph, shared, half, (), random)
+            other = one and shared and grow_part(graph, shared, half, one[half:], random)
+            if one and other:
+                return TwoParts(tuple(one), tuple(other))
+    raise InputError("simulation.maze", f"{len(cells)} cells", "room for two parts that overlap")
+
+
+def separate_parts(graph: networkx.Graph, random: np.random.Generator) -> TwoParts:
+    """Two connected parts without a common cell that hold all cells: a random spanning tree, divided at the
+    edge that leaves the parts most equal.
+
+    Raises:
+        InputError: the smaller part has fewer than `SMALLEST` cells in each of `TRIES` trees.
+    """
+    for _ in range(TRIES):
+        tree = networkx.random_spanning_tree(graph, seed=int(random.integers(1 << 31)))
+        sizes = {edge: _side(tree, edge) for edge in sorted(map(tuple, map(sorted, tree.edges)))}
+        side = min(sizes.values(), key=lambda part: abs(2 * len(part) - len(graph)))
+        rest = sorted(set(graph) - side)
+        if min(len(side), len(rest)) >= SMALLEST:
+            return TwoParts(tuple(sorted(side)), tuple(rest))
+    raise InputError("simulation.maze", f"{len(graph)} cells", "room for two separate parts")
+
+
+def _side(tree: networkx.Graph, edge: tuple[Cell, Cell]) -> set[Cell]:
+    """The cells on the first cell's side of an edge of a tree."""
+    without = networkx.restricted_view(tree, [], [edge])
+    return set(networkx.node_connected_component(without, edge[0]))
+
+
+def entrance(maze: Maze, part: Collection[Cell], outside: Collection[Cell]) -> list[tuple[Cell, Cell]]:
+    """Pairs of an outside cell and a cell of the part that no wall separates, in order."""
+    return sorted((a, b) for a in outside for b in neighbours(maze, a) if b in part)
+
+
+def wall_middle(a: Cell, b: Cell) -> np.ndarray:
+    """[2] middle of the wall between two neighbouring cells, m."""
+    return (cell_centre(a) + cell_centre(b)) / 2
+
+
+def walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[Cell, Cell]]:
+    """Pairs of neighbouring cells with (or without) a wall between them, the first on the loop, but not the
+    steps of the loop."""
+    steps = {frozenset(step) for step in zip(loop, [*loop[1:], loop[0]], strict=True)}
+    pairs = []
+    for x, y in loop:
+        for b in ((x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)):
+            inside = 0 <= b[0] < maze.columns and 0 <= b[1] < maze.rows
+            known = (b, (x, y)) in pairs or frozenset(((x, y), b)) in steps
+            if inside and not known and is_open(maze, (x, y), b) != there:
+                pairs.append(((x, y), b))
+    return pairs
+
+
+def cells_of(poses: np.ndarray) -> list[Cell]:
+    """The cell of each pose [T, 3]."""
+    return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
+
+
+class World(NamedTuple):
+    """A maze and its loop in anticlockwise order."""
+
+    maze: Maze
+    loop: list[Cell]
+
+
+class Overlap(NamedTuple):
+    """Two sessions in parts of a maze that share half their cells, and one session over both.
+
+    Attributes:
+        parts: their cells.
+    """
+
+    one: Recipe
+    other: Recipe
+    both: Recipe
+    parts: TwoParts
+
+
+class Carried(NamedTuple):
+    """A session in one part of a maze, and two sessions of a robot that was carried away after it.
+
+    Attributes:
+        first: explores the known part. known: enters the known part, after up to `LEAD` cells of the other,
+            and stays there for `REENTERED` whisks. entry: its first step there. unknown: stays in the other
+            part. parts: the known cells, and the others.
+    """
+
+    first: Recipe
+    known: Recipe
+    entry: int
+    unknown: Recipe
+    parts: TwoParts
+
+
+class Change(NamedTuple):
+    """A session after a maze has changed.
+
+    Attributes:
+        after: the session. places: [n, 2] middles of the walls that are gone or new, m.
+    """
+
+    after: Recipe
+    places: np.ndarray
+
+
+def open_world(maze: int) -> World:
+    """The unchanged maze of a seed."""
+    return World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
+
+
+def ten_circuits(maze: int) -> Recipe:
+    """The session that makes the map: that of the row `main` of the touch table."""
+    return Recipe(touch_config(maze, maze % 100, MAIN, {}))
+
+
+def unknown_start(maze: int, whisks: int = LOCALISED, name: str = "start") -> Recipe:
+    """A session in the same maze from another cell of the loop or between two, one way round or the other.
+
+    Args:
+        name: of its random streams; a further name gives a further session.
+    """
+    random = stream(maze, f"atlas.{name}.route")
+    number = int(random.integers(1, len(open_world(maze).loop)))
+    letter = "CA"[int(random.integers(2))]
+    first = int(random.integers(8))  # a cell takes about 6 whisks, and a turn up to 4
+    path = {"circuits": 3 * letter, "start": number}
+    return Recipe(_later(maze, name, {"path": path}), first, first + whisks)
+
+
+def other_maze(maze: int) -> Recipe:
+    """A session in the maze of the next seed."""
+    return unknown_start(maze + 1, FOREIGN, "foreign")
+
+
+def same_maze(maze: int, number: int) -> Recipe:
+    """Ten circuits in the same maze, number 0 those of the map, others from another cell of the loop."""
+    if number == 0:
+        return ten_circuits(maze)
+    name = f"again {number}"
+    start = int(stream(maze, f"atlas.{name}.route").integers(len(open_world(maze).loop)))
+    return Recipe(_later(maze, name, {"path": {"circuits": PAPER_CIRCUITS, "start": start}}))
+
+
+def overlapping_sessions(maze: int) -> Overlap:
+    """Explorations of two parts that share half their cells, and one as long as both together over both."""
+    random = stream(maze, "atlas.overlap.parts")
+    world = open_world(maze)
+    parts = overlapping_parts(maze_graph(world.maze, world.loop[0]), random)
+    union = tuple(dict.fromkeys(parts.one + parts.other))
+    lengths = {"one": (parts.one, PART), "other": (parts.other, PART), "both": (union, 2 * PART)}
+    sessions = {
+        name: _explore_all(maze, world, f"overlap {name}", cells, steps)
+        for name, (cells, steps) in lengths.items()
+    }
+    return Overlap(**sessions, parts=parts)
+
+
+def carried_sessions(maze: int) -> Carried:
+    """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place."""
+    random = stream(maze, "atlas.carried.parts")
+    world = open_world(maze)
+    parts = separate_parts(maze_graph(world.maze, world.loop[0]), random)
+    if random.integers(2):
+        parts = TwoParts(parts.other, parts.one)
+    way = _enter(world.maze, parts, random)
+    config = _later(maze, "carried known", {"path": {"cells": way}})
+    truth = record(Recipe(config)).truth
+    entry = first_step_in(truth, parts.one)
+    path = {"explore": float(LOCALISED), "within": _turned(parts.other, random)}
+    return Carried(
+        first=_explore_all(maze, world, "carried first", parts.one, PART),
+        known=Recipe(config, 0, entry + REENTERED),
+        entry=entry,
+        unknown=Recipe(_later(maze, "carried unknown", {"path": path})),
+        parts=parts,
+    )
+
+
+def moved_wall(maze: int) -> Change:
+    """Circuits after a wall beside the loop has been taken away and put up at another place beside it.
+
+    Raises:
+        InputError: no wall beside the loop has a gap beside the loop near it.
+    """
+    random = stream(maze, "atlas.wall")
+    world = open_world(maze)
+    walls, gaps = (walls_beside(world.maze, world.loop, there) for there in (True, False))
+    moves = [
+        (wall, gap)
+        for wall in walls
+        for gap in gaps
+        if np.hypot(*(wall_middle(*wall) - wall_middle(*gap))) <= NEAR_WALL * CELL_SIDE
+    ]
+    if not moves:
+        raise InputError("simulation.maze", f"maze {maze} has no gap near a wall", "one beside the loop")
+    wall, gap = moves[int(random.integers(len(moves)))]
+    start = int(random.integers(len(world.loop)))
+    settings = {"maze": {"added": [gap], "removed": [wall]}, "path": {"circuits": AFTER, "start": start}}
+    return Change(
+        Recipe(_later(maze, "wall moved", settings)), np.array([wall_middle(*wall), wall_middle(*gap)])
+    )
+
+
+def closed_door(maze: int) -> Change:
+    """A session after the loop has been closed between two cells: up to the door, back, all the way round to
+    its other side, and so on, from a random cell."""
+    random = stream(maze, "atlas.door")
+    loop = open_world(maze).loop
+    shut = int(random.integers(len(loop)))
+    line = [*loop[shut:], *loop[:shut]]  # from one side of the door to the other
+    start = int(random.integers(1, len(line) - 1))
+    way = [*line[start:], *line[-2::-1], *line[1:], *line[-2:0:-1]]
+    settings = {"maze": {"added": [(line[0], line[-1])]}, "path": {"cells": way}}
+    return Change(Recipe(_later(maze, "door", settings)), wall_middle(line[0], line[-1])[None])
+
+
+def kidnapped(maze: int) -> Recipe:
+    """Ten circuits with eight kidnaps: the row `kidnaps` of the touch table."""
+    return Recipe(touch_config(maze, maze % 100, KIDNAPS, {"may_be_carried": True}))
+
+
+def first_step_in(truth: np.ndarray, cells: Collection[Cell]) -> int:
+    """The first step of true poses [T, 3] in one of the cells; T if there is none."""
+    inside = [cell in cells for cell in cells_of(truth)]
+    return inside.index(True) if any(inside) else len(truth)
+
+
+def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
+    """The configuration of a further session of the maze."""
+    return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
+
+
+def _explore_all(maze: int, world: World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
+    """A session that enters each of these cells and no other, from a random one on.
+
+    Raises:
+        InputError: none of `TRIES` random routes enters all.
+    """
+    random = stream(maze, f"atlas.{name}.route")
+    for _ in range(TRIES):
+        start = cells[int(random.integers(len(cells)))]
+        way = exploration_route(world.maze, start, steps, random, cells)
+        if set(way) == set(cells):
+            return Recipe(_later(maze, name, {"path": {"cells": way}}))
+    raise InputError("simulation.path.cells", f"no route of {steps} cells", f"one through {len(cells)} cells")
+
+
+def _turned(cells: tuple[Cell, ...], random: np.random.Generator) -> tuple[Cell, ...]:
+    """The cells from a random one on, which is where an exploration starts."""
+    first = int(random.integers(len(cells)))
+    return cells[first:] + cells[:first]
+
+
+def _enter(maze: Maze, parts: TwoParts, random: np.random.Generator) -> list[Cell]:
+    """A route of 0 to `LEAD` unknown cells and then known ones, longer than `REENTERED` whisks there."""
+    lead, cells = int(random.integers(LEAD + 1)), REENTERED // 4
+    if not lead:
+        start = _turned(parts.one, random)[0]
+        return exploration_route(maze, start, cells, random, parts.one)
+    doors = entrance(maze, parts.one, parts.other)
+    outside, inside = doors[int(random.integers(len(doors)))]
+    before = exploration_route(maze, outside, lead, random, parts.other)[::-1] if lead > 1 else [outside]
+    return [*before, *exploration_route(maze, inside, cells, random, parts.one)]

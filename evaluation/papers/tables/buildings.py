@@ -1,0 +1,328 @@
+"""The table of real buildings: whether the map is better than odometry where nobody tuned it.
+
+Rows are recordings as they are with miscalibrated copies of them (`robot.sources.perturbation`), and a
+recording with given place ids of which a third is lost, wrong or new; depth views of a Create are mapped at
+several cell sizes and sector widths. ATE is the RMS position error after a rigid alignment, m: of the final
+map, of the live pose (as estimated at the time) and of odometry. A run is worse than odometry if its ATE
+exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if its two true positions are more
+than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by more than `FALSE_TURN`; a closure
+sequence is false if that holds for the medians over its closures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice, product
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.special import expit
+
+from evaluation.metrics.statistics import expected_calibration_error
+from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
+from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
+from evaluation.papers.tables.recordings import Recording, metres, real_recordings
+from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from evaluation.studies.executor import run_tasks
+from ratslam.runs.settings.run_config import RunConfig
+from robot.sources.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
+
+FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
+"""Of a closure's steps: true distance, m, and error of the claimed heading difference, rad."""
+HARM_FACTOR, HARM_MARGIN = 1.05, 0.3
+"""Of odometry's ATE, and m."""
+SUFFIX = "_odom_gt.csv"
+"""End of the file names of buildings, in the folder `buildings` of the real recordings."""
+PERTURBATIONS = {
+    "miscalibrated": miscalibrate,
+    "ids lost": lose_labels,
+    "ids wrong": mistake_labels,
+    "ids new": rename_labels,
+}
+COLUMNS = (
+    "recording", "odometry", "final", "live", "final of copies: median, worst",
+    "live of copies: median, worst",
+    "worst final / odometry", "worse than odometry: final, live", "false / closures as is",
+    "false / closures of all runs", "false / sequences of all runs",
+)  # fmt: skip
+
+Section = Literal["buildings", "ids", "create"]
+CREATE = "configs/create_lab.yaml"
+FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
+"""Of cell size and sector width in the rows of the Create."""
+
+
+class BuildingsRow(NamedTuple):
+    """A row: a recording, its section of the table, what its copies are (a key of `PERTURBATIONS`; "": there
+    are none), and factors on cell size and sector width."""
+
+    recording: Recording
+    section: Section
+    copies: str = ""
+    cell: float = 1.0
+    sector: float = 1.0
+
+    def configuration(self, folder: Path) -> RunConfig:
+        """The configuration of its runs.
+
+        Args:
+            folder: of the repository.
+        """
+        config = self.recording.configuration(folder)
+        if self.cell == self.sector == 1:
+            return config
+        fov = float(config.recall.sector_fov)
+        scaled = {
+            "pose_cells.cell_size": config.pose_cells.cell_size * self.cell,
+            "experience.match_sd": config.experience.match_sd * self.cell,
+            "recall.sector_fov": fov * self.sector,
+        }
+        return self.recording.configuration(folder, *(f"{key}={value!r}" for key, value in scaled.items()))
+
+
+class RunTask(NamedTuple):
+    """One run: a configuration, and the copy's kind and seed (0: the recording as it is)."""
+
+    config: RunConfig
+    copies: str
+    seed: int
+
+
+class RunFigures(NamedTuple):
+    """The figures of one run.
+
+    Attributes:
+        odometry, final, live: ATE, m. closures: [K] bool, of each accepted closure, whether it is false.
+        sequences: [R, 2] bool, of each closure sequence, whether it is accepted and whether it is false.
+            Closures and sequences without known truth do not count as false. odds: [R] log odds that each
+            sequence is true, NaN where they are not known.
+    """
+
+    odometry: float
+    final: float
+    live: float
+    closures: np.ndarray
+    sequences: np.ndarray
+    odds: np.ndarray
+
+
+def buildings_rows() -> dict[str, BuildingsRow]:
+    """All rows by name; those of the buildings are the files found in the folder of the real recordings, or
+    one row, `buildings`, for a file that is missing."""
+    folder = (real_recordings() or Path()).absolute() / "buildings"
+    found = {file.name.removesuffix(SUFFIX): file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+    hall = "configs/tuc_lecture_hall.yaml"
+    recordings = {
+        name: Recording(name, "configs/building.yaml", (f"recording.file={file}",), real=True)
+        for name, file in (found or {"buildings": folder / f"NAME{SUFFIX}"}).items()
+    }
+    recordings["intel"] = Recording(
+        "intel (`configs/intel_laser.yaml`)", "configs/intel_laser.yaml", real=True
+    )
+    recordings["tuc"] = Recording(f"lecture hall (`{hall}`, given ids)", hall, real=True)
+    rows = {name: BuildingsRow(one, "buildings", "miscalibrated") for name, one in recordings.items()}
+    for fault in ("lost", "wrong", "new"):
+        recording = Recording(f"lecture hall, copies with a third of the ids {fault}", hall, real=True)
+        rows[f"ids {fault}"] = BuildingsRow(recording, "ids", f"ids {fault}")
+    for (cell, cells), (sector, sectors) in product(FACTORS.items(), FACTORS.items()):
+        recording = Recording(f"Create, depth, cell x {cell}, sector x {sector}", CREATE, real=True)
+        rows[f"create {cell} {sector}"] = BuildingsRow(recording, "create", "", cells, sectors)
+    return rows
+
+
+def choose_rows(names: Sequence[str] | None) -> dict[str, BuildingsRow]:
+    """The rows with these names or in sections with these names; without names all.
+
+    Raises:
+        InputError: a name that is neither.
+    """
+    rows = buildings_rows()
+    sections: dict[str, BuildingsRow] = {row.section: row for row in rows.values()}
+    chosen = select_rows(names, {**sections, **rows}, tuple(sections))
+    return {name: row for name, row in rows.items() if name in chosen or row.section in chosen}
+
+
+def buildings_table(
+    rows: Mapping[str, BuildingsRow],
+    copies: int = 10,
+    workers: int = 0,
+    folder: Path = Path(),
+    files: Files = Files(),  # noqa: B008
+) -> Iterator[str]:
+    """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
+
+    Args:
+        rows: those of `buildings_rows` to print. folder: of the repository, which holds `configs`. files: of
+            the runs, `buildings.csv`, and of those to compare them with below the table; a session is the
+            seed of a copy, 0 the recording as it is.
+
+    Raises:
+        InputError: one of these files cannot be used.
+    """
+    missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing(folder))}
+    present = {name: row for name, row in rows.items() if name not in missing}
+    counts = {name: 1 + copies * bool(row.copies) for name, row in present.items()}
+    planned = [(name, seed) for name, count in counts.items() for seed in range(count)]
+    log = SessionLog("buildings", files, [(name, str(seed)) for name, seed in planned])
+    tasks = [
+        RunTask(present[name].configuration(folder), present[name].copies, seed) for name, seed in planned
+    ]
+    results = zip(planned, run_tasks(measure_run, tasks, workers=workers), strict=True)
+    found: dict[Section, list[RunFigures]] = {}
+    notes = []
+    yield markdown_header(COLUMNS)
+    for name, row in present.items():
+        runs = []
+        for (_, seed), figures in islice(results, counts[name]):
+            log.add(name, seed, run_record(figures))
+            runs.append(figures)
+        yield markdown_row([row.recording.label, *_cells(runs)])
+        found.setdefault(row.section, []).extend(runs)
+        notes += [_ids_note(row, runs)] if row.section == "ids" else []
+    notes = ([_total(found["buildings"])] if "buildings" in found else []) + notes
+    notes += [_create_note(found["create"])] if "create" in found else []
+    notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
+    yield from ["", *notes] if notes else []
+    yield from compare_runs(COMPARED, log, list(rows))
+
+
+def run_record(figures: RunFigures) -> dict[str, float | int]:
+    """The figures of a run by name: ATEs, m, and numbers of closures and of accepted sequences."""
+    accepted = figures.sequences[figures.sequences[:, 0].astype(bool), 1]
+    return {
+        "odometry": figures.odometry,
+        "final": figures.final,
+        "live": figures.live,
+        "closures": len(figures.closures),
+        "false_closures": int(figures.closures.sum()),
+        "sequences": len(accepted),
+        "false_sequences": int(accepted.sum()),
+    }
+
+
+def measure_run(task: RunTask) -> RunFigures:
+    """Runs and measures a recording or a copy.
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    config, copies, seed = task
+    run = run_recording(config, PERTURBATIONS[copies] if seed else None, seed)
+    claims = closure_claims(run)
+    return RunFigures(
+        odometry=run.ate(run.odometry),
+        final=run.ate(run.final),
+        live=run.ate(run.online),
+        closures=is_false(claims.distance, claims.turn)[claims.accepted],
+        sequences=judge_sequences(claims),
+        odds=sequence_odds(claims),
+    )
+
+
+def is_false(distance: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Whether closures are false, [n] bool, from `ClosureClaims.distance` and `ClosureClaims.turn`."""
+    return (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+
+
+def judge_sequences(claims: ClosureClaims) -> np.ndarray:
+    """[R, 2] bool, of each closure sequence, whether it is accepted and whether it is false."""
+    members = [claims.sequence == number for number in np.unique(claims.sequence)]
+    distance, turn = (
+        np.array([np.median(values[rows]) for rows in members]) for values in (claims.distance, claims.turn)
+    )
+    accepted = np.array([claims.accepted[rows].any() for rows in members], bool)
+    return np.column_stack([accepted, is_false(distance, turn)])
+
+
+def sequence_odds(claims: ClosureClaims) -> np.ndarray:
+    """[R] log odds that each closure sequence is true; NaN where the truth or they themselves are unknown."""
+    _, first = np.unique(claims.sequence, return_index=True)
+    known = [np.isfinite(claims.distance[claims.sequence == k]).all() for k in claims.sequence[first]]
+    return np.where(known, claims.log_odds[first], np.nan)
+
+
+def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+    """Whether ATEs, m, exceed those of odometry by more than the margins."""
+    return error > HARM_FACTOR * odometry + HARM_MARGIN
+
+
+COMPARED = Compared(
+    "final ATE", "final", "live", "odometry", worse=is_worse, failed=is_worse,
+    counts={
+        "false / closures": ("false_closures", "closures"),
+        "false / sequences": ("false_sequences", "sequences"),
+    },
+    medians={},
+)  # fmt: skip
+"""Of two runs of the table; a run whose final map is worse than odometry is a failure."""
+
+
+def _cells(runs: Sequence[RunFigures]) -> list[str]:
+    """The cells of a row: its recording as it is, then the copies."""
+    odometry, final, live = _errors(runs)
+    ratio = (final / np.maximum(odometry, 1e-12)).max()
+    return [
+        *map(metres, runs[0][:3]),
+        _spread(final[1:]),
+        _spread(live[1:]),
+        f"{ratio:.2f}",
+        f"{is_worse(final, odometry).sum()}, {is_worse(live, odometry).sum()} of {len(runs)}",
+        _closures(runs[:1]),
+        _closures(runs),
+        _sequences(runs),
+    ]
+
+
+def _total(runs: Sequence[RunFigures]) -> str:
+    """The line below the table over all runs of buildings."""
+    odometry, final, live = _errors(runs)
+    closures = np.concatenate([run.closures for run in runs])
+    share = f" ({closures.mean():.1%})" if len(closures) else ""
+    return (
+        f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
+        f"{_sequences(runs)}; worse than odometry: final {is_worse(final, odometry).mean():.1%}, live "
+        f"{is_worse(live, odometry).mean():.1%}; {_calibration(runs)}."
+    )
+
+
+def _calibration(runs: Sequence[RunFigures]) -> str:
+    """How well the odds of all sequences, accepted or not, agree with the truth."""
+    odds, sequences = np.concatenate([run.odds for run in runs]), np.vstack([run.sequences for run in runs])
+    known = np.isfinite(odds)
+    error = expected_calibration_error(expit(odds[known]), ~sequences[known, 1])
+    return f"expected calibration error of the odds of {known.sum()} sequences {error:.3f}"
+
+
+def _ids_note(row: BuildingsRow, runs: Sequence[RunFigures]) -> str:
+    """The line below the table that compares spoilt ids with the recording as it is."""
+    _, final, _ = _errors(runs)
+    return f"{row.copies}: worst copy {final[1:].max() / final[0]:.2f} times the ATE as is."
+
+
+def _create_note(runs: Sequence[RunFigures]) -> str:
+    """The line below the table over all settings of the Create."""
+    odometry, final, live = _errors(runs)
+    return (
+        f"Create, {len(runs)} settings: final median {metres(np.median(final))} m; above odometry: final "
+        f"{(final > odometry).sum()}, live {(live > odometry).sum()}."
+    )
+
+
+def _errors(runs: Sequence[RunFigures]) -> np.ndarray:
+    """[3, n] ATE of odometry, final and live, m."""
+    return np.array([run[:3] for run in runs]).T
+
+
+def _spread(errors: np.ndarray) -> str:
+    return f"{metres(np.median(errors))}, {metres(errors.max())}" if len(errors) else "-"
+
+
+def _closures(runs: Sequence[RunFigures]) -> str:
+    return f"{sum(run.closures.sum() for run in runs)} / {sum(len(run.closures) for run in runs)}"
+
+
+def _sequences(runs: Sequence[RunFigures]) -> str:
+    """False ones of the accepted sequences."""
+    accepted = np.concatenate([run.sequences[run.sequences[:, 0]] for run in runs])
+    return f"{accepted[:, 1].sum()} / {len(accepted)}"

@@ -1,0 +1,190 @@
+"""The table of closures: fits and tests the log-odds that a closure sequence is true.
+
+Each touch session is simulated and finished. The weights of `ratslam.mapping.closure_judge` are fitted on
+the sequences of its final map, by a logistic regression with a ridge; each sequence counts three times, with
+all keyframes after it, with `YOUNG` and with none, because it is judged while it is young too. Views that
+contradict a place never count for it: recall leaves so few of them within its sequences that their weight
+would be an accident. Every session is tested with weights fitted on the others. A sequence is true if most of
+its claims are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from evaluation.metrics.statistics import auc
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.touch import CHANGE, TouchTask, task_config
+from evaluation.papers.trials.touch_trial import run_session, start_session
+from evaluation.studies.executor import run_tasks
+from ratslam.core.session import Session
+from ratslam.mapping.closure_judge import (
+    BEYOND,
+    KINDS,
+    WEIGHTS,
+    SequenceEvidence,
+    log_odds,
+    sequence_evidence,
+)
+from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.map import KeyframeMap
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.source import open_observations
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from tactile.base.se2 import between, wrap
+
+ROWS = (
+    "main", "exploration", "open arena", "tree", "noise x 2", "white", "control: other maze", "new ground",
+)  # fmt: skip
+"""Rows of the touch table."""
+FIRST = 31000
+"""Number of the first maze."""
+FEW = 2
+"""Fewest sessions; with one none is left to fit on."""
+RIDGE = 10.0
+"""Penalty on the squared weights."""
+YOUNG = 10
+"""Keyframes after a sequence that is judged while it is young."""
+LEAST_SCORE, LEAST_LENGTH = 5.0, 2
+"""Least evidence of recall and least number of candidates of a sequence that counts."""
+TRUE_WITHIN, TRUE_TURN = 3.6, np.radians(30)
+"""Distance, cells, and difference of heading, rad, between what a true candidate claims and the truth."""
+COLUMNS = (
+    "condition", "sessions", "sequences", "true", "AUC: recall's evidence", "accepted or not", "log-odds",
+    "log-odds when they end",
+)  # fmt: skip
+
+
+class JudgedSession(NamedTuple):
+    """The n sequences of a session.
+
+    Attributes:
+        true: [n] bool. score: [n] evidence of recall. accepted: [n] bool. known: evidence when all, `YOUNG`
+            and no keyframes have followed them.
+    """
+
+    true: np.ndarray
+    score: np.ndarray
+    accepted: np.ndarray
+    known: tuple[SequenceEvidence, SequenceEvidence, SequenceEvidence]
+
+
+def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = None) -> Iterator[str]:
+    """The lines of the table, and the weights.
+
+    Args:
+        sessions: of each row. folder: gets the weights as a file to ship; None: no file.
+    """
+    sessions = max(sessions, FEW)
+    tasks = [TouchTask(row, FIRST + number) for row in ROWS for number in range(sessions)]
+    every = list(run_tasks(judge_session, tasks, workers=workers))
+    fitted = [fit_weights([other for other in every if other is not one]) for one in every]
+    yield markdown_header(COLUMNS)
+    for k, row in enumerate(ROWS):
+        own = slice(k * sessions, (k + 1) * sessions)
+        yield _line(row, every[own], fitted[own])
+    yield _line("all", every, fitted)
+    weights = fit_weights(every)
+    text = json.dumps({"weights": np.round(weights, 3).tolist()}, indent=1)
+    yield f"\n```json\n{text}\n```"
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / WEIGHTS).write_text(text + "\n", encoding="utf-8")
+
+
+def judge_session(task: TouchTask) -> JudgedSession:
+    """Runs a session and judges the sequences of its final map."""
+    with open_observations(task_config(task)) as (config, source):
+        log = load_into_memory(source)
+    held: list[Session] = []
+
+    def start(config: RunConfig, log: InMemorySource) -> Session:
+        held.append(start_session(config, log))
+        return held[0]
+
+    truth = run_session(config, log, start).truth
+    map = held[0].map
+    assert isinstance(map, KeyframeMap)
+    final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
+    scores = final.log.scores()
+    chosen = np.flatnonzero((scores >= LEAST_SCORE) & (final.log.left() >= LEAST_LENGTH))
+    later = steps >= (int(CHANGE * len(truth)) if task.row == "control: other maze" else 0)
+    first, second, third = (
+        sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
+        for after in (BEYOND, YOUNG, 0)
+    )
+    return JudgedSession(
+        _are_true(graph, final.log, truth[steps], later, chosen),
+        scores[chosen],
+        final.log.verdicts()[chosen] == Verdict.ACCEPTED,
+        (first, second, third),
+    )
+
+
+def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
+    """The weights [2, 3 + 2 KINDS] of a logistic regression over the map, and of one over the older pass."""
+    versions = [(evidence, one.true) for one in sessions for evidence in one.known]
+    features = np.concatenate([evidence.features() for evidence, _ in versions])
+    true = np.concatenate([true for _, true in versions]).astype(float)
+    known = np.isfinite(features).all(axis=(1, 2))
+    once = 1 / 3  # a sequence counts once, however often it is judged
+    return np.stack([_regress(features[known, way], true[known], once) for way in (0, 1)])
+
+
+def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray:
+    """Weights of features [n, F], the first of which is 1, by which they tell what is true [n]."""
+    ridge = RIDGE * (np.arange(features.shape[1]) > 0)
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        z = features @ weights
+        value = worth * (np.logaddexp(0, z) - true * z).sum() + (ridge * weights**2).sum() / 2
+        return float(value), worth * features.T @ (expit(z) - true) + ridge * weights
+
+    against = np.zeros(2 * KINDS, bool)
+    against[[0, 1, KINDS, KINDS + 1]] = True
+    bounds = [(None, None), (0, None), (0, None), *((None, 0 if one else None) for one in against)]
+    return cast(np.ndarray, minimize(loss, np.zeros(features.shape[1]), jac=True, bounds=bounds).x)
+
+
+def _are_true(
+    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, later: np.ndarray, sequences: np.ndarray
+) -> np.ndarray:
+    """[n] bool of sequences [n]: at least half of their candidates claim about the true poses [N, 3].
+
+    Args:
+        later: [N] bool, keyframes of another world than the earlier ones.
+    """
+    table = log.table()
+    frame, match = table[:, 0].astype(int), table[:, 1].astype(int)
+    error = between(truth[match], truth[frame])
+    turned = np.abs(wrap(error[:, 2] + table[:, 2] * graph.sector_angle))
+    right = (np.hypot(error[:, 0], error[:, 1]) < TRUE_WITHIN * graph.cell) & (turned < TRUE_TURN)
+    right &= later[frame] == later[match]
+    return np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in sequences.tolist()], bool)
+
+
+def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndarray]) -> str:
+    """A row of the table; each session with its own weights."""
+    true, score, accepted = (np.concatenate([one[k] for one in sessions]) for k in range(3))
+    odds, ended = (
+        np.concatenate([log_odds(one.known[k], own) for one, own in zip(sessions, fitted, strict=True)])
+        for k in (0, 2)
+    )
+    known = np.isfinite(odds)
+    told = (score, accepted.astype(float), odds, ended)
+    return markdown_row(
+        [name, len(sessions), int(known.sum()), int(true[known].sum())]
+        + [_auc(values[known], true[known]) for values in told]
+    )
+
+
+def _auc(values: np.ndarray, happened: np.ndarray) -> str:
+    return f"{auc(values[~happened], values[happened]):.3f}" if happened.any() and not happened.all() else "-"

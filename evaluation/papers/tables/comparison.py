@@ -1,0 +1,411 @@
+"""The figures of each session in a file, and two runs of a table compared session by session.
+
+A table hides what a change of the code does: its medians move with the sessions that happen to be in it. Here
+the same session is measured before and after the change, so that its maze, its noise and its luck are in both
+and only the change is left. The sessions of a run are in `NAME.csv`, one a row: the row of the table, the
+session, the code that measured it, and its figures, each a number or yes or no.
+
+- What is unknown is an empty cell. It is NaN here, and a pair that is unknown on either side is left out of
+  what compares that figure; a cell that leaves pairs out says of how many it is.
+- The ratio of a pair is that now over that before: 1 where both are equal, also if both are 0 or infinite,
+  and infinite where only that before is 0.
+- The interval of a median of ratios is that of order statistics (Thompson 1936); cured and new failures are
+  compared by the sign test (McNemar 1947, exact), as all other pairs say nothing of the difference.
+
+Example:
+    >>> key = ("clean", "31100")
+    >>> old, new = ({key: StoredSession(key, "", {"em": em})} for em in (0.02, 0.01))
+    >>> pairs = pair_sessions(old, new, ["clean"])
+    >>> paired_ratios(*pairs.known("em")).tolist()
+    [0.5]
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.studies.machine import code_digest
+from tactile.base.atomic_write import write_text_atomically
+from tactile.base.bounded import read_rows
+from tactile.base.errors import InputError
+
+KEY = ("row", "session", "code")
+"""The first columns of a file."""
+LEVEL = 0.95
+"""Least coverage of an interval."""
+
+Figure = bool | int | float
+Record = Mapping[str, Figure]
+"""The figures of a session by name."""
+Key = tuple[str, str]
+"""Row and session."""
+
+
+class Files(NamedTuple):
+    """Folders of a run.
+
+    Attributes:
+        output: where its sessions are written; None: nowhere. against: of the earlier run that it is compared
+            with; None: with none.
+    """
+
+    output: Path | None = None
+    against: Path | None = None
+
+
+class StoredSession(NamedTuple):
+    """A row of a file. `code` is what measured it: the digest of the code, and the settings beside row and
+    session on which the figures depend."""
+
+    key: Key
+    code: str
+    figures: Record
+
+
+Sessions = dict[Key, StoredSession]
+
+
+class SessionLog:
+    """The sessions of a run, each in its file as soon as it is added.
+
+    A file that is there already keeps the sessions that are not measured again, each with the code that
+    measured it.
+
+    Args:
+        name: of the table; its file is `NAME.csv`. planned: the sessions that will be measured. settings: see
+            `StoredSession`.
+
+    Attributes:
+        measured: the sessions added so far. earlier: those of the run to compare with; None without one.
+
+    Raises:
+        InputError: a file of the run cannot be used.
+    """
+
+    def __init__(self, name: str, files: Files, planned: Iterable[Key], settings: str = "") -> None:
+        output, against = files
+        self.measured: Sessions = {}
+        self.earlier = None if against is None else _earlier_sessions(against, f"{name}.csv", planned)
+        if output is not None and against is not None and output.resolve() == against.resolve():
+            cure = "choose another with -o"
+            raise InputError("--against", f"{against} is the folder of -o too", "that of another run", cure)
+        self._code = f"{code_digest()} {settings}".strip()
+        self._path = None if output is None else output / f"{name}.csv"
+        self._kept: Sessions = {}
+        if self._path is not None and self._path.exists():
+            self._kept = read_sessions(self._path)
+
+    def add(self, row: str, session: object, figures: Mapping[str, Any]) -> None:
+        """Adds a session, and writes the file."""
+        plain = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in figures.items()
+        }
+        key = row, str(session)
+        self.measured[key] = StoredSession(key, self._code, plain)
+        if self._path is not None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_text_atomically(self._path, sessions_text({**self._kept, **self.measured}.values()))
+
+
+def sessions_text(sessions: Collection[StoredSession]) -> str:
+    """The text of a file; a cell is empty where a session has no such figure, or NaN."""
+    names = dict.fromkeys(chain.from_iterable(one.figures for one in sessions))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*KEY, *names], lineterminator="\n")
+    writer.writeheader()
+    for (row, session), code, figures in sessions:
+        known = {name: repr(value) for name, value in figures.items() if value == value}
+        writer.writerow({"row": row, "session": session, "code": code} | known)
+    return text.getvalue()
+
+
+def read_sessions(path: Path) -> Sessions:
+    """The sessions of a file.
+
+    Raises:
+        InputError: it cannot be read, is another file, or has a session twice; with the line.
+    """
+    seen: set[Key] = set()
+
+    def parse(cells: Mapping[str, str]) -> StoredSession:
+        key = cells["row"], cells["session"]
+        if None in cells or None in cells.values():
+            raise ValueError("cells that are missing, or too many")
+        if key in seen:
+            raise ValueError(f"session {' '.join(key)} for the second time")
+        seen.add(key)
+        figures = {name: _figure(cell) for name, cell in cells.items() if name not in KEY and cell}
+        return StoredSession(key, cells["code"], figures)
+
+    return {one.key: one for one in read_rows(path, "a file of sessions, as -o writes it", parse)}
+
+
+def _figure(cell: str) -> Figure:
+    """A figure from its text."""
+    if cell in ("True", "False"):
+        return cell == "True"
+    return int(cell) if cell.lstrip("-").isdecimal() else float(cell)
+
+
+def _earlier_sessions(folder: Path, name: str, planned: Iterable[Key]) -> Sessions:
+    """The sessions of an earlier run, of which some are planned now."""
+    cure = "name the folder that the earlier run was given by -o"
+    if not (folder / name).is_file():
+        found = f"no {name} in it" if folder.is_dir() else "no such folder"
+        raise InputError(str(folder), found, f"a folder with the {name} of an earlier run", cure)
+    sessions = read_sessions(folder / name)
+    wanted = list(planned)
+    if wanted and sessions.keys().isdisjoint(wanted):
+        found = f"none of the {len(wanted)} sessions to be measured ({_some(wanted)}), but {_some(sessions)}"
+        raise InputError(str(folder / name), found, "a run of the same rows and sessions", cure)
+    return sessions
+
+
+def _some(keys: Iterable[Key]) -> str:
+    """The first and the last of some sessions."""
+    names = [" ".join(key) for key in keys]
+    return ", ".join(names if len(names) < 3 else (names[0], "...", names[-1])) or "no session"
+
+
+class Pairs(NamedTuple):
+    """n sessions that were measured twice.
+
+    Attributes:
+        keys: [n]. old, new: [n] figures before and now. only_old, only_new: number of sessions that are in
+            one run alone.
+    """
+
+    keys: list[Key]
+    old: list[Record]
+    new: list[Record]
+    only_old: int = 0
+    only_new: int = 0
+
+    def known(self, *names: str) -> tuple[np.ndarray, np.ndarray]:
+        """Figures before and now, each [k, m] (of one name: [m]), of the m pairs that have all of them."""
+        return self.named(*names)[1:]
+
+    def named(self, *names: str) -> tuple[list[Key], np.ndarray, np.ndarray]:
+        """The same with the sessions [m]."""
+        values = np.array(
+            [[[one.get(name, np.nan) for one in side] for name in names] for side in (self.old, self.new)],
+            float,
+        )
+        has = ~np.isnan(values).any(axis=(0, 1))
+        old, new = values[..., has] if len(names) > 1 else values[:, 0, has]
+        return [key for key, there in zip(self.keys, has, strict=True) if there], old, new
+
+
+def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> Pairs:
+    """The sessions of these rows that are in both runs, in the order of that now."""
+    old, new = ({key: one for key, one in run.items() if key[0] in rows} for run in (old, new))
+    keys = [key for key in new if key in old]
+    return Pairs(
+        keys, [old[key].figures for key in keys], [new[key].figures for key in keys],
+        len(old) - len(keys), len(new) - len(keys),
+    )  # fmt: skip
+
+
+def paired_ratios(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """[n] ratio of each pair of figures [n] that are not negative: 1 of equal ones, infinite over 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(old == new, 1.0, new / old)
+
+
+def median_interval(values: np.ndarray) -> tuple[float, float]:
+    """The interval of the median of a population from values [n], which covers it with at least `LEVEL`
+    whatever the distribution; NaN with too few of them, for 95 % with fewer than six.
+
+    The k smallest and the k largest values are left out. The median is beyond the k-th smallest one with the
+    probability that k - 1 or fewer of n tosses of a coin are heads, and k is the largest for which that is at
+    most half of what the interval may miss (Thompson 1936, Annals of Mathematical Statistics 7, 122-128).
+    """
+    from scipy.stats import binom
+
+    k = int((binom.cdf(np.arange(len(values)), len(values), 0.5) <= (1 - LEVEL) / 2).sum())
+    if not k:
+        return np.nan, np.nan
+    ordered = np.sort(values)
+    return float(ordered[k - 1]), float(ordered[-k])
+
+
+def sign_test(cured: int, new: int) -> float:
+    """Two-sided p value of the hypothesis that failures are cured as often as there are new ones: that so
+    many of cured + new tosses of a coin are heads, or a number as improbable (McNemar 1947, Psychometrika 12,
+    153-157, in its exact form); 1 without any."""
+    from scipy.stats import binomtest
+
+    return float(binomtest(new, cured + new).pvalue) if cured + new else 1.0
+
+
+class Compared(NamedTuple):
+    """What is compared of a table whose sessions have an error, that of the live pose, and odometry's.
+
+    Attributes:
+        label: name of the error. error, live, odometry: names of the figures. worse, failed: whether sessions
+            are worse than odometry, and whether they fail, [n] bool from an error and odometry's [n]. counts:
+            title, and the figures of which one is part of the other. medians: title and figure.
+    """
+
+    label: str
+    error: str
+    live: str
+    odometry: str
+    worse: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    failed: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    counts: Mapping[str, tuple[str, str]]
+    medians: Mapping[str, str]
+
+
+def compare_runs(what: Compared, log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
+    """The lines below a table that compare its run with an earlier one; none without one.
+
+    Each row of the table has a line, and all together have one. Figures are before and now.
+    """
+    if log.earlier is None:
+        return
+    columns: dict[str, Callable[[Pairs], str]] = {
+        "sessions": lambda pairs: str(len(pairs.keys)),
+        f"{what.label}, now / before [95 %]": lambda pairs: _ratio(pairs, what.error),
+        f"live {what.label.split()[-1]}, now / before [95 %]": lambda pairs: _ratio(pairs, what.live),
+        f"{what.label} / odometry, median": lambda pairs: _over_odometry(what, pairs),
+        "worse than odometry": lambda pairs: _count(what.worse, pairs, what.error, what.odometry),
+        "live worse than odometry": lambda pairs: _count(what.worse, pairs, what.live, what.odometry),
+        **{title: partial(_medians, name=name) for title, name in what.medians.items()},
+        **{title: partial(_sums, names=names) for title, names in what.counts.items()},
+        "failures": lambda pairs: _count(what.failed, pairs, what.error, what.odometry),
+        "cured, new (p)": lambda pairs: _changed(*_failures(what, pairs)[1:]),
+    }  # fmt: skip
+    yield from ["", "Before, and now, of the same sessions:", ""]
+    yield markdown_header(["row", *columns])
+    for name, pairs in _groups(log, rows):
+        yield markdown_row([name, *(cell(pairs) for cell in columns.values())])
+    keys, before, now = _failures(what, pair_sessions(log.earlier, log.measured, rows))
+    failures = [" ".join(key) for key, new in zip(keys, now & ~before, strict=True) if new]
+    yield from ["", f"New failures: {', '.join(failures) or 'none'}."]
+    yield from _provenance(log, rows)
+
+
+def compare_figures(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
+    """The same for rows whose sessions have figures of any name: a line for each figure of a row, and for
+    those that several rows have. Yes or no is whether a session fails in something."""
+    if log.earlier is None:
+        return
+    yield from ["", "Before, and now, of the same sessions:", ""]
+    yield markdown_header(
+        ["row", "figure", "sessions", "before", "now", "now / before [95 %]", "cured, new (p)"]
+    )
+    failures = []
+    for row, pairs in _groups(log, rows):
+        names = list(dict.fromkeys(chain.from_iterable(pairs.new)))
+        for name in names:
+            having = {key[0] for key, one in zip(pairs.keys, pairs.new, strict=True) if name in one}
+            if row == ALL and len(having) < 2:
+                continue
+            keys, old, new = pairs.named(name)
+            all_of = sum(key[0] in having for key in pairs.keys)
+            number = f"{len(keys)} of {all_of}" if len(keys) < all_of else str(all_of)
+            cells: tuple[str, ...]
+            if any(isinstance(one.get(name), bool) for one in pairs.new):
+                cells = f"{old.sum():.0f}", f"{new.sum():.0f}", "-", _changed(old > 0, new > 0)
+                changed = [" ".join(key) for key, is_new in zip(keys, new > old, strict=True) if is_new]
+                failures += [f"{name}: {', '.join(changed)}"] if changed and row != ALL else []
+            else:
+                cells = _median(old), _median(new), _spread(paired_ratios(old, new)), "-"
+            yield markdown_row([row, name, number, *cells])
+    yield from ["", f"New failures: {'; '.join(failures) or 'none'}."]
+    yield from _provenance(log, rows)
+
+
+ALL = "all rows"
+"""Name of the line over several rows."""
+
+
+def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, Pairs]]:
+    """The pairs of each row, then of all rows if there are several."""
+    assert log.earlier is not None
+    for row in rows:
+        yield row, pair_sessions(log.earlier, log.measured, [row])
+    if len(rows) > 1:
+        yield ALL, pair_sessions(log.earlier, log.measured, rows)
+
+
+def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
+    """Lines on the sessions that are in one run alone, and on what measured the others."""
+    assert log.earlier is not None
+    lone = [
+        f"{row} {pairs.only_old} before, {pairs.only_new} now"
+        for row, pairs in _groups(log, rows)
+        if row != ALL and pairs.only_old + pairs.only_new
+    ]
+    if lone:
+        yield f"In one run alone and left out, sessions: {'; '.join(lone)}."
+    keys = pair_sessions(log.earlier, log.measured, rows).keys
+    codes = [Counter(run[key].code for key in keys) for run in (log.earlier, log.measured)]
+    named = [", ".join(f"{code} ({count} sessions)" for code, count in each.items()) for each in codes]
+    yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."
+
+
+def _failures(what: Compared, pairs: Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
+    """The sessions [m], and whether they fail, [m] bool before and now."""
+    keys, old, new = pairs.named(what.error, what.odometry)
+    return keys, what.failed(*old), what.failed(*new)
+
+
+def _ratio(pairs: Pairs, name: str) -> str:
+    ratio = paired_ratios(*pairs.known(name))
+    return _spread(ratio) + _of(len(ratio), pairs) * bool(len(ratio))
+
+
+def _spread(ratio: np.ndarray) -> str:
+    """Median of ratios [n], with its interval."""
+    if not len(ratio):
+        return "-"
+    low, high = median_interval(ratio)
+    return f"{np.median(ratio):.3f} " + (f"[{low:.3f}-{high:.3f}]" if low == low else "[-]")
+
+
+def _over_odometry(what: Compared, pairs: Pairs) -> str:
+    ratios = [paired_ratios(odometry, error) for error, odometry in pairs.known(what.error, what.odometry)]
+    return f"{_median(ratios[0])}, {_median(ratios[1])}{_of(len(ratios[0]), pairs)}"
+
+
+def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: Pairs, *names: str) -> str:
+    old, new = pairs.known(*names)
+    return f"{happens(*old).sum()}, {happens(*new).sum()}{_of(old.shape[1], pairs)}"
+
+
+def _medians(pairs: Pairs, name: str) -> str:
+    old, new = pairs.known(name)
+    return f"{_median(old)}, {_median(new)}{_of(len(old), pairs)}"
+
+
+def _sums(pairs: Pairs, names: tuple[str, str]) -> str:
+    old, new = pairs.known(*names)
+    sums = [f"{side[0].sum():.0f} / {side[1].sum():.0f}" for side in (old, new)]
+    return f"{', '.join(sums)}{_of(old.shape[1], pairs)}"
+
+
+def _changed(old: np.ndarray, new: np.ndarray) -> str:
+    """Cured and new failures of sessions that fail [n] bool before and now."""
+    cured, appeared = int((old & ~new).sum()), int((new & ~old).sum())
+    return f"{cured}, {appeared} ({sign_test(cured, appeared):.2g})"
+
+
+def _median(values: np.ndarray) -> str:
+    return f"{np.median(values):.3f}" if len(values) else "-"
+
+
+def _of(count: int, pairs: Pairs) -> str:
+    """How many pairs a cell is of, where that is not all."""
+    return f" of {count}" if count < len(pairs.keys) else ""

@@ -1,0 +1,195 @@
+"""The table of map health: whether a map's own doubt tells bad maps from good ones.
+
+Each session is finished once and its map spoilt in many ways (`trials.spoilt_maps`). A map is bad if its
+error exceeds `HARM_FACTOR` times odometry's (recordings: and 0.3 m): whisker sessions by the Energy Metric,
+recordings by ATE, both of keyframes. Even sessions fit the regression, odd ones test it; the weights below
+the table, of all sessions, become those of `ratslam.mapping.map_health`. Only maps with closures count.
+Sessions are of mazes and recordings used for development.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.statistics import auc
+from evaluation.metrics.trajectory import ate
+from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.recordings import Recording, real_recordings
+from evaluation.papers.tables.touch import MAIN, ROWS
+from evaluation.papers.trials.recording_trial import run_recording
+from evaluation.papers.trials.spoilt_maps import spoilt_maps
+from evaluation.studies.executor import run_tasks
+from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
+from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
+from ratslam.runs.settings.run_config import RunConfig
+from robot.sources.odometry import OdometryConfig
+from robot.sources.perturbation import miscalibrate
+
+FIRST_MAZE = 31000
+RIDGE = 2.0
+"""Penalty on the squared weights of standardised features."""
+CLEAR = 1.25
+"""Ratio of the errors of map and odometry beyond which one is clearly better."""
+EXPLORATION = {"path": {"explore": 900}}
+NOISE = OdometryConfig()
+
+
+def _noise(factor: float) -> dict[str, Any]:
+    """Settings of the odometry with this factor on its noise."""
+    return {"odometry": {"length": factor * NOISE.length, "heading": factor * NOISE.heading}}
+
+
+TOUCH: dict[str, dict[str, Any]] = {
+    "main": MAIN,
+    "exploration": EXPLORATION,
+    "open arena": MAIN | EXPLORATION | {"maze": {"share": 0.08}},
+    "tree": MAIN | EXPLORATION | {"maze": {"kind": "tree"}},
+    "good odometry": EXPLORATION | _noise(0.25),
+    "white": ROWS["white"].simulation,
+    "noise x 2": MAIN | _noise(2.0),
+}
+"""Settings `simulation` of the whisker sessions."""
+REAL = {
+    "acapulco": ("configs/building.yaml", "buildings/acapulco_odom_gt.csv"),
+    "aces": ("configs/building.yaml", "buildings/aces_odom_gt.csv"),
+    "intel": ("configs/intel_laser.yaml", ""),
+    "lecture hall": ("configs/tuc_lecture_hall.yaml", ""),
+}
+"""Configuration of each real recording, and the recording in the folder of these where it names none."""
+COLUMNS = (
+    "sessions", "maps", "bad", "AUC", "AUC, clear maps", "AUC of the number of closures",
+    "alarms in good maps", "misses of bad maps",
+)  # fmt: skip
+
+
+class HealthTask(NamedTuple):
+    """A session: a row, and its number."""
+
+    row: str
+    number: int
+    folder: Path
+
+
+class JudgedMaps(NamedTuple):
+    """The maps of sessions, n in all.
+
+    Attributes:
+        features: [n, 5] of `HealthFeatures`. ratio: [n] error over odometry's. bad: [n] bool. closures: [n].
+    """
+
+    features: np.ndarray
+    ratio: np.ndarray
+    bad: np.ndarray
+    closures: np.ndarray
+
+
+def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> Iterator[str]:
+    """The lines of the table.
+
+    Args:
+        sessions: of each row; recordings are perturbed copies but the first. folder: of the repository.
+    """
+    rows = [*TOUCH, *(REAL if real_recordings() else ())]
+    tasks = [HealthTask(row, number, folder) for row in rows for number in range(sessions)]
+    found = list(run_tasks(judge_session, tasks, workers=workers))
+    weights, final = (fit_weights(_together(maps)) for maps in (found[0::2], found))
+    constants = np.array([INTERCEPT, *WEIGHTS])
+    yield markdown_header(COLUMNS)
+    for row in rows:
+        maps = _together([one for task, one in zip(tasks, found, strict=True) if task.row == row])
+        yield _line(row, maps, constants)
+    yield _line("all", _together(found), constants)
+    yield _line("even, fitted on these", _together(found[0::2]), weights)
+    yield _line("odd, fitted on even ones", _together(found[1::2]), weights)
+    yield f"\nIntercept and weights fitted on all sessions: {', '.join(f'{w:.2f}' for w in final)}."
+
+
+def judge_session(task: HealthTask) -> JudgedMaps:
+    """Runs a session and judges its spoilt maps."""
+    config, touch = task_config(task)
+    copied = task.number > 0 and not touch
+    run = run_recording(config, miscalibrate if copied else None, task.number)
+    map = run.session.map
+    assert isinstance(map, KeyframeMap)
+    truth, graph = run.truth[map.keyframe_steps()], map.keyframes()
+    known = np.isfinite(truth).all(axis=1)
+
+    def error(poses: np.ndarray) -> float:
+        if touch:
+            return energy_all_pairs(poses[known], truth[known]).total
+        return ate(poses[known], truth[known])
+
+    before = error(graph.dead_reckoned())
+    limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)
+    rows = []
+    for _, solution in spoilt_maps(map, truth, task.number):
+        closures = int((solution.log.weights() > ACCEPTED_WEIGHT).sum())
+        if closures:
+            after = error(solution.fit.poses)
+            rows.append((*health_features(graph, solution), after / before, after > limit, closures))
+    values = np.array(rows, float).reshape(len(rows), -1)
+    return JudgedMaps(values[:, :-3], values[:, -3], values[:, -2] > 0, values[:, -1])
+
+
+def task_config(task: HealthTask) -> tuple[RunConfig, bool]:
+    """The configuration of a session, and whether it is a whisker session."""
+    if task.row in TOUCH:
+        maze = FIRST_MAZE + task.number
+        simulation = TOUCH[task.row]
+        simulation = simulation | {"seed": task.number, "maze": {"seed": maze} | simulation.get("maze", {})}
+        parts = {"simulation": simulation, "session": {"reserve": 2048}}
+        return RunConfig.model_validate(parts), True
+    config, file = REAL[task.row]
+    settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
+    recording = Recording(task.row, config, settings, real=True)
+    return recording.configuration(task.folder, "session.reserve=1024"), False
+
+
+def fit_weights(maps: JudgedMaps) -> np.ndarray:
+    """[6] intercept and weights of a logistic regression with a ridge on standardised features."""
+    mean, sd = maps.features.mean(axis=0), maps.features.std(axis=0) + 1e-9
+    columns = np.column_stack([np.ones(len(maps.bad)), (maps.features - mean) / sd])
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        z, ridge = columns @ weights, RIDGE * weights * (np.arange(len(weights)) > 0)
+        value = np.logaddexp(0, z).sum() - z[maps.bad].sum() + ridge @ weights / 2
+        return float(value), columns.T @ (expit(z) - maps.bad) + ridge
+
+    weights = minimize(loss, np.zeros(columns.shape[1]), jac=True).x
+    scaled = weights[1:] / sd
+    return np.array([weights[0] - scaled @ mean, *scaled])
+
+
+def _line(name: str, maps: JudgedMaps, weights: np.ndarray) -> str:
+    """A row of the table with an intercept and weights [6]."""
+    worse = expit(weights[0] + maps.features @ weights[1:])
+    clear = (maps.ratio > CLEAR) | (maps.ratio < 1 / CLEAR)
+    doubted = worse > DOUBTED
+    return markdown_row(
+        [
+            name, len(maps.bad), int(maps.bad.sum()), _auc(worse, maps.bad),
+            _auc(worse[clear], maps.bad[clear]), _auc(-maps.closures, maps.bad),
+            _share(doubted[~maps.bad]), _share(~doubted[maps.bad]),
+        ]
+    )  # fmt: skip
+
+
+def _auc(values: np.ndarray, bad: np.ndarray) -> str:
+    return f"{auc(values[~bad], values[bad]):.3f}" if bad.any() and not bad.all() else "-"
+
+
+def _share(happened: np.ndarray) -> str:
+    return f"{happened.sum()} of {len(happened)}"
+
+
+def _together(found: Sequence[JudgedMaps]) -> JudgedMaps:
+    return JudgedMaps(*(np.concatenate(parts) for parts in zip(*found, strict=True)))

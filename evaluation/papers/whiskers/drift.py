@@ -1,0 +1,272 @@
+"""Coloured noise, drift and creep of real whiskers, and of the simulator's with `HALL_BASELINE`.
+
+The magnetic whiskers of an arm in clutter are divided: the settings of `HALL_BASELINE` are read off `FIT`
+and compared with those of `CHECK`. Beside them stand the simulator's noise with these settings and without
+(white), and a whisker read by a camera.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from robot.recordings.whiskers.number_table import read_columns
+from robot.recordings.whiskers.reach import read_reach
+from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
+from tactile.features.contact_stream import find_fixed_contacts
+
+CAMERA = "real_touch/actuated_whisker_purdue/data/airflow/airflowDemoData.csv"
+RATE = 200.0
+"""Readings per second; the file has no time, the authors assume this rate."""
+START = 100
+"""First readings, which are free: later ones beyond 20 of their standard deviations are contacts'."""
+SETTLING = 0.3
+"""Time after a contact in which a whisker swings, s."""
+
+
+class Part(NamedTuple):
+    """Whiskers by their place in the record: free ones, and those that bend and are free again at the end."""
+
+    free: tuple[int, ...]
+    bent: tuple[int, ...]
+
+
+FIT = Part(free=(4, 5), bent=(0, 1, 3))
+"""Left 4 and 5; left 0, 1 and 3."""
+CHECK = Part(free=(6, 7), bent=(8, 9, 10))
+"""Left 6 and 7; right 0, 1 and 2."""
+LAGS = np.arange(1, 11)
+"""Lags of the autocorrelation, in samples."""
+COLOURED = 0.1
+"""Correlation of neighbours from which on noise is not called white."""
+TRACKED = 50
+"""Samples whose mean is subtracted where the noise alone is measured."""
+SPANS = np.unique(np.geomspace(20, 1600, 25).astype(int))
+"""Time spans over which the drift is drawn, in samples."""
+GROWTH = 4.0
+"""Time over which the growth of the drift is measured, s; a third of the record."""
+BLOCK = 100
+"""Samples whose mean shows the baseline."""
+AXIS = 1
+"""The axis into which these whiskers are bent."""
+SIMULATED, COPIES = 200, 20
+"""Simulated free whiskers, and simulated copies of each real whisker that bends."""
+
+
+class FreeFigures(NamedTuple):
+    """Figures of free whiskers, pooled over their channels.
+
+    Attributes:
+        correlation: at `LAGS`, the median channel. change: rms change over `SPANS`, in noise sds.
+        time: in which the correlation falls to 1/e, s, as between neighbours; None for white noise.
+        drift: in noise sds per square root of a second. range: least and largest range of the baseline of a
+            channel, in noise sds.
+    """
+
+    correlation: np.ndarray
+    change: np.ndarray
+    time: float | None
+    drift: float
+    range: tuple[float, float]
+
+
+class CreepFigures(NamedTuple):
+    """Figures of whiskers after their last contact.
+
+    Attributes:
+        share, time: of the creep; time in s. shares: of each whisker with that time. offset: [K, T] distance
+            of each whisker from where it settles, as a share of its mean deflection in contact, from its
+            release on, `RATE` a second.
+    """
+
+    share: float
+    time: float
+    shares: np.ndarray
+    offset: np.ndarray
+
+
+class DriftResult(NamedTuple):
+    """Figures of free whiskers and after contacts, by source."""
+
+    free: dict[str, FreeFigures]
+    creep: dict[str, CreepFigures]
+
+
+def measure_drift(folder: Path) -> DriftResult:
+    """The figures of real and simulated whiskers.
+
+    Raises:
+        InputError: a recording is missing or damaged.
+    """
+    reach, camera = require_recordings(folder, REACH, CAMERA)
+    signal = read_reach(reach).signal
+    free: dict[str, FreeFigures] = {}
+    creep: dict[str, CreepFigures] = {}
+    for name, part in (("fitted", FIT), ("checked", CHECK)):
+        free[name] = free_figures(signal[:, part.free].reshape(len(signal), -1), RATE)
+        creep[name] = creep_figures(signal[:, part.bent], None if name == "fitted" else creep["fitted"].time)
+    for name, config in (("simulated", HALL_BASELINE), ("control: white noise", BaselineConfig())):
+        noise = simulate_free(config, len(signal))
+        free[name] = free_figures(noise.reshape(len(signal), -1), RATE)
+        bent = np.repeat(signal[:, FIT.bent + CHECK.bent], COPIES, axis=1)
+        creep[name] = creep_figures(simulate_bent(config, bent), creep["fitted"].time)
+    held, _ = read_columns(camera, ("Time", "dx", "dy"))
+    held = held[(held[:, 0] > 19) & (held[:, 0] < 23.5)]  # pressed without moving
+    free["camera"] = free_figures(held[:, 1:], len(held) / np.ptp(held[:, 0]))
+    return DriftResult(free, creep)
+
+
+def mean_change(record: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Half the mean square change over each lag, [L, C], of records [T, C]."""
+    return np.array([((record[lag:] - record[:-lag]) ** 2).mean(axis=0) / 2 for lag in lags])
+
+
+def free_figures(record: np.ndarray, rate: float) -> FreeFigures:
+    """The figures of whiskers that touch nothing.
+
+    Args:
+        record: [T, C] channels. rate: readings per second.
+    """
+    quick = record - uniform_filter1d(record, TRACKED, axis=0, mode="nearest")
+    noise = quick.var(axis=0)
+    correlation = np.median(1 - mean_change(quick, LAGS) / noise, axis=1)
+    span = np.array([min(round(GROWTH * rate), len(record) // 2)])
+    grown = (2 * mean_change(record, span)[0] / noise - 2).mean() * rate / span[0]
+    level = uniform_filter1d(record, BLOCK, axis=0)[BLOCK // 2 : -BLOCK // 2] / np.sqrt(noise)
+    extent, spans = np.ptp(level, axis=0), SPANS[: np.searchsorted(SPANS, len(record) // 2)]
+    return FreeFigures(
+        correlation=correlation,
+        change=np.sqrt(np.mean(2 * mean_change(record, spans) / noise, axis=1)),
+        time=float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None,
+        drift=float(np.sqrt(max(grown, 0.0))),
+        range=(float(extent.min()), float(extent.max())),
+    )
+
+
+def creep_figures(signal: np.ndarray, time: float | None) -> CreepFigures:
+    """The figures of whiskers after their last contact: a fit of creep, level and slope to their free end.
+
+    Args:
+        signal: [T, W, 3]. time: of the creep, s; None: the one that fits best.
+    """
+    touches = find_fixed_contacts(signal[:START], signal)
+    times = np.geomspace(0.1, 3, 60) if time is None else np.array([time])
+    fits = [[_creep_fit(signal[:, w], touches[:, w], time) for w in range(signal.shape[1])] for time in times]
+    misfit = [sum(fit[1] for fit in row) for row in fits]
+    best = int(np.argmin(misfit))
+    shares = np.array([fit[0] for fit in fits[best]])
+    offset = [fit[2] for fit in fits[best]]
+    length = min(map(len, offset))
+    return CreepFigures(
+        float(np.median(shares)), float(times[best]), shares, np.array([row[:length] for row in offset])
+    )
+
+
+def _creep_fit(signal: np.ndarray, touches: np.ndarray, time: float) -> tuple[float, float, np.ndarray]:
+    """Share, rms misfit in noise sds, and the offset after release of one whisker [T, 3] that touches [T]."""
+    noise = signal[:START].std(axis=0)
+    deviation = (signal - signal[:START].mean(axis=0)) / noise
+    bend = np.where(touches, deviation[:, AXIS], 0.0)
+    keep = np.exp(-1 / (RATE * time))
+    crept = lfilter([1 - keep], [1, -keep], bend)
+    release = int(np.flatnonzero(touches)[-1]) + 1
+    rows = np.arange(release + round(SETTLING * RATE), len(signal))
+    model = np.column_stack([crept[rows], np.ones(len(rows)), (rows - rows[0]) / RATE])
+    weights, _, _, _ = np.linalg.lstsq(model, deviation[rows, AXIS])
+    misfit = float(np.sqrt(np.mean((deviation[rows, AXIS] - model @ weights) ** 2)))
+    after = np.arange(release, len(signal))
+    settled = weights[1] + weights[2] * (after - rows[0]) / RATE
+    return float(weights[0]), misfit, (deviation[after, AXIS] - settled) / bend[touches].mean()
+
+
+def simulate_free(config: BaselineConfig, count: int) -> np.ndarray:
+    """[T, W, 2] noise and drift of simulated whiskers that touch nothing, in noise sds."""
+    sensor = Baseline(config, 1.0, RATE, SIMULATED, seed=0)
+    white = np.random.default_rng(1).standard_normal((1, count, SIMULATED, 2))
+    return (sensor.colour(white) + sensor.wander(np.zeros_like(white)))[0]
+
+
+def simulate_bent(config: BaselineConfig, signal: np.ndarray) -> np.ndarray:
+    """[T, W, 3] simulated whiskers, bent as real ones [T, W, 3] are while they touch, in noise sds."""
+    noise = signal[:START].std(axis=0)
+    deviation = (signal - signal[:START].mean(axis=0)) / noise
+    bend = np.where(find_fixed_contacts(signal[:START], signal), deviation[..., AXIS], 0.0)
+    seen = np.zeros(signal.shape)
+    seen[..., :2] = np.stack([np.zeros_like(bend), bend], axis=-1)
+    sensor = Baseline(config, 1.0, RATE, signal.shape[1], seed=0)
+    white = np.random.default_rng(2).standard_normal(seen.shape)
+    seen[..., :2] += (sensor.colour(white[None, ..., :2]) + sensor.wander(seen[None, ..., :2]))[0]
+    seen[..., 2] = white[..., 2]
+    return seen
+
+
+LABELS = {
+    "fitted": "real, fitted: left 4, 5 (free); left 0, 1, 3 (bent)",
+    "checked": "real, checked: left 6, 7; right 0, 1, 2",
+    "simulated": "simulated with these settings",
+    "camera": "control: a whisker read by a camera, held for 4.5 s",
+}
+COLUMNS = (
+    "whiskers", "correlation of neighbours", "its time", "drift, sd / sqrt(s)", "range of the baseline, sd",
+    "creep: share of the bend (range)", "its time",
+)  # fmt: skip
+CAVEATS = (
+    "All real noise of the magnetic whiskers is coloured, but two readings apart its correlation is below 0, "
+    "where that of the simulator is above. The real drift is smoother than a random walk: the simulator's is "
+    "larger over less than 2 s. It ends when the arm stands still; whether it grows on after these 12 s the "
+    "recording does not say. The creep of the right array is smaller than that of the left, from which the "
+    "setting is taken."
+)
+
+
+def drift_table(result: DriftResult) -> list[str]:
+    """The lines of the table."""
+    lines = [markdown_header(COLUMNS)]
+    for name, free in result.free.items():
+        cells = [LABELS.get(name, name), f"{free.correlation[0]:.2f}"]
+        cells += ["white" if free.time is None else f"{1000 * free.time:.1f} ms", f"{free.drift:.2f}"]
+        cells.append("{:.1f}-{:.1f}".format(*free.range))
+        if creep := result.creep.get(name):
+            cells.append(f"{creep.share:.3f} ({creep.shares.min():.3f}-{creep.shares.max():.3f})")
+            cells.append(f"{creep.time:.2f} s")
+        lines.append(markdown_row([*cells, *["-"] * (len(COLUMNS) - len(cells))]))
+    return [*lines, "", CAVEATS]
+
+
+def draw_drift(result: DriftResult, png: Path) -> None:
+    """Draws autocorrelation, drift and creep of real and simulated whiskers."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    colours, drift, creep = figure.subplots(1, 3)
+    styles = {
+        "fitted": {"color": "tab:blue", "label": "real, fitted"},
+        "checked": {"color": "tab:cyan", "label": "real, checked"},
+        "simulated": {"color": "tab:red", "label": "simulated"},
+        "control: white noise": {"color": "grey", "linestyle": "--", "label": "simulated, white noise"},
+    }
+    for name, style in styles.items():
+        free = result.free[name]
+        colours.plot(1000 * LAGS / RATE, free.correlation, marker=".", **style)
+        drift.semilogx(SPANS[: len(free.change)] / RATE, free.change, **style)
+        offset = 100 * np.median(result.creep[name].offset, axis=0)
+        smooth = np.convolve(offset, np.ones(20) / 20, "valid")
+        creep.plot((np.arange(len(smooth)) + 10) / RATE, smooth, **style)
+    colours.set(xlabel="lag (ms)", ylabel="autocorrelation", title="Noise of free whiskers")
+    drift.set(xlabel="time span (s)", ylabel="rms change (noise sd)", title="Drift of free whiskers")
+    creep.axvspan(0, SETTLING, color="0.9", lw=0)
+    creep.set(xlim=(0, 3.4), ylim=(-0.5, 2.5), xlabel="time after the last contact (s)")
+    creep.set(ylabel="offset (% of the deflection)", title="Creep after a contact (grey: swinging)")
+    colours.legend()
+    for axes in (colours, drift, creep):
+        axes.grid(alpha=0.3)
+    figure.savefig(png, dpi=130)
+
+
+FIGURE = RealFigure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)

@@ -1,0 +1,1 @@
+"""Studies: many configurations over many seeds, shared out among processes; tuning; sizing."""

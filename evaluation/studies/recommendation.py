@@ -1,0 +1,187 @@
+"""Recommended values, with reasons, of the settings that cost time or memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from evaluation.studies.report import render_table
+from evaluation.studies.scene_statistics import Scene
+from evaluation.studies.summary import plain
+from ratslam.classic.levels import SETTLED, window_levels
+from ratslam.classic.pose_cell_config import NetworkConfig, network_of
+from ratslam.classic.pose_cells import LARGEST_SUBSTEP
+from ratslam.grid.config import DriftConfig
+from ratslam.grid.particle_maps import LAYERS
+from ratslam.methods.grid import LIVE_SIDE
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import open_path
+from ratslam.runs.settings.strict_yaml.dumper import Dumper
+from robot.simulation.head.session import choose_tier
+
+PARTS = 4  # largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed
+SLOW = 0.05  # smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed
+FEWEST, MOST = 11, 201
+"""Cells along an axis: at least those of a packet, at most those measured with the moving window."""
+PER_CELL = 100  # particles per cell of odometry error across the scene
+PARTICLES = 30, 3000  # smallest and largest number of particles
+MEMORY = 1024  # largest memory of all particles' maps, MiB
+
+
+class Recommendation(NamedTuple):
+    """A setting: key path, present value, recommended value, reason in one line."""
+
+    key: str
+    now: Any
+    value: Any
+    why: str
+
+    @property
+    def changed(self) -> bool:
+        """Whether the recommended value differs from the present one."""
+        return bool(self.value != self.now)
+
+
+def recommend(config: RunConfig, scene: Scene) -> list[Recommendation]:
+    """Recommendations for a configuration that its source has completed."""
+    own = _grid(config, scene) if config.backend == "grid" else _rat(config, scene)
+    return [*own, *_tier(config)]
+
+
+def round_number(value: float, side: int = 0, steps: tuple[int, ...] = (1, 2, 5)) -> float:
+    """The nearest of some steps times a power of ten; not below the value if side is 1, not above if -1."""
+    power = np.floor(np.log10(value))
+    every = [float(f"{step}e{power + k:.0f}") for k in (-1, 0, 1) for step in steps]
+    allowed = [each for each in every if (each - value) * side >= 0]
+    return min(allowed, key=lambda each: abs(np.log(each / value)))
+
+
+def cells_to_cover(span: float, cell: float) -> int:
+    """Odd number of cells of a torus that does not wrap, with space for a packet at either end."""
+    return max(FEWEST, int(np.ceil(span / cell)) + SETTLED) | 1
+
+
+def render_recommendations(found: Sequence[Recommendation]) -> str:
+    """A table of settings: present value, recommended value, reason."""
+    rows = [[each.key, *map(plain, (each.now, each.value)), each.why] for each in found]
+    return render_table([["setting", "now", "recommended", "why"], *rows])
+
+
+def changed_settings_yaml(found: Sequence[Recommendation]) -> str:
+    """YAML of the settings to change; '' if there are none."""
+    tree: dict[str, Any] = {}
+    for each in found:
+        if each.changed:
+            section, path = open_path(tree, each.key, each.key)
+            section[path[-1]] = each.value
+    return yaml.dump(tree, Dumper=Dumper, sort_keys=False) if tree else ""
+
+
+def _of(config: RunConfig, key: str, value: Any, why: str) -> Recommendation:
+    now: Any = config
+    for name in key.split("."):
+        now = getattr(now, name)
+    return Recommendation(key, now, value, why)
+
+
+def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
+    cells = config.pose_cells
+    yield (size := _cell_size(config, scene))
+    yield (across := _cells_xy(config, scene, size.value))
+    fitting = {"cell_size": size.value, "cells_xy": across.value, "engine": "window"}
+    yield _engine(config, network_of(cells, config.attractor).model_copy(update=fitting))
+    step = 2 * np.pi / cells.cells_heading
+    turns = f"a turn of {scene.turn:.2g} rad takes {_parts(scene.turn / step)} sub-steps"
+    yield _of(
+        config, "pose_cells.cells_heading", cells.cells_heading, f"{np.degrees(step):.3g} degrees; {turns}"
+    )
+    yield _of(config, "backend", "recall", "weighs runs of views; classic takes the best single view")
+    yield _of(config, "session.precision", "float64", "what the published figures are of")
+
+
+def _cell_size(config: RunConfig, scene: Scene) -> Recommendation:
+    now = config.pose_cells.cell_size
+    moved, most = scene.usual / now, scene.most / now
+    why = (
+        f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): "
+        f"{_parts(most)} sub-steps of {LARGEST_SUBSTEP:g} at most"
+    )
+    value = now
+    if _parts(most) > PARTS:
+        value, why = round_number(scene.most / (LARGEST_SUBSTEP * PARTS), 1), f"{why}, where {PARTS} will do"
+    elif moved < SLOW:
+        value, why = round_number(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
+    return _of(config, "pose_cells.cell_size", value, why)
+
+
+def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Recommendation:
+    now, span = config.pose_cells.cells_xy, max(scene.span)
+    cover = min(cells_to_cover(span, size), MOST)
+    # What recall and its map do is the same on any torus: then the one there is will do.
+    value = now if config.backend == "recall" and FEWEST <= now <= cover else cover
+    wraps = span / (value * size)
+    spanned = f"the path spans {span / size:.0f} cells: " + (
+        f"wraps {wraps:.1f} x" if wraps > 1 else "none twice"
+    )
+    free = ", which recall does not mind" if config.backend == "recall" and wraps > 1 else ""
+    return _of(config, "pose_cells.cells_xy", value, spanned + free)
+
+
+def _engine(config: RunConfig, proposed: NetworkConfig) -> Recommendation:
+    levels = window_levels(proposed, np.dtype(float))
+    shapes = ["x".join(map(str, level.window.shape[::-1])) for level in levels]
+    if len(levels) == 1:
+        return _of(config, "attractor.engine", "dense", f"{shapes[0]} cells are too few for a window")
+    share = np.prod(levels[0].window.shape) / np.prod(levels[-1].window.shape)
+    several = [f"{level.windows} of " * (level.windows > 1) for level in levels]
+    then = ", ".join(map("".join, zip(several[1:-1], shapes[1:-1], strict=True)))
+    why = f"{shapes[0]} of {shapes[-1]} cells ({share:.0%}); where not exact, {then}{', ' if then else ''}all"
+    return _of(config, "attractor.engine", "window", why)
+
+
+def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
+    grid, side = config.grid, config.grid.side or LIVE_SIDE
+    blob, cell = grid.footprint.blob_sd, round_number(grid.footprint.blob_sd)
+    across = int(np.ceil(side / cell))
+    off = _drifted(grid.drift, scene) / cell
+    wanted = int(np.clip(round_number(max(PER_CELL * off, 1.0), steps=(1, 2, 3, 5)), *PARTICLES))
+    each = LAYERS * across**2 * np.dtype(np.float32).itemsize / 2**20
+    count = min(wanted, max(PARTICLES[0], int(MEMORY / each)))
+    yield _of(config, "grid.cell", cell, f"as fine as the mark of a contact, {blob:g} m")
+    why = f"{max(scene.span):.3g} m of path and what whiskers reach from it: {across} cells"
+    yield _of(config, "grid.side", side, why)
+    why = (
+        f"{PER_CELL} for each cell ({off:.2g}) that odometry is off across the scene; {count * each:.0f} MiB"
+    )
+    less = f", {wanted} do not fit in {MEMORY}" if count < wanted else ""
+    yield _of(config, "grid.particles", count, why + less)
+    yield _of(config, "session.precision", "float32", "half the memory; evidence needs no more digits")
+
+
+def _tier(config: RunConfig) -> Iterator[Recommendation]:
+    simulation = config.simulation
+    if simulation is None:
+        return
+    chosen = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
+    value = "auto" if simulation.fidelity == "auto" else chosen.name
+    named = f"{chosen.name}: " if value == "auto" else ""
+    why = f"{named}{chosen.why}; `study --preset tiers` compares them"
+    yield _of(config, "simulation.fidelity", value, why)
+
+
+def _parts(cells: float) -> int:
+    """Number of sub-steps for a motion in cells."""
+    return max(1, int(np.ceil(cells / LARGEST_SUBSTEP - 1e-9)))
+
+
+def _drifted(drift: DriftConfig, scene: Scene) -> float:
+    """Standard deviation of odometry after crossing the scene by the filter's drift model, m."""
+    span = max(scene.span)
+    cycles = max(span / scene.usual, 1.0)
+    lasting = np.hypot(drift.session, drift.move)
+    along = span * np.hypot(lasting, drift.step / np.sqrt(cycles))
+    aside = span * drift.heading * np.sqrt(cycles / 3)
+    return float(np.hypot(along, aside))

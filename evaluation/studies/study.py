@@ -1,0 +1,263 @@
+"""A study: a base configuration, its variations, and the runs that follow from them.
+
+Settings of a study are put into a configuration so that error messages name their place in the study.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import lru_cache
+from itertools import combinations, product
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel
+
+from evaluation.studies.schema import RowPlan, StudyPlan
+from ratslam.mapping.config import FULL, Ablation
+from ratslam.runs.settings.packaged import find_config
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import Document, load, open_path, override, validate
+from ratslam.runs.settings.strict_yaml.document import KeyPath, Place
+from tactile.base.errors import InputError, InputErrors
+
+Model = TypeVar("Model", bound=BaseModel)
+MOST = 100_000  # largest number of jobs of a study
+SEEDS = {
+    "simulation": "simulation.seed",
+    "create_simulation": "create_simulation.seed",
+    "rat_simulation": "rat_simulation.seed",
+    "recording": "session.seed",
+}
+"""Key path that `seeds` sets, by kind of source."""
+
+
+class Job(NamedTuple):
+    """One run of a study."""
+
+    row: str  # name of its row; '' if the study has no rows
+    varied: dict[str, Any]  # combination of `vary`, by key path
+    config: RunConfig  # with absolute paths
+    hash: str = ""  # of the configuration without its seed, and of the files it names
+    seed: int = 0
+    copy_number: int = 0  # seed of the perturbed copy; 0: none
+    pace: str = "replay"  # see `StudyPlan`
+    reference_tier: str | None = None  # see `StudyPlan`
+    ablation: Ablation = FULL  # parts of the keyframe map that are on
+
+    @property
+    def key(self) -> str:
+        """Identifies the run: two jobs with one key are the same."""
+        return run_key(self.hash, self.seed, self.copy_number)
+
+
+class Setting(NamedTuple):
+    """A dotted key of a configuration, its value, and the path in the study where that is written."""
+
+    key: str
+    value: Any
+    at: KeyPath
+
+
+class Study(NamedTuple):
+    """A checked study."""
+
+    name: str  # file name without its ending
+    plan: StudyPlan  # content of the file with overrides
+    document: Document  # the same, with places
+    base: Document  # the base with `set` applied, with places
+    folder: Path  # of the base, where its relative paths start
+    overridden: Sequence[str]  # keys of `--set` that are settings of all runs
+    jobs: tuple[Job, ...]  # by row, combination, seed and perturbed copy
+
+
+def run_key(hash: str, seed: int, copy_number: int) -> str:
+    """The key of a run."""
+    return f"{hash}-{seed}-{copy_number}" if copy_number else f"{hash}-{seed}"
+
+
+def read_study(path: str | Path, overrides: Sequence[str] = ()) -> Study:
+    """The study in a file; see `check_study`."""
+    return check_study(Path(path).stem, load(path), Path(path).parent, overrides)
+
+
+def check_study(name: str, document: Document, folder: Path, overrides: Sequence[str] = ()) -> Study:
+    """A study all of whose configurations are valid, else an `InputError`.
+
+    Args:
+        folder: start of a relative path of `base`. overrides: each `a.b=value`: a key of the study where `a`
+            is one, else a setting of all runs.
+    """
+    document = override(document, [text for text in overrides if is_study_key(text)])
+    plan = validate(document, StudyPlan)
+    of_runs = [text for text in overrides if not is_study_key(text)]
+    keys = [text.partition("=")[0] for text in of_runs]
+    _check_unambiguous(plan, document, keys)
+    file = find_config(plan.base, folder)
+    base = load(file)
+    for key in _outermost_first(plan.set):
+        base = _put(base, Setting(key, plan.set[key], ("set", key)), document)
+    study = Study(name, plan, document, override(base, of_runs), file.parent, keys, ())
+    parameters = plan.tune.parameters if plan.tune else {}
+    first = {key: parameter.extremes[0] for key, parameter in parameters.items()}
+    for key, parameter in parameters.items():
+        for value in parameter.extremes:
+            searched_jobs(study, first | {key: value})
+    return study._replace(jobs=tuple(_jobs(study)))
+
+
+def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
+    """The runs of the study's base with parameters by key path; an `InputError` if they are contradictory."""
+    settings = [Setting(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
+    return list(_runs_of(study, settings, "tune", RowPlan(), parameters))
+
+
+def _jobs(study: Study) -> Iterator[Job]:
+    plan, rows = study.plan, study.plan.every_row()
+    copies = sum(len(plan.every_copy(row)) for row in rows.values())
+    total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
+    if total > MOST:
+        raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
+    alternatives = [
+        [Setting(key, value, ("vary", key, k)) for k, value in enumerate(values)]
+        for key, values in plan.vary.items()
+    ]
+    wrong: dict[str, InputError] = {}
+    for name, row in rows.items():
+        keys = _outermost_first(row.settings)
+        fixed = [Setting(key, row.settings[key], ("rows", name, key)) for key in keys]
+        for varied in product(*alternatives):
+            try:
+                yield from _runs_of(study, [*fixed, *varied], name, row, {key: v for key, v, _ in varied})
+            except InputError as error:
+                each = error.errors if isinstance(error, InputErrors) else [error]
+                wrong |= {str(one): one for one in each}
+    if wrong:
+        raise InputErrors(list(wrong.values()))
+
+
+def _runs_of(
+    study: Study, settings: Sequence[Setting], name: str, row: RowPlan, varied: dict[str, Any]
+) -> Iterator[Job]:
+    """The study's base with further settings, under every seed and copy."""
+    plan, document = study.plan, study.base
+    for setting in settings:
+        document = _put(document, setting, study.document)
+    config = validate(document, RunConfig).with_absolute_paths(study.folder.resolve())
+    keys = {key: study.document.at_key(("set", key)) for key in plan.set}
+    keys |= {key: f"--set {key}" for key in study.overridden}
+    keys |= {each.key: study.document.at_key(_without_index(each.at)) for each in settings}
+    if seed_key(config) in keys:
+        raise InputError(keys[seed_key(config)], "a seed", "the study's `seeds`")
+    parts = (plan.pace, plan.reference_tier, "" if row.ablation == FULL else repr(row.ablation))
+    digest = _digest_of(config, " ".join(filter(None, parts)))
+    for seed, copy_number in product(plan.every_seed(), plan.every_copy(row)):
+        seeded = with_settings(config, {seed_key(config): seed})
+        how = plan.pace, plan.reference_tier, row.ablation
+        yield Job(name, varied, seeded, digest, seed, copy_number, *how)
+
+
+def _put(document: Document, setting: Setting, study: Document) -> Document:
+    """The document with a setting of the study; raises an `InputError` if there is no such key."""
+    key, value, at = setting
+    where = study.at_key(at)
+    if "=" in key or not all(key.split(".")):
+        raise InputError(where, "not a key path", "names joined by dots, such as pose_cells.cells_xy")
+    data = copy.deepcopy(document.data)
+    section, path = open_path(data, key, where)
+    section[path[-1]] = copy.deepcopy(value)
+    key_place, value_place = (study.places[study.nearest(each)] for each in (_without_index(at), at))
+    here = Place(key_place.key, value_place.value)
+    places = {each: place for each, place in document.places.items() if each[: len(path)] != path}
+    for length in range(1, len(path)):
+        places.setdefault(path[:length], here)
+    inside = {
+        (*path, *each[len(at) :]): place for each, place in study.places.items() if each[: len(at)] == at
+    }
+    return Document(data, places | inside | {path: here})
+
+
+def _without_index(at: KeyPath) -> KeyPath:
+    """The path without the index of a value in a list."""
+    return at[:-1] if isinstance(at[-1], int) else at
+
+
+def _outermost_first(keys: Iterable[str]) -> list[str]:
+    """Sections before their keys, so that the result does not depend on the order of writing."""
+    return sorted(keys, key=lambda key: (key.count("."), key))
+
+
+def is_study_key(assignment: str) -> bool:
+    """Whether `a.b=value` sets a key of the study; else it is a setting of all runs."""
+    return assignment.partition("=")[0].split(".")[0] in StudyPlan.model_fields
+
+
+def _check_unambiguous(plan: StudyPlan, document: Document, overridden: Collection[str]) -> None:
+    """Raises an `InputError` if one key contains another, or a value is given twice.
+
+    Args:
+        overridden: keys of `--set` that are settings of all runs.
+    """
+    parameters = {key: ("tune", "parameters", key) for key in (plan.tune.parameters if plan.tune else ())}
+    rows = [(key, ("rows", name, key)) for name, row in plan.every_row().items() for key in row.settings]
+    vary = {key: ("vary", key) for key in plan.vary}
+    pairs: list[Any] = [*combinations(vary.items(), 2), *combinations(parameters.items(), 2)]
+    for (first, _), (second, at) in [*pairs, *product(vary.items(), rows)]:
+        if f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}."):
+            raise InputError(document.at_key(at), f"sets what {first!r} varies", "one or the other")
+    for key, values in plan.vary.items():
+        texts = [json.dumps(value, sort_keys=True) for value in values]
+        twice = next((k for k, text in enumerate(texts) if text in texts[:k]), None)
+        if twice is not None:
+            where = document.at_value(("vary", key, twice))
+            raise InputError(where, f"{texts[twice]} given twice", "each once")
+        if key in overridden:
+            raise InputError(f"--set {key}", "varied by the study", "a setting of all runs")
+
+
+def with_settings(config: Model, settings: dict[str, Any]) -> Model:
+    """The configuration with values at key paths, which are not validated."""
+    for key, value in settings.items():
+        name, _, rest = key.partition(".")
+        inner = with_settings(getattr(config, name), {rest: value}) if rest else value
+        config = config.model_copy(update={name: inner})
+    return config
+
+
+def seed_key(config: RunConfig) -> str:
+    """The key path that `seeds` sets."""
+    return next(key for part, key in SEEDS.items() if getattr(config, part) is not None)
+
+
+def _digest_of(config: RunConfig, how: str) -> str:
+    """Hash of a configuration with absolute paths, without its seed.
+
+    It covers all values, which of them were given (others may be completed from the source), and the content
+    of each file that the configuration names.
+    """
+    section, _, name = seed_key(config).partition(".")
+    parts = [config.model_dump(), config.model_dump(exclude_unset=True)]
+    for part in parts:
+        part.get(section, {}).pop(name, None)
+    text = json.dumps([*parts, how], sort_keys=True, default=_content)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _content(path: Path) -> str:
+    """The digest of a file's content; the path of what is not a file."""
+    try:
+        stat = path.stat()
+        return _digest(path, stat.st_mtime_ns, stat.st_size) if path.is_file() else str(path)
+    except OSError:
+        return str(path)
+
+
+@lru_cache(maxsize=256)
+def _digest(path: Path, modified: int, size: int) -> str:
+    """sha256 of a file; `modified` and `size` distinguish its versions in the cache."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

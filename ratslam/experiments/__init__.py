@@ -1,1 +1,0 @@
-"""Studies, the two papers' figures, and sizing; nothing else imports them."""

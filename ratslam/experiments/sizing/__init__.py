@@ -1,1 +1,0 @@
-"""Settings that fit a scene, and the cost of each cheaper one."""

@@ -1,0 +1,79 @@
+"""Studies of short sessions, and runs without sessions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import pytest
+
+from evaluation.metrics.metric import Quantity
+from evaluation.studies.machine import machine
+from evaluation.studies.records import RunRecord
+from evaluation.studies.study import Job
+
+TINY = {
+    "simulation.maze": {"columns": 3, "rows": 2, "loop": 6},
+    "simulation.path": {"circuits": "C"},
+    "simulation.whisking.rate": 0.5,
+    "pose_cells.cells_xy": 11,
+    "pose_cells.cells_heading": 12,
+    "backend": "classic",
+}
+"""Some 40 whisks."""
+
+
+def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, hash=None, **values):
+    """A record without a run."""
+    quantities = {
+        name: Quantity(label=name, value=value, unit="", odometry=odometry) for name, value in values.items()
+    }
+    measured = {"step_time": time, "step_time_p99": 2 * time, "run_time": 3 * time, "compile_time": 1.0}
+    return RunRecord(
+        hash=hash or row or "none", seed=seed, row=row, varied=varied or {}, steps=10, quantities=quantities,
+        measured=measured | {"memory": 400.0}, error=error, machine=machine(),
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def shared_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes fetch the kernels that this process has compiled."""
+    for name in ("compilation_cache_dir", "persistent_cache_min_compile_time_secs",
+                 "persistent_cache_min_entry_size_bytes"):  # fmt: skip
+        monkeypatch.setenv(f"JAX_{name.upper()}", str(getattr(jax.config, f"jax_{name}")))
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a study of tiny sessions."""
+
+    def write(**content: object) -> Path:
+        (tmp_path / "base.yaml").write_text("simulation: {}\n")
+        path = tmp_path / "study.yaml"
+        settings = TINY | dict(content.pop("set", {}))  # type: ignore[call-overload]
+        path.write_text(json.dumps({"base": "base.yaml", "set": settings, **content}))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Replaces runs by records that follow from settings and seed; the keys of the runs."""
+    keys: list[str] = []
+
+    def run_job(job: Job) -> RunRecord:
+        keys.append(job.key)
+        score = job.config.keyframes.min_score
+        failed = "keyframes.min_score: too much" if score > 40 else None
+        values = {
+            "energy_all": (score - 7) ** 2 + job.seed,
+            "exm_arr": 1 / (1 + abs(score - 12) + job.config.recall.guard),
+        }
+        found = record(time=1000 / score, error=failed, **({} if failed else values))
+        return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})
+
+    monkeypatch.setattr("evaluation.studies.study_runner.run_job", run_job)
+    return keys
