@@ -21,7 +21,7 @@ from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.types import Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance
-from ratslam.mapping.archive import Archive
+from ratslam.mapping.archive import MOST_SOLVED, Archive
 from ratslam.mapping.calibration import calibration_from_views
 from ratslam.mapping.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.mapping.closure_judge import doubt_of_closures
@@ -140,6 +140,8 @@ class KeyframeMap(Checkpointed, Map):
     def final_doubt(self) -> float:
         if self._worse is None:
             graph, found = self.keyframes(), self.solution()
+            if graph.count > MOST_SOLVED:  # merged keyframes, which are not solved for, say nothing new
+                graph, found = self._graph, self.kept_solution()
             self._worse = float(np.fmax(worse_than_odometry(graph, found), doubt_of_closures(graph, *found)))
         return self._worse
 
