@@ -13,7 +13,7 @@ from evaluation.studies.tiers import shortened
 from ratslam.runs.run import open_recorder
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.source import open_source
-from robot.recordings.formats import RecordingConfig
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate

@@ -71,10 +71,11 @@ class Commands:
     """The commands of a parser: of the program, or of a command that has commands of its own.
 
     Attributes:
-        parsers: of each command by its name, in the order of registration.
+        parser: theirs. parsers: of each command by its name, in the order of registration.
     """
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self.parser = parser
         self._subparsers = parser.add_subparsers(
             required=True, metavar="COMMAND", title="commands", parser_class=CommandParser
         )

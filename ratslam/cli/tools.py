@@ -54,6 +54,7 @@ def add_commands(commands: Commands) -> None:
         "tools completion bash > ~/.local/share/bash-completion/completions/ratslam",
     )  # fmt: skip
     completion.add_argument("shell", choices=("bash", "zsh", "fish"), help="your shell")
+    completion.set_defaults(program=commands.parser)
 
 
 def _recover(arguments: argparse.Namespace) -> int:
@@ -110,7 +111,5 @@ def _version(arguments: argparse.Namespace) -> int:
 def _completion(arguments: argparse.Namespace) -> int:
     import shtab
 
-    from ratslam.cli import build_parser
-
-    print(shtab.complete(build_parser(), arguments.shell))
+    print(shtab.complete(arguments.program, arguments.shell))
     return 0

@@ -15,7 +15,7 @@ from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.recorder import LiveRecorder
-from robot.recordings.formats import RecordingConfig
+from robot.recordings.recording_config import RecordingConfig
 from tactile.features.calibration import Calibration
 
 RECORDING = "session.mcap"

@@ -22,18 +22,18 @@ from ratslam.core.types import Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.archive import MOST_SOLVED, Archive
-from ratslam.mapping.calibration import calibration_from_views
+from ratslam.mapping.calibration import calibration_from_views, write_calibration
 from ratslam.mapping.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.mapping.closure_judge import doubt_of_closures
 from ratslam.mapping.config import FULL, Ablation, KeyframeMapConfig
 from ratslam.mapping.edges import Edges
 from ratslam.mapping.experiences import ExperienceChange, Experiences
 from ratslam.mapping.gain_odds import LearnedOdds
+from ratslam.mapping.io import write_g2o, write_json
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.keyframe_merger import KeyframeMerger
 from ratslam.mapping.live_filter import LiveFilter
-from ratslam.mapping.loop_closures import ClosureLog, Verdict, recalled_candidate
-from ratslam.mapping.map_files import map_files
+from ratslam.mapping.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
 from ratslam.mapping.map_health import DOUBTED, worse_than_odometry
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.mapping.piece_ties import FindTie, no_tie, tie_newest_piece
@@ -209,8 +209,15 @@ class KeyframeMap(Checkpointed, Map):
         return self._graph.edges(*self.kept_solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """See `ratslam.mapping.map_files`."""
-        return map_files(self, calibrated=self.final_doubt() <= DOUBTED)
+        """Functions that write files, by name: experiences as node-link JSON, keyframes as a g2o graph, the
+        closures with their evidence, and, where the map is not doubted, the calibration of the odometry."""
+        calibrated = self.final_doubt() <= DOUBTED
+        calibration = {"calibration.yaml": self._write_calibration} if calibrated else {}
+        return calibration | {
+            "map.json": lambda path: write_json(path, self.graph()),
+            "map.g2o": self._write_g2o,
+            "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
+        }
 
     def keyframes(self) -> KeyframeGraph:
         """All keyframes, merged ones included, with their views; poses are those of the last solution."""
@@ -376,6 +383,16 @@ class KeyframeMap(Checkpointed, Map):
     def _by_odometry(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
         """See `MapSolution.by_odometry`; graph: the keyframes of the solution."""
         return solution.by_odometry(graph, self._steps.odometry[self.keyframe_steps()[graph.taken.rows]])
+
+    def _write_g2o(self, path: Path) -> None:
+        """Of several pieces, the first keyframe of each is fixed: nothing else determines where it lies."""
+        taken, fit = self._graph.taken.rows, self.kept_solution().fit
+        pieces, first = np.unique(self.keyframe_pieces()[taken], return_index=True)
+        write_g2o(path, fit.poses, self.edges(), fixed=first.tolist() if len(pieces) > 1 else ())
+
+    def _write_calibration(self, path: Path) -> None:
+        noise = self._graph.heading_noise if self.config.select_every else None
+        write_calibration(path, self._graph.calibration(*self.kept_solution()), noise)
 
     def _forget_solution(self) -> None:
         self._solution = self._kept = self._worse = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +13,14 @@ from ratslam.core.session import capacity_at
 from ratslam.mapping.gain_odds import PLAIN, GainOdds, Weighing
 from ratslam.mapping.ground import Ground, ground_of
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.network.pose_cells import Belief
+from ratslam.network.pose_cells import Belief, Network
 from ratslam.places.self_comparison import compare_with_itself
 from ratslam.places.view_comparison import Comparison
 from ratslam.recall import filter
-from ratslam.recall.config import sector_shifts
+from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.memory import MapFeedback, Memory, corrected_motion, first_keyframes, frozen_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
-
-if TYPE_CHECKING:
-    from ratslam.methods.recall import RecallBackend, RecallState
 
 TOGETHER = 64
 """Number of views compared in one compiled call."""
@@ -42,6 +39,27 @@ class Look(NamedTuple):
     shows: Array
 
 
+class ViewMatcher(Protocol):
+    """What of the recall backend compares views; see `ratslam.methods.recall.RecallBackend`."""
+
+    recall: RecallConfig
+    network: Network
+    dtype: np.dtype
+    cell: float
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of whisker pixels."""
+
+    def likelihood(
+        self, config: RecallConfig, memory: Memory, view: Array, label: Array
+    ) -> tuple[Memory, ObservationLikelihood]:
+        """Likelihood of a view at every keyframe of a memory."""
+
+    def no_belief(self, capacity: int) -> Belief:
+        """All is novelty, with view cells for so many keyframes."""
+
+
 class MapViews:
     """The views of a finished map, compared with each other or with those of a session.
 
@@ -49,20 +67,13 @@ class MapViews:
         recall: the backend that made the map. graph: its keyframes.
     """
 
-    def __init__(self, recall: RecallBackend, graph: KeyframeGraph) -> None:
+    def __init__(self, recall: ViewMatcher, graph: KeyframeGraph) -> None:
         self.recall, self.graph = recall, graph
         # No keyframe of a finished map is too new to be recalled.
         self.config = recall.recall.model_copy(update={"guard": 0})
         self.shifts = sector_shifts(self.config)
         self._compare = jax.jit(self._look_at_many)
         self._gains = jax.jit(self._gains_of_many)
-
-    def remember(self, state: RecallState) -> RecallState:
-        """A state of the recall backend, with room for them, with all keyframes that are not merged; all of
-        its belief is novelty."""
-        graph = self.graph
-        frozen = self.freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
-        return self.recall.begin_piece(state)._replace(memory=frozen, health=state.health)
 
     def freeze(self, frames: np.ndarray, poses: np.ndarray, capacity: int = 0) -> Memory:
         """The memory of keyframes `frames` [N], of all ever taken, at `poses` [N, 3].

@@ -5,7 +5,7 @@ true one. A placement of the whole piece has to explain all its views."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,13 +16,10 @@ from ratslam.mapping.ground import Ground
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog
 from ratslam.mapping.piece_ties import Tie
-from ratslam.methods.map_views import MapViews
+from ratslam.methods.map_views import MapViews, ViewMatcher
 from ratslam.places.paths import less_where_dependent
 from ratslam.places.placement import Traverse, closures_along, find_placements
 from ratslam.recall.memory import Memory
-
-if TYPE_CHECKING:
-    from ratslam.methods.recall import RecallBackend
 
 FEWEST = 10
 """Least number of keyframes of a piece that is placed on another or has another placed on it."""
@@ -45,7 +42,7 @@ class PieceTies:
         recall: the backend that makes the map.
     """
 
-    def __init__(self, recall: RecallBackend) -> None:
+    def __init__(self, recall: ViewMatcher) -> None:
         self._recall = recall
         self._views: MapViews | None = None
 

@@ -196,12 +196,18 @@ class RecallBackend(Backend):
     def state_of(self, map: Map, capacity: int) -> RecallState:
         """The keyframes of a map and the motion since the newest; all of the belief is novelty."""
         assert isinstance(map, KeyframeMap)
-        state = self.init(None, capacity)
-        if not map.kept_keyframes().count:
+        state, graph = self.init(None, capacity), map.kept_keyframes()
+        if not graph.count:
             return state
-        state = MapViews(self, map.kept_keyframes()).remember(state)
+        state = self.remember(graph, state)
         motion, length, turn = (jnp.array(value, self.dtype) for value in map.travel)
         return state._replace(memory=state.memory._replace(motion=motion, length=length, turn=turn))
+
+    def remember(self, graph: KeyframeGraph, state: RecallState) -> RecallState:
+        """The state, which has room for them, with all keyframes of a graph that are not merged; all of its
+        belief is novelty."""
+        frozen = MapViews(self, graph).freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
+        return self.begin_piece(state)._replace(memory=frozen, health=state.health)
 
     def no_belief(self, capacity: int) -> Belief:
         """All is novelty, with view cells for so many keyframes."""

@@ -24,7 +24,7 @@ from ratslam.runs.runner import open_runner
 from ratslam.runs.saved_map import SavedMap, is_map
 from ratslam.runs.sensor import check_same_fov
 from ratslam.runs.source import open_observations
-from robot.recordings.formats import RecordingConfig
+from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError, tell
 
 NOT_LOCALISED = {

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,8 +128,8 @@ def merge_maps(
         report(f"adding {saved.path}")
         joins += _join(made, backend, tried, owner, report)
     renew_experiences(made)
-    session.map, views = made, MapViews(backend, made.kept_keyframes())
-    session.change_rows(made.kept_keyframes().count, sum(steps), views.remember)
+    session.map, kept = made, made.kept_keyframes()
+    session.change_rows(kept.count, sum(steps), partial(backend.remember, kept))
     piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
     found = MergeReport(
         tuple(saved.path for saved in maps),

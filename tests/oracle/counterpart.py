@@ -11,7 +11,8 @@ import numpy as np
 from ratslam.core.session import Session
 from ratslam.methods.classic import ClassicBackend
 from ratslam.methods.config import ClassicBackendConfig
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 from tests.oracle.compare import Report

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.experience_metric import ExmConfig
+from evaluation.metrics.registry import METRICS
 from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.classic.recording_config import CellsConfig
 from ratslam.runs.settings.includes import merge_includes
 from ratslam.runs.settings.packaged import PresetName, find_config
-from ratslam.runs.settings.plugin_settings import check_plugins, resolved_plugin
 from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
 from ratslam.runs.settings.strict_yaml import load, validate
-from ratslam.runs.settings.strict_yaml.document import Document
+from ratslam.runs.settings.strict_yaml.document import Document, KeyPath
 from robot.live.config import LiveConfig
-from robot.recordings.formats import RecordingConfig
+from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.create.session import CreateSimulationConfig
 from robot.simulation.head.session import SimulationConfig
 from robot.simulation.rat.session import RatSimulationConfig
 from robot.sources.registry import SOURCES
 from robot.touch_source import TOUCH
 from tactile.base.config import Settings
-from tactile.base.errors import InputError
-from tactile.base.plugins import PluginConfig
+from tactile.base.errors import InputError, InputErrors
+from tactile.base.plugins import PluginConfig, Registry, read_settings
 from tactile.frontend import TouchConfig
 
 
@@ -180,3 +181,59 @@ def _check_sources(document: Document, assignments: Sequence[str]) -> None:
             found = f"a setting of another source: this configuration has {' and '.join(sorted(own))}"
             cure = "a seed belongs to simulated sessions" if name.endswith(".seed") else ""
             raise InputError(f"--set {name}", found, "settings of that", cure)
+
+
+class Chosen(NamedTuple):
+    """A registered part that a configuration names: the path of its name, that of its settings, and where it
+    is registered."""
+
+    name: KeyPath
+    settings: KeyPath
+    registry: Registry[Any]
+    plugin: str
+
+
+def check_plugins(document: Document, config: RunConfig) -> None:
+    """Checks the names and settings of all registered parts in a configuration.
+
+    Raises:
+        InputErrors: all errors, each with file, line, column and key path.
+    """
+    errors: list[InputError] = []
+    for part in _chosen(config):
+        try:
+            entry = part.registry.get(part.plugin, document.at_value(part.name))
+            if part.plugin not in part.registry.builtin:
+                validate(document.section(part.settings), entry.config_class)
+            elif document.value(part.settings):
+                found = f"settings of a registered {part.registry.noun}, but '{part.plugin}' is one of ours"
+                raise InputError(document.at_key(part.settings), found)
+        except InputErrors as several:
+            errors += several.errors
+        except InputError as error:
+            errors.append(error)
+    if errors:
+        raise InputErrors(errors)
+
+
+def resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path) -> PluginConfig:
+    """The configuration of a part with the relative paths in its settings taken from `folder`."""
+    model = registry.get(config.plugin, "plugin").config_class
+    settings = read_settings(model, config.settings, "settings")
+    paths = {name: folder / value for name, value in settings if isinstance(value, Path)}
+    given: dict[str, Any] = json.loads(settings.model_copy(update=paths).model_dump_json(exclude_unset=True))
+    return config.model_copy(update={"settings": given})
+
+
+def _chosen(config: RunConfig) -> Iterator[Chosen]:
+    from ratslam.methods.registry import BACKENDS  # loads JAX
+
+    yield Chosen(("backend",), ("backend_settings",), BACKENDS, config.backend)
+    parts: list[tuple[KeyPath, Registry[Any], PluginConfig | None]] = [
+        (("source",), SOURCES, config.source),
+        (("touch", "frontend"), TOUCH, config.touch.frontend),
+    ]
+    parts += [(("score", "metrics", k), METRICS, one) for k, one in enumerate(config.score.metrics)]
+    for path, registry, part in parts:
+        if part is not None:
+            yield Chosen((*path, "plugin"), (*path, "settings"), registry, part.plugin)

@@ -27,22 +27,37 @@ import json
 import math
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.emulators.ur10.config import WallConfig
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.registers import Value
 
-if TYPE_CHECKING:
-    from robot.emulators.ur10.server import ControllerServer
-
 NAN: Value = (math.nan,) * 6
+
+
+class FaultyServer(Protocol):
+    """What faults need of a server: its controller, the owners of its inputs, its clients of states."""
+
+    controller: EmulatedController
+    claims: Any
+
+    @property
+    def rtde(self) -> list[tuple[Any, Any]]:
+        """Connections and sessions."""
+
+    def send(self, connection: Any, data: bytes) -> None:
+        """Sends data to a client."""
+
+    def close(self, connection: Any) -> None:
+        """Closes a client's connection."""
 
 
 class ControllerFaults:
     """Active faults and their effect on published states."""
 
-    def __init__(self, server: ControllerServer) -> None:
+    def __init__(self, server: FaultyServer) -> None:
         self._server = server
         self._controller = server.controller
         self._stalled_until = -math.inf

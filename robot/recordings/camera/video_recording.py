@@ -4,7 +4,6 @@ themselves."""
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +13,11 @@ from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
 from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
 from robot.sources.registry import Warn
 from tactile.base.errors import InputError
-
-if TYPE_CHECKING:
-    from robot.recordings.formats import RecordingConfig
 
 
 def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:

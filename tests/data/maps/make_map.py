@@ -18,7 +18,8 @@ import ratslam
 from ratslam.runs.map_archive import FORMAT
 from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.runs.settings.strict_yaml import parse, validate
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.description import describe
 
 FOLDER = Path(__file__).parent

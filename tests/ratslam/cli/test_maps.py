@@ -13,7 +13,8 @@ import ratslam
 from ratslam.cli import main
 from ratslam.mapping.map_solution import MapSolution, Obstacle
 from ratslam.runs.saved_map import read_map
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from tests.helpers.square_run import copy_square_run
 
 MAPS = Path(__file__).parents[2] / "data" / "maps"

@@ -22,7 +22,8 @@ from ratslam.runs.map_archive import digest_of
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.source import Sample
 from tactile.base.errors import InputError

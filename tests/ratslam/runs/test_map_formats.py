@@ -9,7 +9,8 @@ import pytest
 
 import ratslam
 from ratslam.runs.saved_map import FORMAT, read_map
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 
 ROOT = Path(__file__).parents[3]
 FILES = sorted((ROOT / "tests" / "data" / "maps").glob("*.npz"))

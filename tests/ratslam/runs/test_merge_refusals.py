@@ -17,7 +17,8 @@ from ratslam.runs.map_care import crop_saved, undo_sequence
 from ratslam.runs.map_settings import differing_settings
 from ratslam.runs.merge import check_mergeable, merge_maps
 from ratslam.runs.saved_map import read_map, write_map
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from tests.ratslam.runs.test_map_formats import FILES
 
 READINGS = Path(__file__).parents[2] / "golden" / "touch_circuits.mcap"

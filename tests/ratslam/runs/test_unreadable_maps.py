@@ -15,7 +15,8 @@ from ratslam.methods.finished_map import map_file
 from ratslam.runs.localise import recorded_alike
 from ratslam.runs.map_care import map_info, undo_sequence
 from ratslam.runs.saved_map import read_map
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError
 
 FILE = Path(__file__).parents[2] / "data" / "maps" / "ratslam-map-1.npz"

@@ -23,8 +23,9 @@ from robot.recordings.csv_config import (
     VelocityColumns,
     ViewColumns,
 )
-from robot.recordings.formats import FORMATS, RecordingConfig, open_recording
+from robot.recordings.formats import FORMATS, open_recording
 from robot.recordings.mcap_reader import record_source
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.input_files import read_bytes
 from robot.sources.registry import SOURCES, SourceEntry
 from robot.sources.source import Source

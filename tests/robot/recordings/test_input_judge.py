@@ -11,7 +11,7 @@ import pytest
 
 from robot.recordings.csv_config import CsvConfig, PoseColumns, TruthColumns, VelocityColumns
 from robot.recordings.csv_reader import read_csv_recording
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
 from robot.recordings.input_judge import (
     DEFAULT_LIMITS,
     RATIO,
@@ -24,6 +24,7 @@ from robot.recordings.input_judge import (
     unit_errors,
 )
 from robot.recordings.npz_trace import read_trace
+from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.stretch import Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses, from_velocities

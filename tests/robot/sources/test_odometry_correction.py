@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
 from robot.recordings.mcap_reader import record_source
+from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
 from robot.sources.odometry import from_motions

@@ -10,7 +10,8 @@ from ratslam.cli import main
 from ratslam.examples import dead_reckoning
 from ratslam.methods.registry import BACKENDS
 from ratslam.service.checks import backend, metric, source, touch
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.session import HeadSimulation, SimulationConfig
 from robot.sources.registry import SOURCES, SourceEntry
 from robot.touch_source import TOUCH, TouchEntry

@@ -12,7 +12,8 @@ import pytest
 from ratslam.service.checks.common import run_checks
 from ratslam.service.checks.source import CHECKS, GROUPS
 from ratslam.service.checks.source_trial import SourceTrial
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.whiskers import objects
 from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
 from robot.simulation.head.session import HeadSimulation, SimulationConfig

@@ -16,7 +16,8 @@ from robot.recordings.bags.description import (
     describe_bag,
 )
 from robot.recordings.bags.suggestion import suggested_topics
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from tests.helpers.ros_bags import (
     Entry,
     header,

@@ -16,7 +16,8 @@ from mcap.writer import IndexType, Writer
 from ratslam.__main__ import main
 from robot.recordings.bags.description import describe_bag
 from robot.recordings.bags.suggestion import suggested_topics
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import Source
 from tactile.base import bounded
 from tactile.base.errors import InputError

@@ -13,7 +13,8 @@ from PIL import Image
 
 from robot.recordings.bags.description import describe_bag
 from robot.recordings.bags.images import COMPRESSED, RAW, grey_image
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, stored_frames, write_video

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from ratslam.examples import taxel_array
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_poses, from_velocities
 from robot.touch_source import TOUCH, open_touch_source

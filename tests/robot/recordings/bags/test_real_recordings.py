@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import ratslam
-from robot.recordings.formats import RecordingConfig, open_recording
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from tests.helpers import real_bags
 from tests.helpers.ros_bags import write_bag

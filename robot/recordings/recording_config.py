@@ -1,0 +1,70 @@
+"""The settings of a recording of any format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from robot.recordings.bags.config import TopicsConfig
+from robot.recordings.camera.image_view import ImageViewConfig
+from robot.recordings.camera.video import VideoConfig
+from robot.recordings.camera.visual_odometry import VisualOdometryConfig
+from robot.recordings.csv_config import CsvConfig
+from robot.recordings.input_judge import DEFAULT_LIMITS, UnitLimits
+from robot.recordings.stretch import StretchConfig
+from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection
+
+
+class RecordingConfig(StretchConfig):
+    """A recording to run on."""
+
+    file: Path
+    """The recording: `.mcap` (of ratslam), `.npz` (reference trace), `.csv` (odometry), a bag (`.bag`,
+    `.db3`, `.mcap`, a folder) or a video (`.mp4`, `.avi`, `.mkv`, `.mov`, `.webm`)."""
+    table: CsvConfig = CsvConfig()
+    """Columns of a `.csv` recording, or of the odometry and truth beside a video."""
+    topics: TopicsConfig | None = None
+    """Topics of a bag."""
+    video: VideoConfig = VideoConfig()
+    """Times and odometry of a video."""
+    image: ImageViewConfig = ImageViewConfig()
+    """How images become views."""
+    visual_odometry: VisualOdometryConfig | None = None
+    """Odometry from the images of a recording that has no other."""
+    odometry: OdometryCorrection = UNCORRECTED
+    """Systematic errors to take out of the odometry, of any format; the unit check comes first."""
+    limits: UnitLimits = DEFAULT_LIMITS
+    """Limits of the unit check, beyond which a recording is refused."""
+
+    def resolved(self, folder: Path) -> RecordingConfig:
+        """A copy with absolute paths; relative ones start at `folder`.
+
+        One `*` in the file name of a part of the table or of the video stands for the beginning of the
+        recording's file name: beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
+        """
+        recording = folder / self.file
+        parts = {
+            key: part.model_copy(update={"file": _companion(recording, folder, part.file)})
+            for key in ("views", "contacts", "labels", "pairs", "truth")
+            if (part := getattr(self.table, key)) is not None and part.file is not None
+        }
+        beside = {
+            key: _companion(recording, folder, file)
+            for key in ("stamps", "odometry")
+            if (file := getattr(self.video, key)) is not None
+        }
+        table, video = self.table.model_copy(update=parts), self.video.model_copy(update=beside)
+        return self.model_copy(update={"file": recording, "table": table, "video": video})
+
+
+def _companion(recording: Path, folder: Path, file: Path) -> Path:
+    """The path of a part of the table: in `folder`, or beside the recording if its name has a `*`."""
+    if file.name.count("*") != 1:
+        return folder / file
+    before, after = file.name.split("*")
+    beside = recording.parent / file.parent
+    found = [
+        path
+        for path in beside.glob(file.name)
+        if recording.name.startswith(path.name[len(before) : -len(after) or None])
+    ]
+    return max(found, key=lambda path: len(path.name), default=beside / file.name)
