@@ -249,7 +249,7 @@ def _cells(arguments: argparse.Namespace) -> int:
     return 0
 
 
-BACKENDS, MOTIONS = ("recall", "classic"), ("random", "drive")
+BACKENDS = ("recall", "classic")
 SESSION_FILES = ("touch.csv", "buildings.csv")
 """Files of the sessions of tables, which may be in one folder."""
 
@@ -312,16 +312,6 @@ def add_tables(tables: Commands) -> None:
     add_count(batches, "--sessions", 256, "sessions in one call")
     add_count(batches, "--steps", 1600, "steps of a session")
     add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
-    precision = add("precision", _precision_lines, "float32 against float64", "--seeds 2 --backends recall")
-    add_count(precision, "--seeds", 20, "sessions per method")
-    precision.add_argument("--backends", nargs="+", choices=BACKENDS, default=BACKENDS, help="the methods")
-    precision.add_argument("-o", "--output", type=Path, metavar="DIR", help="new folder for BACKEND.npz")
-    add_workers(precision, 1)
-    chaos = add("chaos", _chaos_lines, "divergence of two almost equal pose-cell networks", "--steps 1000")
-    add_count(chaos, "--steps", 100_000, "steps per walk")
-    add_count(chaos, "--walks", 3, "walks per row")
-    chaos.add_argument("--pairs", nargs="+", metavar="PAIR", help="only these pairs of networks")
-    chaos.add_argument("--motions", nargs="+", choices=MOTIONS, default=MOTIONS, help="only these motions")
 
 
 def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
@@ -427,17 +417,3 @@ def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
         from evaluation.papers.tables.batches import batch_table
 
         yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
-
-
-def _precision_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.precision import precision_table
-
-    return precision_table(arguments.backends, arguments.seeds, arguments.workers, arguments.output)
-
-
-def _chaos_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.chaos import PAIRS, chaos_table
-    from evaluation.papers.tables.markdown import select_rows
-
-    pairs = select_rows(arguments.pairs, PAIRS, tuple(PAIRS))
-    return chaos_table(pairs, arguments.motions, arguments.steps, arguments.walks)

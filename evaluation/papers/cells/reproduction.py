@@ -15,7 +15,6 @@ NAMES: tuple[str, ...] = (
     "rotation",
     "boxes",
     "torus",
-    "recording_cost",
     "analysis_cost",
     "agreement",
     "shuffles",
@@ -27,7 +26,7 @@ NAMES: tuple[str, ...] = (
     "lesions",
     "scale",
 )
-"""The figures and tables. The first ten are modules of this room and on `backend: classic`, the others on
+"""The figures and tables. The first nine are modules of this room and on `backend: classic`, the others on
 `backend: recall`."""
 MODULES = {
     "posterior": "belief_rows",
