@@ -8,62 +8,62 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from evaluation.metrics.metric import Finding, Metric
-    from evaluation.metrics.registry import METRICS, MetricEntry
+    from evaluation.metrics.metric_registry import METRICS, MetricEntry
     from ratslam.core.backend import Backend, Map
+    from ratslam.core.estimates import Action, Estimate
     from ratslam.core.path_map import PathMap
     from ratslam.core.session import Session
-    from ratslam.core.types import Action, Estimate
-    from ratslam.methods.registry import BACKENDS, BackendEntry, Sensors
+    from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
     from ratslam.runs.estimate import Health, PoseEstimate
+    from ratslam.runs.open_source import open_source
     from ratslam.runs.result import Result, run
     from ratslam.runs.settings.run_config import RunConfig, load_config
     from ratslam.runs.slam import Slam
-    from ratslam.runs.source import open_source
     from robot.sources.description import SourceDescription
-    from robot.sources.registry import SOURCES, SourceEntry
     from robot.sources.source import Sample, Source
     from robot.sources.source_info import SourceInfo
+    from robot.sources.source_registry import SOURCES, SourceEntry
     from robot.touch_source import TOUCH, TouchEntry
-    from tactile.base.config import Settings
     from tactile.base.errors import InputError
+    from tactile.base.settings import Settings
     from tactile.base.types import Observation, Odometry, observation
 
 RATSLAM_PACKAGE = "ratslam"  # see tactile/__init__.py
 
 _MODULES = {
-    "Action": "ratslam.core.types",
-    "BACKENDS": "ratslam.methods.registry",
+    "Action": "ratslam.core.estimates",
+    "BACKENDS": "ratslam.methods.method_registry",
     "Backend": "ratslam.core.backend",
-    "BackendEntry": "ratslam.methods.registry",
-    "Estimate": "ratslam.core.types",
+    "BackendEntry": "ratslam.methods.method_registry",
+    "Estimate": "ratslam.core.estimates",
     "Finding": "evaluation.metrics.metric",
     "Health": "ratslam.runs.estimate",
     "InputError": "tactile.base.errors",
-    "METRICS": "evaluation.metrics.registry",
+    "METRICS": "evaluation.metrics.metric_registry",
     "Map": "ratslam.core.backend",
     "Metric": "evaluation.metrics.metric",
-    "MetricEntry": "evaluation.metrics.registry",
+    "MetricEntry": "evaluation.metrics.metric_registry",
     "Observation": "tactile.base.types",
     "Odometry": "tactile.base.types",
     "PathMap": "ratslam.core.path_map",
     "PoseEstimate": "ratslam.runs.estimate",
     "Result": "ratslam.runs.result",
     "RunConfig": "ratslam.runs.settings.run_config",
-    "SOURCES": "robot.sources.registry",
+    "SOURCES": "robot.sources.source_registry",
     "Sample": "robot.sources.source",
-    "Sensors": "ratslam.methods.registry",
+    "Sensors": "ratslam.methods.method_registry",
     "Session": "ratslam.core.session",
-    "Settings": "tactile.base.config",
+    "Settings": "tactile.base.settings",
     "Slam": "ratslam.runs.slam",
     "Source": "robot.sources.source",
     "SourceDescription": "robot.sources.description",
-    "SourceEntry": "robot.sources.registry",
+    "SourceEntry": "robot.sources.source_registry",
     "SourceInfo": "robot.sources.source_info",
     "TOUCH": "robot.touch_source",
     "TouchEntry": "robot.touch_source",
     "load_config": "ratslam.runs.settings.run_config",
     "observation": "tactile.base.types",
-    "open_source": "ratslam.runs.source",
+    "open_source": "ratslam.runs.open_source",
     "run": "ratslam.runs.result",
 }
 __all__ = [

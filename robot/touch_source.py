@@ -7,12 +7,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from robot.simulation.create.session import CreateSimulationConfig, train_strain_templates
+from robot.simulation.create.simulated_session import CreateSimulationConfig, train_strain_templates
 from robot.sources.source import ClosedSource, Sample, Source
 from robot.sources.source_info import SourceInfo
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.plugins import Registry, read_settings
+from tactile.base.settings import Settings
 from tactile.base.types import Observation
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig

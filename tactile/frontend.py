@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
+from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.features.calibration import Calibration
-from tactile.features.contact import ContactConfig, detect_contacts
+from tactile.features.contact_threshold import ContactConfig, detect_contacts
 from tactile.features.rest_baseline import (
     RestBaseline,
     RestBaselineConfig,

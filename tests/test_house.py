@@ -21,9 +21,9 @@ ROOMS = sorted(
 )
 LONGEST_FILE, LONGEST_FUNCTION, LONGEST_ROOT_README = 600, 80, 1500
 MOST = {
-    "rooms": 33, "folders": 64, "files": 648, "product lines": 89_700, "code lines": 60_100,
-    "public names": 2_800, "all names": 4_115, "records": 557, "short and called once": 430,
-    "twin names": 32, "module circles": 0, "room circles": 0, "upward arrows": 0,
+    "rooms": 33, "folders": 64, "files": 645, "product lines": 89_100, "code lines": 59_600,
+    "public names": 2_780, "all names": 4_085, "records": 554, "short and called once": 428,
+    "twin names": 0, "module circles": 0, "room circles": 0, "upward arrows": 0,
 }  # fmt: skip
 """Largest number of each figure of `tests.house_figures`; lowered with every step towards its goals."""
 

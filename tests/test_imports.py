@@ -19,10 +19,10 @@ PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
 VIOLATIONS = {
     "packages: ratslam above robot, tactile below all": [
         ("tactile.planted", "robot"),
-        ("robot.planted", "ratslam.core.types"),
+        ("robot.planted", "ratslam.core.estimates"),
     ],
     "evaluation knows tactile alone, but for studies and papers": [
-        ("evaluation.metrics.trajectory", "ratslam.core.types"),
+        ("evaluation.metrics.trajectory", "ratslam.core.estimates"),
         ("evaluation.plots.style", "robot"),
     ],
     "only entry points know studies and papers": [
@@ -37,7 +37,7 @@ VIOLATIONS = {
     "rooms of robot": [
         ("robot.drivers.outcome", "robot.emulators"),
         ("robot.recordings.schemas", "robot.live"),
-        ("robot.simulation.head.session", "robot.touch_source"),
+        ("robot.simulation.head.simulated_session", "robot.touch_source"),
     ],
     "rooms of evaluation": [
         ("evaluation.metrics.trajectory", "evaluation.plots.style"),
@@ -48,12 +48,12 @@ VIOLATIONS = {
         ("ratslam.classic.pose_cells", "ratslam.grid.config"),
         ("ratslam.recall.filter", "ratslam.mapping"),
         ("ratslam.runs.run", "ratslam.service.checks"),
-        ("ratslam.service.checks.backend", "ratslam.live"),
-        ("ratslam.planted", "ratslam.core.types"),
+        ("ratslam.service.checks.backend_checks", "ratslam.live"),
+        ("ratslam.planted", "ratslam.core.estimates"),
     ],
     "rooms of evaluation.papers": [
-        ("evaluation.papers.tables.touch", "evaluation.papers.maps"),
-        ("evaluation.papers.planted", "ratslam.core.types"),
+        ("evaluation.papers.tables.touch_table", "evaluation.papers.maps"),
+        ("evaluation.papers.planted", "ratslam.core.estimates"),
     ],
     "core, methods and backends do not know robot and evaluation": [
         ("ratslam.core.session", "robot"),

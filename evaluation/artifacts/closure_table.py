@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.run_directory import first_step
+from evaluation.artifacts.run_reader import first_step
 from tactile.base.bounded import read_rows
 
 ACCEPTED = "accepted"

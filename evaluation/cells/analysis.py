@@ -29,8 +29,8 @@ from evaluation.cells.information import information, information_rate, mean_rat
 from evaluation.cells.rate_map import MapSettings, arena_edges, bin_activity, rate_maps, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
 from tactile.base.atomic_write import write_atomically
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 
 class AnalysisSettings(Settings):

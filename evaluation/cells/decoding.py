@@ -9,9 +9,9 @@ from pydantic import Field
 
 from evaluation.cells.rate_map import BoxSamples, arena_edges, box_samples, rate_maps, sum_samples
 from evaluation.cells.recording import CellRecording
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 
 class DecodingSettings(Settings):

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 from scipy.ndimage import label
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 
 class FieldSettings(Settings):

@@ -17,8 +17,8 @@ from pydantic import Field
 from scipy.sparse import csr_array
 
 from evaluation.cells.recording import BinnedSums
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 
 class MapSettings(Settings):

@@ -20,7 +20,7 @@ from evaluation.metrics.occupancy_grid import (
     TouchableSurface,
     truth_occupancy,
 )
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 CellMask = Literal["grid", "arena"]
 """Cells of the mean: all, or those of the arena and its wall."""

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 Direction = Literal["low", "high"] | None
 """Direction of better values; None if values have no order."""

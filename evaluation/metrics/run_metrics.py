@@ -15,8 +15,8 @@ from evaluation.metrics.energy_metric import (
     relation_errors,
     successive_pairs,
 )
+from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, experience_metric
 from evaluation.metrics.experience_log import change_rows
-from evaluation.metrics.experience_metric import EXM_MODES, ExmConfig, base_end, experience_metric
 from evaluation.metrics.map_pieces import ate_within_pieces, energy_within_pieces, tie_jump, unjoined_share
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, truth_rows

@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import Relations
+from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.experience_log import ExperienceLog
-from evaluation.metrics.experience_metric import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
 from evaluation.metrics.run_metrics import (
@@ -21,8 +21,8 @@ from evaluation.metrics.run_metrics import (
     path_length,
     run_data,
 )
-from tactile.base.config import Settings
 from tactile.base.errors import printable
+from tactile.base.settings import Settings
 
 REGISTERED = "Registered metrics"
 """Heading of the metrics that are not ours."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.experience_metric import ExmConfig, ExperienceMetric, experience_metric
+from evaluation.metrics.exm import ExmConfig, ExperienceMetric, experience_metric
 from tactile.base.errors import InputError
 
 FALSE_CLOSURE_DISTANCE = 0.1

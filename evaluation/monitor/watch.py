@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.artifacts.manifest import RUNNING
-from evaluation.artifacts.run_directory import read_walls
+from evaluation.artifacts.run_reader import read_walls
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import align
-from evaluation.monitor.progress import WATCH_IMAGE, RunMonitor, RunProgress, step_count
+from evaluation.monitor.run_progress import WATCH_IMAGE, RunMonitor, RunProgress, step_count
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
 from evaluation.plots.style import BLUE, GREY, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from evaluation.papers.cells.reproduction import NAMES as CELL_ROWS
-from evaluation.papers.maps.registry import ROWS as MAP_ROWS
+from evaluation.papers.maps.map_rows import ROWS as MAP_ROWS
 from evaluation.papers.whiskers.reproduction import NAMES as REAL_ROWS
 from ratslam.cli.common import (
     INTERRUPTED,
@@ -344,14 +344,14 @@ def _print_table(arguments: argparse.Namespace) -> int:
 def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
     from evaluation.papers.tables.comparison import Files
     from evaluation.papers.tables.markdown import select_rows
-    from evaluation.papers.tables.touch import DEFAULT_ROWS, ROWS, touch_table
+    from evaluation.papers.tables.touch_table import DEFAULT_ROWS, ROWS, touch_table
 
     rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
     return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
 
 
 def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.grid import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
+    from evaluation.papers.tables.grid_table import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
     from evaluation.papers.tables.markdown import select_rows
 
     if arguments.rows or arguments.worlds:

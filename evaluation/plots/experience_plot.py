@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.metrics.experience_metric import ExperienceMetric, experience_metric
+from evaluation.metrics.exm import ExperienceMetric, experience_metric
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style

@@ -12,11 +12,11 @@ import numpy as np
 from evaluation.artifacts import change_table
 from evaluation.artifacts.closure_table import read_closures
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
-from evaluation.artifacts.run_directory import read_run, read_scorecard, read_walls
+from evaluation.artifacts.run_reader import read_run, read_scorecard, read_walls
 from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.cells import recording
-from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.map_pieces import arrange_pieces
+from evaluation.metrics.occupancy_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.change_plot import draw_changes

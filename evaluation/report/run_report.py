@@ -12,16 +12,16 @@ from evaluation.artifacts.closure_table import ClosureTable, read_closure_table
 from evaluation.artifacts.closure_views import ClosureViews, read_closure_views
 from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
 from evaluation.artifacts.manifest import RUNNING, Manifest, read_manifest
-from evaluation.artifacts.run_directory import (
+from evaluation.artifacts.run_reader import (
     check_run_directory,
     read_column,
     read_run,
     read_scorecard,
     read_walls,
 )
-from evaluation.metrics.grid_score import GridScore
 from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.occupancy_score import GridScore
 from evaluation.metrics.run_arrays import UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum

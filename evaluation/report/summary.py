@@ -6,7 +6,7 @@ from pathlib import Path
 
 from evaluation.artifacts.closure_table import count_closures
 from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics.run_metrics import path_length
 from evaluation.metrics.scorecard import Scorecard, render_error, render_health, render_warnings
 

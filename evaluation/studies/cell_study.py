@@ -23,9 +23,9 @@ from ratslam.runs.settings.run_config import load_config
 from ratslam.runs.settings.strict_yaml import Document, override, validate
 from ratslam.runs.settings.strict_yaml.document import Place
 from tactile.base.atomic_write import flush_to_disk, write_atomically
-from tactile.base.config import Settings
 from tactile.base.errors import os_errors_of
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 FOLDER = "sets"
 """Name of the folder of a study's chunks."""

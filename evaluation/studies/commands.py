@@ -109,7 +109,7 @@ class Progress:
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
-        from evaluation.studies.summary import label
+        from evaluation.studies.study_summary import label
 
         for record in self.failed:
             copy = f", copy {record.copy_number}" if record.copy_number else ""
@@ -138,9 +138,9 @@ def _study(arguments: argparse.Namespace) -> int:
     if arguments.preset == CELLS:
         return _cells(arguments)
     from evaluation.studies.metrics import find_error
+    from evaluation.studies.parameter_search import search_plan
     from evaluation.studies.presets import preset_study
     from evaluation.studies.records import RunLog
-    from evaluation.studies.search import search_plan
     from evaluation.studies.study import read_study
 
     remarks: list[str] = []
@@ -167,7 +167,7 @@ def _folder(arguments: argparse.Namespace, name: str, mark: str) -> Path:
 
 def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
     from evaluation.studies.executor import Executor
-    from evaluation.studies.report import make_report
+    from evaluation.studies.study_report import make_report
     from evaluation.studies.study_runner import measure_jobs, run_jobs
 
     jobs = study.jobs
@@ -228,7 +228,7 @@ def _cells(arguments: argparse.Namespace) -> int:
 
 
 def _save(report: Any, records: Path) -> None:
-    from evaluation.studies.report import render, save_report
+    from evaluation.studies.study_report import render, save_report
 
     paths = save_report(report, records.parent)
     print(render(report))
@@ -237,8 +237,8 @@ def _save(report: Any, records: Path) -> None:
 
 def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
     from evaluation.studies.executor import Executor
-    from evaluation.studies.report import make_report
-    from evaluation.studies.search import search
+    from evaluation.studies.parameter_search import search
+    from evaluation.studies.study_report import make_report
 
     plan = study.plan.tune
     runs = len(study.plan.every_seed()) * max(study.plan.copies, 1)
@@ -268,8 +268,8 @@ def _size(arguments: argparse.Namespace) -> int:
     from evaluation.studies.scene_statistics import scene_of
     from evaluation.studies.tiers import with_tier
     from evaluation.studies.trial_runs import render_trial_runs, try_settings
+    from ratslam.runs.open_source import open_source
     from ratslam.runs.settings.completion import complete
-    from ratslam.runs.source import open_source
 
     path, config = arguments.config, read_config(arguments)
     with open_source(with_tier(config, "kinematic")) as source:

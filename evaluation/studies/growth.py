@@ -16,12 +16,12 @@ from evaluation.studies.study import with_settings
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, override, validate
 from ratslam.runs.settings.strict_yaml.document import Place
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze_routes import winding_loop
 from robot.world.scene import PAPER_CIRCUITS, PathConfig
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 SIDE = 64
 """Columns and rows of the maze of new ground, cells: the largest that can be simulated."""

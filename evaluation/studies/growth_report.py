@@ -17,7 +17,7 @@ from evaluation.plots.growth_plot import GrowthCurve, draw_growth
 from evaluation.studies.executor import Executor
 from evaluation.studies.growth import GrowthStudy, GrowthTask
 from evaluation.studies.growth_session import GrowthRow, measure_growth
-from evaluation.studies.report import (
+from evaluation.studies.study_report import (
     describe_machines,
     find_disturbances,
     format_number,

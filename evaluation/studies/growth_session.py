@@ -17,11 +17,11 @@ from evaluation.studies.growth import Ground, GrowthTask
 from evaluation.studies.machine import Machine, compilations, machine
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
-from ratslam.runs.source import open_observations, read_observations
+from ratslam.runs.open_source import open_observations, read_observations
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import repeat_course
-from tactile.base.config import Settings
 from tactile.base.se2 import integrate
+from tactile.base.settings import Settings
 from tactile.base.types import Observation
 
 SEED = 0

@@ -15,7 +15,7 @@ from time import perf_counter
 from numba.core import event as events
 
 from evaluation.metrics.resources import processor_name
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")
 COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's event of a compiled or fetched kernel

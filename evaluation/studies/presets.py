@@ -13,7 +13,7 @@ from evaluation.studies.tiers import shortened
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, override, validate
 from ratslam.runs.settings.strict_yaml.document import Place
-from robot.simulation.head.session import choose_tier
+from robot.simulation.head.simulated_session import choose_tier
 from tactile.base.errors import InputError
 
 PARTS: dict[str, dict[str, Any]] = {

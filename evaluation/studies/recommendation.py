@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from evaluation.studies.report import render_table
 from evaluation.studies.scene_statistics import Scene
-from evaluation.studies.summary import plain
+from evaluation.studies.study_report import render_table
+from evaluation.studies.study_summary import plain
 from ratslam.classic.levels import SETTLED, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, network_of
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
@@ -20,7 +20,7 @@ from ratslam.methods.grid import LIVE_SIDE
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import open_path
 from ratslam.runs.settings.strict_yaml.dumper import Dumper
-from robot.simulation.head.session import choose_tier
+from robot.simulation.head.simulated_session import choose_tier
 
 PARTS = 4  # largest number of sub-steps of all but a few cycles; with more, cells are too fine for the speed
 SLOW = 0.05  # smallest motion of a usual cycle, cells; with less, cells are too coarse for the robot's speed

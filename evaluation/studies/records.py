@@ -11,8 +11,8 @@ from pydantic import Field
 from evaluation.metrics.metric import Quantity
 from evaluation.studies.machine import Machine
 from evaluation.studies.study import Job, run_key
-from tactile.base.config import Settings
 from tactile.base.errors import os_errors_of
+from tactile.base.settings import Settings
 
 FILE = "runs.jsonl"  # name of the file of records in a study's directory
 

@@ -15,8 +15,8 @@ import numpy as np
 from evaluation.artifacts.grid_npz import read_grid
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import MAIN_CONVENTION
-from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.metric import Finding, Quantity
+from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.resources import peak_memory, reset_peak_memory, watch_load
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import anchored_errors, recognition_error
@@ -30,7 +30,7 @@ from ratslam.core.session import CHUNK, Session
 from ratslam.runs.artifacts import true_grid
 from ratslam.runs.build_session import build_session
 from ratslam.runs.online_error import OnlineErrorLog
-from ratslam.runs.source import open_observations, read_observations
+from ratslam.runs.open_source import open_observations, read_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.perturbation import perturb
 from robot.sources.source import Source
@@ -92,7 +92,7 @@ def _play(job: Job) -> dict[str, Any]:
 
 
 def _take_steps(session: Session, source: Source, pace: str, watch: Stopwatch) -> tuple[RunArrays, float]:
-    """The session as arrays, as `evaluation.artifacts.run_directory.read_run` reads one from its files, and
+    """The session as arrays, as `evaluation.artifacts.run_reader.read_run` reads one from its files, and
     the share of steps with a lost pose."""
     time, motion, true, estimates = [], [], [], []
     rows, present = read_observations(source), OnlineErrorLog()

@@ -10,9 +10,9 @@ import numpy as np
 
 from evaluation.studies.study import with_settings
 from evaluation.studies.tiers import shortened
+from ratslam.runs.open_source import open_source
 from ratslam.runs.run import open_recorder
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, ConfigDict, Field, NonNegativeInt, field_va
 from evaluation.metrics.metric import Direction
 from evaluation.studies.metrics import COLUMNS, METRICS
 from ratslam.mapping.config import FULL, Ablation
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 
 def _known(name: str) -> str:

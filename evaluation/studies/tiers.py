@@ -11,9 +11,9 @@ from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.view_separation import image_difference
 from evaluation.studies.metrics import quantity
 from evaluation.studies.study import with_settings
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.errors import InputError
 

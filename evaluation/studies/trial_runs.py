@@ -10,13 +10,13 @@ from typing import Any
 from evaluation.metrics.resources import one_core
 from evaluation.studies.recommendation import FEWEST, Recommendation
 from evaluation.studies.records import RunRecord
-from evaluation.studies.report import make_report, render
 from evaluation.studies.run_job import run_job
 from evaluation.studies.scene_statistics import short_session
 from evaluation.studies.schema import StudyPlan
 from evaluation.studies.study import Job, with_settings
+from evaluation.studies.study_report import make_report, render
+from ratslam.runs.open_source import open_source
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_source
 from tactile.base.errors import InputError
 
 COARSER = 1.5  # factor on the size of a cell in a cheaper step

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ratslam.classic import window
+from ratslam.classic import excitation_inhibition as window
 from ratslam.classic.level_step import StepInput, StepResult, equal_sums, step_at
 from ratslam.classic.levels import Activity, Block, Level, block_at, extent, total, transfer
 from tactile.base.types import Array

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import pose_cells, window
+from ratslam.classic import pose_cells
+from ratslam.classic.excitation_inhibition import with_kernels
 from ratslam.classic.levels import window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.core.types import Estimate
+from ratslam.core.estimates import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
 BLOCK = 8
@@ -84,7 +85,7 @@ def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: 
 
     def simulate(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(level._replace(window=window.with_kernels(level.window, *kernels)) for level in used)
+        tuned = tuple(level._replace(window=with_kernels(level.window, *kernels)) for level in used)
 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import pose_cells, window
+from ratslam.classic import pose_cells
 from ratslam.classic.batch import BLOCK, Network
 from ratslam.classic.cell_probe import activity_of
+from ratslam.classic.excitation_inhibition import with_kernels
 from ratslam.classic.levels import Level, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, rings
 from ratslam.classic.pose_cells import PoseCells
@@ -207,7 +208,7 @@ def _walk(
 ) -> tuple[_Walker, CellTrack]:
     dtype, network = rows.motion.dtype, own.network
     kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-    tuned = tuple(level._replace(window=window.with_kernels(level.window, *kernels)) for level in levels)
+    tuned = tuple(level._replace(window=with_kernels(level.window, *kernels)) for level in levels)
     ring = rings(config, dtype)
 
     def step(walker: _Walker, row: CellCourse) -> tuple[_Walker, CellTrack]:

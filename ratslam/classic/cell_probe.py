@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import window
+from ratslam.classic import excitation_inhibition as window
 from ratslam.classic.levels import Activity, Block, Level
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

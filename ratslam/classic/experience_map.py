@@ -17,13 +17,13 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from ratslam.classic.relaxation import relax
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.estimates import Action, Estimate
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import Action, Estimate
 from ratslam.mapping.edges import Edges
 from ratslam.mapping.io import write_g2o, write_json
 from ratslam.mapping.least_squares import GrowingGraph, geman_mcclure, huber, least_squares, no_kernel
-from tactile.base.config import Settings
 from tactile.base.se2 import between, compose, inverse
+from tactile.base.settings import Settings
 from tactile.base.types import Observation
 
 if TYPE_CHECKING:

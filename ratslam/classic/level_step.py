@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ratslam.classic import window
+from ratslam.classic import excitation_inhibition as window
+from ratslam.classic.excitation_inhibition import Window
 from ratslam.classic.levels import Block, Level, extent
-from ratslam.classic.window import Window
 from tactile.base.types import Array
 
 SUM_TOLERANCE = 64

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import window
+from ratslam.classic import excitation_inhibition as window
+from ratslam.classic.excitation_inhibition import Window
 from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.classic.window import Window
-from ratslam.core.types import PoseCellActivity
+from ratslam.core.estimates import PoseCellActivity
 from tactile.base.types import Array
 
 SETTLED = 10

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import PositiveFloat
 
-from ratslam.core.types import Action
-from tactile.base.config import Settings
+from ratslam.core.estimates import Action
+from tactile.base.settings import Settings
 from tactile.base.types import Array
 
 TIE = 1e-9

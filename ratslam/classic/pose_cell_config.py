@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
 
 from ratslam.network.config import PoseCellConfig
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 
 def _odd(width: int) -> int:

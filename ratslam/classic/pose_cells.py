@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.classic.adaptive_window import step_at_smallest_level
+from ratslam.classic.excitation_inhibition import TIE, deposit_gain, ring_difference, rotate
 from ratslam.classic.level_step import StepInput
 from ratslam.classic.levels import Activity, Level, point_activity, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
-from ratslam.classic.window import TIE, deposit_gain, ring_difference, rotate
 from tactile.base.types import Array, Odometry
 
 LARGEST_SUBSTEP = 0.75

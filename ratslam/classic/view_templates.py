@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.types import Array, Observation
 
 TIE = 1e-9

@@ -18,7 +18,7 @@ from ratslam.cli import (
     check,
     doctor,
     files,
-    fit,
+    fitting,
     live,
     localise,
     look,
@@ -32,7 +32,7 @@ from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
 from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError, printable, tell
 
-MODULES = (run, live, localise, merge, maps, path, look, doctor, fit, files, check, tools)
+MODULES = (run, live, localise, merge, maps, path, look, doctor, fitting, files, check, tools)
 """The commands that are always there, in the order of the help."""
 INSTALLED = "ratslam.commands"
 """Group of the entry points of further commands: functions that take `Commands` and register theirs."""

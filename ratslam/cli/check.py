@@ -10,7 +10,7 @@ from ratslam.cli.common import Commands, positive_integer, prepare_jax
 from tactile.base.errors import tell
 
 if TYPE_CHECKING:
-    from ratslam.service.checks.common import Result
+    from ratslam.service.checks.check_results import Result
 
 FAILED = 1
 """Exit code if a check failed."""
@@ -48,7 +48,7 @@ def add_commands(commands: Commands) -> None:
 
 def _backend(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.service.checks.backend import check_backend
+    from ratslam.service.checks.backend_checks import check_backend
 
     tell("the checks take a minute or two, and several on a busy machine")
 
@@ -56,7 +56,7 @@ def _backend(arguments: argparse.Namespace) -> int:
 
 
 def _source(arguments: argparse.Namespace) -> int:
-    from ratslam.service.checks.source import check_source
+    from ratslam.service.checks.source_checks import check_source
     from ratslam.service.checks.source_trial import SAMPLES
 
     most = arguments.samples or SAMPLES
@@ -64,13 +64,13 @@ def _source(arguments: argparse.Namespace) -> int:
 
 
 def _touch(arguments: argparse.Namespace) -> int:
-    from ratslam.service.checks.touch import check_touch
+    from ratslam.service.checks.touch_checks import check_touch
 
     return _report(arguments, check_touch(arguments.name, arguments.set, arguments.source))
 
 
 def _metric(arguments: argparse.Namespace) -> int:
-    from ratslam.service.checks.metric import check_metric
+    from ratslam.service.checks.metric_checks import check_metric
 
     return _report(arguments, check_metric(arguments.name, arguments.set))
 

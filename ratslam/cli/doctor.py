@@ -70,7 +70,7 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
 
     like = None
     if arguments.like is not None:
-        from ratslam.methods.registry import LOCALISING
+        from ratslam.methods.method_registry import LOCALISING
         from ratslam.runs.saved_map import read_map
 
         like = read_map(arguments.like)

@@ -30,7 +30,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ratslam.service.export.formats import export_run
+    from ratslam.service.export.export_formats import export_run
     from ratslam.service.rats.spikes import SpikeConfig
 
     export_run(

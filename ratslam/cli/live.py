@@ -17,7 +17,7 @@ from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
     from ratslam.runs.settings.run_config import RunConfig
-    from robot.live.config import LiveConfig
+    from robot.live.live_config import LiveConfig
 
 
 def add_commands(commands: Commands) -> None:
@@ -61,7 +61,7 @@ def add_commands(commands: Commands) -> None:
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.summary import summarise
-    from ratslam.live.session import run_live_session
+    from ratslam.live.live_session import run_live_session
     from ratslam.runs.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
 
@@ -87,7 +87,11 @@ def _live(arguments: argparse.Namespace) -> int:
 
 def _emulate(arguments: argparse.Namespace) -> int:
     config, session = _read_live_config(arguments, head_address=None)
-    from robot.live.emulator_config import arm_emulator_config, create_emulator_config, head_emulator_config
+    from robot.live.live_emulator_config import (
+        arm_emulator_config,
+        create_emulator_config,
+        head_emulator_config,
+    )
 
     head, opened = config.touch.head, {"open_to_network": arguments.open_to_network}
     if (arguments.device == "create") != (session.create is not None):

@@ -69,7 +69,7 @@ def add_commands(commands: Commands) -> None:
 
 def _watch(arguments: argparse.Namespace) -> int:
     from evaluation.artifacts.manifest import RUNNING
-    from evaluation.monitor.progress import KILLED, WATCH_IMAGE
+    from evaluation.monitor.run_progress import KILLED, WATCH_IMAGE
     from evaluation.monitor.watch import watch_run
 
     for name in ("every", "patience"):
@@ -90,11 +90,11 @@ def _watch(arguments: argparse.Namespace) -> int:
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from evaluation.artifacts.run_directory import read_run
+    from evaluation.artifacts.run_reader import read_run
     from evaluation.metrics.energy_metric import read_relations
+    from evaluation.metrics.exm import ExmConfig
     from evaluation.metrics.experience_log import read_experience_log
-    from evaluation.metrics.experience_metric import ExmConfig
-    from evaluation.metrics.registry import build_metrics
+    from evaluation.metrics.metric_registry import build_metrics
     from evaluation.metrics.scorecard import score_log, score_run
     from tactile.base.plugins import PluginConfig
 
@@ -115,7 +115,7 @@ def _score(arguments: argparse.Namespace) -> int:
 
 def render_scores(path: Path, card: Scorecard) -> str:
     """All figures as text: the table, that of the grid in a run directory with one, warnings and health."""
-    from evaluation.metrics.grid_score import GridScore, render_grid_scores
+    from evaluation.metrics.occupancy_score import GridScore, render_grid_scores
     from evaluation.metrics.scorecard import render_health, render_scorecard, render_warnings
     from tactile.base.bounded import read_json
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from ratslam.core.types import Estimate, GridDrawing, PoseCellActivity
+from ratslam.core.estimates import Estimate, GridDrawing, PoseCellActivity
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
@@ -25,7 +25,7 @@ State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
 Evidence = Any
 """The backend's own record of one step: a NamedTuple of arrays of fixed shapes with at least `outcome`.
-Fields annotated `ratslam.core.types.Scalar` are columns of `steps.csv`."""
+Fields annotated `ratslam.core.estimates.Scalar` are columns of `steps.csv`."""
 NO_CLOSURE = "no loop closure was accepted, the map is the odometry"
 """Why a map of a method that closes loops is not judged."""
 Feedback = Any

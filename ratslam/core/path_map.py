@@ -9,8 +9,8 @@ import numpy as np
 
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.estimates import Estimate
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import Estimate
 from tactile.base.types import Observation
 
 

@@ -20,9 +20,9 @@ from jax import lax
 
 from ratslam.core.backend import Backend, Evidence, Map, State
 from ratslam.core.checkpoint import with_prefix
+from ratslam.core.estimates import Estimate
 from ratslam.core.packing import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.precision import Precision, check_precision
-from ratslam.core.types import Estimate
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
 

@@ -15,7 +15,7 @@ from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.service.rats.driven_network import DrivenNetwork
 from robot.simulation.rat.rat_odometry import RatOdometryConfig
-from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 
 CELLS = 529 + np.arange(6) * 2690  # of 36 x 21 x 21 over heading, y, x
 

@@ -13,12 +13,12 @@ import numpy as np
 
 import ratslam
 from ratslam.core.backend import Backend
+from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.core.finite_values import finite_values
 from ratslam.core.path_map import PathMap
-from ratslam.core.types import Action, Estimate, Scalar
-from ratslam.methods.registry import BACKENDS, BackendEntry, Sensors
-from tactile.base.config import Settings
+from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
 from tactile.base.se2 import compose
+from tactile.base.settings import Settings
 from tactile.base.types import Observation
 
 

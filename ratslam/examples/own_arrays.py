@@ -13,11 +13,11 @@ from pydantic import PositiveInt
 import ratslam
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_velocities
-from robot.sources.registry import SOURCES, SourceEntry
 from robot.sources.source import Source
 from robot.sources.source_info import SourceInfo
-from tactile.base.config import Settings
+from robot.sources.source_registry import SOURCES, SourceEntry
 from tactile.base.se2 import integrate
+from tactile.base.settings import Settings
 
 LAP, LAPS, RADIUS = 100, 4, 1.0  # s, laps, m
 

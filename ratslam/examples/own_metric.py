@@ -9,10 +9,10 @@ import numpy as np
 
 import ratslam
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric
-from evaluation.metrics.registry import METRICS, MetricEntry
+from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from evaluation.metrics.run_metrics import RunData
-from tactile.base.config import Settings
 from tactile.base.se2 import between
+from tactile.base.settings import Settings
 
 
 class Config(Settings):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.estimates import Action, Estimate, GridDrawing
 from ratslam.core.localisation import Localisation, LocalisedCourse, LocalisedPose, pieces_of
-from ratslam.core.types import Action, Estimate, GridDrawing
 from tactile.base.types import Observation
 
 UNEXPLAINED = 4

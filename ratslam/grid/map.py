@@ -10,8 +10,8 @@ import numpy as np
 
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.estimates import Estimate, GridDrawing
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import Estimate, GridDrawing
 from ratslam.grid.config import GridConfig
 from ratslam.grid.genealogy import Genealogy
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy

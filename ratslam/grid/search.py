@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.types import Scalar
+from ratslam.core.estimates import Scalar
 from ratslam.grid import particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures

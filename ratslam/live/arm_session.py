@@ -14,9 +14,7 @@ from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
-from robot.live.goal_route import GoalRoute
-from robot.live.rig import Rig
-from robot.live.route import (
+from robot.live.arm_route import (
     ArmRoute,
     approach_route,
     check_targets,
@@ -26,6 +24,8 @@ from robot.live.route import (
     plan_scene,
     whole_path,
 )
+from robot.live.goal_route import GoalRoute
+from robot.live.live_rig import Rig
 from robot.live.selftest import find_devices, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.sources.source_info import SourceInfo

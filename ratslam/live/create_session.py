@@ -17,7 +17,7 @@ from robot.drivers.outcome import SessionOutcome
 from robot.live.create_loop import MotionReport, run_create_loop
 from robot.live.create_rig import CreateRig
 from robot.live.create_selftest import find_devices, start_and_check
-from robot.simulation.create.session import CreateSimulationConfig, describe_create
+from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
 from robot.world.arena import Arena, wall_segments
 from robot.world.random_arena import make_arena
 from tactile.base.errors import InputError

@@ -15,11 +15,11 @@ from ratslam.runs.localise import localising_for_goals
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
+from robot.live.arm_route import MovableArm
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute
+from robot.live.live_rig import Rig
 from robot.live.polling import SessionFault, session_fault
-from robot.live.rig import Rig
-from robot.live.route import MovableArm
 from robot.live.whisk_loop import WhiskReport
 from tactile.whiskers.head_geometry import ur10_head
 
@@ -55,7 +55,7 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
 
 
 class GoalSteering:
-    """The route of the whisk loop (`robot.live.route.ArmRoute`) that follows the mapper's newest estimate.
+    """The route of the whisk loop (`robot.live.arm_route.ArmRoute`) that follows the newest estimate.
 
     Args:
         whisks: reports of the whisks passed on so far; the list grows.
@@ -70,13 +70,13 @@ class GoalSteering:
         self._mapped = self._told = 0  # results taken; whisks of which the route was told
 
     def advance(self, arm: MovableArm) -> bool:
-        """See `robot.live.route.ArmRoute`."""
+        """See `robot.live.arm_route.ArmRoute`."""
         if not self.route.drive.finished:
             self._take_results()
         return self.route.advance(arm)
 
     def resend_last(self) -> None:
-        """See `robot.live.route.ArmRoute`."""
+        """See `robot.live.arm_route.ArmRoute`."""
         self.route.resend_last()
 
     def status(self) -> str:

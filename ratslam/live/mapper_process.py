@@ -312,7 +312,7 @@ def _map(line: Connection) -> None:
 def _mapped_sample(
     number: int, observed: Observation, step: Step, touch: TouchConfig, seconds: float
 ) -> MappedSample:
-    from ratslam.core.types import Action
+    from ratslam.core.estimates import Action
     from ratslam.runs.goal_planner import felt_points
 
     estimate = step.estimate

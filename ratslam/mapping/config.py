@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 
 class KeyframeNoise(Settings):

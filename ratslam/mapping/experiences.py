@@ -12,8 +12,8 @@ import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.compiled import compiled, wrapped
+from ratslam.core.estimates import Action
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import Action
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

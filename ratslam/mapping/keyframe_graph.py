@@ -19,10 +19,10 @@ from scipy.sparse.csgraph import connected_components
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
 from ratslam.mapping.appearance import Appearance
-from ratslam.mapping.calibration import learn_heading_noise, starting_calibration, starting_noise
 from ratslam.mapping.config import Ablation, KeyframeMapConfig
 from ratslam.mapping.edges import Edges
 from ratslam.mapping.loop_closures import ClosureLog
+from ratslam.mapping.odometry_calibration import learn_heading_noise, starting_calibration, starting_noise
 from ratslam.mapping.optimizer import (
     NO_LINKS,
     CalibrationPrior,

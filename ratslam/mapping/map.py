@@ -18,11 +18,10 @@ import numpy as np
 
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.types import Estimate
+from ratslam.core.estimates import Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.archive import MOST_SOLVED, Archive
-from ratslam.mapping.calibration import calibration_from_views, write_calibration
 from ratslam.mapping.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.mapping.closure_judge import doubt_of_closures
 from ratslam.mapping.config import FULL, Ablation, KeyframeMapConfig
@@ -36,6 +35,7 @@ from ratslam.mapping.live_filter import LiveFilter
 from ratslam.mapping.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
 from ratslam.mapping.map_health import DOUBTED, worse_than_odometry
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
 from ratslam.mapping.piece_ties import FindTie, no_tie, tie_newest_piece
 from ratslam.mapping.selection_worker import SelectionWorker
 from ratslam.mapping.step_record import StepRecord, leading_to

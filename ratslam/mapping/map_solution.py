@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.growable_array import GrowableArray
-from ratslam.mapping.calibration import HeadingNoise, learn_heading_noise, log_posterior, starting_noise
 from ratslam.mapping.claimed_revisits import claims_cost
 from ratslam.mapping.closure_judge import judge_anew
 from ratslam.mapping.closure_selection import (
@@ -40,6 +39,12 @@ from ratslam.mapping.keyframe_graph import KeyframeGraph, number_pieces
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map_hypotheses import MapHypotheses
 from ratslam.mapping.odometry_breaks import find_break
+from ratslam.mapping.odometry_calibration import (
+    HeadingNoise,
+    learn_heading_noise,
+    log_posterior,
+    starting_noise,
+)
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.mapping.piece_joining import spans_pieces
 from tactile.base.se2 import compose, inverse

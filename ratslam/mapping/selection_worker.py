@@ -14,13 +14,13 @@ import numpy as np
 
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.growable_array import GrowableArray
-from ratslam.mapping.calibration import HeadingNoise
 from ratslam.mapping.closure_selection import FINE, STEPS
 from ratslam.mapping.delayed_job import DelayedJob
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.map_hypotheses import MapHypotheses
 from ratslam.mapping.map_solution import selected_solution
+from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.mapping.optimizer import MapFit, solve
 from tactile.base.se2 import compose, inverse
 

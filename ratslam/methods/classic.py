@@ -17,8 +17,8 @@ from ratslam.classic.pose_cell_config import network_of, rings, units
 from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.classic.view_templates import Match, Templates
 from ratslam.core.backend import Backend, PoseCellProbe, enlarge
+from ratslam.core.estimates import Estimate, PoseCellActivity, Scalar
 from ratslam.core.finite_values import finite_values
-from ratslam.core.types import Estimate, PoseCellActivity, Scalar
 from ratslam.methods.config import ClassicBackendConfig
 from tactile.base.se2 import wrap
 from tactile.base.types import Array, Observation

@@ -15,7 +15,7 @@ from ratslam.grid.config import GridConfig
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.network.config import PoseCellConfig
 from ratslam.recall.config import RecallConfig
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 BackendConfig = TypeVar("BackendConfig", bound=Settings)
 Start = Literal["here", "unknown"]

@@ -15,8 +15,9 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend
-from ratslam.core.types import Action, Estimate, Scalar
-from ratslam.grid import kernels, likelihoods, particle_maps, particles
+from ratslam.core.estimates import Action, Estimate, Scalar
+from ratslam.grid import blob_kernels as kernels
+from ratslam.grid import likelihoods, particle_maps, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap

@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend, Map
+from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.core.finite_values import finite_values
-from ratslam.core.types import Action, Estimate, Scalar
 from ratslam.mapping.gain_odds import DISTINCT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend
-from ratslam.core.types import Action, Estimate, Scalar
+from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
 from ratslam.grid.expectation import expect
 from ratslam.grid.localiser import GridLocaliser, SavedGrid

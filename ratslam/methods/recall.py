@@ -13,8 +13,8 @@ from jax import lax
 
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, Map, PoseCellProbe, enlarge
+from ratslam.core.estimates import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.core.finite_values import finite_values
-from ratslam.core.types import Action, Estimate, PoseCellActivity, Scalar
 from ratslam.mapping.acceptance import Acceptance, AcceptByEvidence
 from ratslam.mapping.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.mapping.archive import Archive

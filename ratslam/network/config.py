@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field, PositiveFloat
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 
 class PoseCellConfig(Settings):

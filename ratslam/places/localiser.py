@@ -10,9 +10,9 @@ import numpy as np
 
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.estimates import Action, Estimate
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.localisation import Localisation, LocalisedPose, pieces_of, write_course
-from ratslam.core.types import Action, Estimate
 from ratslam.mapping.following import Motion, Supposed, move
 from ratslam.mapping.gain_odds import DISTINCT, GainOdds
 from ratslam.mapping.ground import Ground

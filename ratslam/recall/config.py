@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 Share = Annotated[float, Field(ge=0, le=1)]
 

@@ -11,9 +11,9 @@ from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.closure_views import ClosureViews, write_closure_views
 from evaluation.artifacts.grid_npz import read_grid, write_grid_truth
 from evaluation.artifacts.nav2 import write_nav2
-from evaluation.artifacts.run_directory import write_walls
+from evaluation.artifacts.run_reader import write_walls
 from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
-from evaluation.metrics.grid_score import score_grid
+from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from ratslam.runs.run_directory import RunDirectory
 from robot.sources.source_info import SourceInfo

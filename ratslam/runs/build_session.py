@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ratslam.methods.registry import Sensors, build
+from ratslam.methods.method_registry import Sensors, build
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session
@@ -27,7 +27,7 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
     the records of `probe_of`.
 
     Raises:
-        InputError: see `ratslam.methods.registry.build` and `plan_recording`.
+        InputError: see `ratslam.methods.method_registry.build` and `plan_recording`.
     """
     prepare_precision(config.session.precision)
     sensors = Sensors(source.view_shape, planar_whiskers_of(source, config.touch))

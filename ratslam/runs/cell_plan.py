@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.classic.cell_probe import choose_cells
-from ratslam.classic.recording_config import CellSumsConfig
+from ratslam.classic.cells_config import CellSumsConfig
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.backend import Backend, PoseCellProbe
 from ratslam.core.session import Probe

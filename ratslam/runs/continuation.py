@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from evaluation.artifacts.manifest import read_manifest
-from ratslam.methods.registry import LOCALISING
+from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.backend import Map
 from ratslam.core.session import Session

@@ -12,7 +12,7 @@ from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.places.localiser import Localiser
 from ratslam.methods.config import Start
-from ratslam.methods.registry import LOCALISING
+from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.settings.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.runs.settings.run_config import RunConfig, SourceConfig
 from ratslam.runs.settings.strict_yaml import dump, override, parse, validate
@@ -23,7 +23,7 @@ from ratslam.runs.run import LAST_TASK, catch_interrupt, process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.saved_map import SavedMap, is_map
 from ratslam.runs.sensor import check_same_fov
-from ratslam.runs.source import open_observations
+from ratslam.runs.open_source import open_observations
 from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError, tell
 

@@ -14,9 +14,9 @@ from evaluation.artifacts.merged_map import NAME as MERGED
 from evaluation.artifacts.merged_map import is_merged, read_session_steps
 from evaluation.artifacts.pieces_table import NAME as PIECES
 from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_directory import has_steps, read_run
+from evaluation.artifacts.run_reader import has_steps, read_run
 from evaluation.metrics.energy_metric import read_relations
-from evaluation.metrics.registry import build_metrics
+from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum, write_tum
 from evaluation.plots.run_plots import plot_writers

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from ratslam.methods.registry import BACKENDS, LOCALISING
+from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.errors import InputError

@@ -22,7 +22,7 @@ from ratslam.runs.settings.strict_yaml import dump
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.runs.estimate import START
-from ratslam.runs.map_archive import digest_of
+from ratslam.runs.checkpoint_file import digest_of
 from ratslam.runs.map_results import write_merged_results
 from ratslam.runs.map_settings import assignments, differing_settings
 from ratslam.runs.saved_map import NAME, SavedMap, read_map, write_map

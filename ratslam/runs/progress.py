@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ratslam.core.types import GridDrawing, PoseCellActivity
+from ratslam.core.estimates import GridDrawing, PoseCellActivity
 from tactile.base.types import Observation
 from tactile.whiskers.head_geometry import Head
 

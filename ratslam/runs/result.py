@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_directory import read_run, read_scorecard
+from evaluation.artifacts.run_reader import read_run, read_scorecard
 from evaluation.cells.recording import NAME as CELLS
 from evaluation.cells.recording import CellRecording, read_recording
 from evaluation.metrics.run_arrays import RunArrays
@@ -26,7 +26,7 @@ from ratslam.core.kernel_cache import keep_kernels
 from ratslam.runs.estimate import Health
 from ratslam.runs.report import NAME, write_report
 from ratslam.runs.run import run as write_run
-from ratslam.runs.source import ConfigLike, resolve_config
+from ratslam.runs.open_source import ConfigLike, resolve_config
 from ratslam.mapping.io import read_json
 from tactile.base.errors import InputError
 

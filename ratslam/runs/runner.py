@@ -17,15 +17,15 @@ import numpy as np
 from evaluation.artifacts.closure_views import eight_bit
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.metrics.energy_metric import read_relations
-from evaluation.metrics.registry import build_metrics
+from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import read_tum
-from ratslam.methods.registry import BACKENDS, LOCALISING, BackendEntry
+from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.session import CHUNK, Session, Step
-from ratslam.core.types import Action
+from ratslam.core.estimates import Action
 from ratslam.runs.artifacts import (
     WhiskerView,
     save_closure_views,

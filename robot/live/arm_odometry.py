@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from robot.drivers.ur10.base_transform import pose_from_tcp, tcp_heading
-from robot.live.config import LiveConfig
+from robot.live.live_config import LiveConfig
 from robot.sources.odometry import MIDPOINT, OdometryErrors, from_velocities, motions_between
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap

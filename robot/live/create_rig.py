@@ -13,11 +13,11 @@ from robot.drivers.create.protocol import Bumps
 from robot.drivers.create.stop_reasons import StopReason
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.device import open_bridge
-from robot.drivers.head.protocol import to_radians
 from robot.drivers.head.reader import HeadReader
+from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
-from robot.live.config import LiveConfig
 from robot.live.head_stream import HeadStream
+from robot.live.live_config import LiveConfig
 from robot.live.polling import OperatorStop, SessionFault, session_fault, wait_until
 from robot.live.recorder import LiveRecorder
 from robot.simulation.create.strain_sensors import fixed_whiskers

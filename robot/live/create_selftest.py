@@ -12,8 +12,8 @@ from robot.drivers.create.serial_link import open_port
 from robot.drivers.create.stop_reasons import CommandRefused, wheel_speeds
 from robot.drivers.outcome import SessionOutcome
 from robot.live import selftest
-from robot.live.config import LiveConfig
 from robot.live.create_rig import CreateRig, unusual_strain
+from robot.live.live_config import LiveConfig
 from tactile.base.errors import InputError
 
 FEWEST_ALIVE = 1

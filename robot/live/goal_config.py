@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 Point = tuple[float, float]
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.config import LiveConfig
+from robot.live.arm_route import MovableArm, route_speed
 from robot.live.goal_drive import DriveState, GoalDrive, Sighting, points_in_map
-from robot.live.route import MovableArm, route_speed
+from robot.live.live_config import LiveConfig
 from tactile.base.se2 import between, compose, wrap
 
 GAIN = 0.1

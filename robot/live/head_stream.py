@@ -10,8 +10,8 @@ import numpy as np
 
 from robot.drivers.clock_sync import ClockSync
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import FrameFlag
 from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.head.usb_protocol import FrameFlag
 from robot.drivers.outcome import Fault, SessionOutcome
 
 MAX_CLOCK_STEP = 2e-3

@@ -13,11 +13,11 @@ import numpy as np
 from robot.drivers.head.reader import HeadReader
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.startup_checks import check_controller
-from robot.live.config import LiveConfig
+from robot.live.arm_route import check_targets, plan_path
 from robot.live.head_stream import HeadStream
+from robot.live.live_config import LiveConfig
+from robot.live.live_rig import Rig
 from robot.live.polling import TICK, SessionFault
-from robot.live.rig import Rig
-from robot.live.route import check_targets, plan_path
 from tactile.base.errors import InputError, os_errors_of
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 

@@ -13,11 +13,11 @@ import numpy as np
 from robot.drivers.outcome import Fault
 from robot.drivers.ur10.base_transform import pose_from_tcp, tcp_from_pose
 from robot.drivers.ur10.safety import plan_move
-from robot.emulators.ur10.arm import EmulatedArm
-from robot.emulators.ur10.config import UrEmulatorConfig
+from robot.emulators.ur10.emulated_arm import EmulatedArm
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.urscript_moves import MoveL
 from robot.live.arm_odometry import ArmOdometry
-from robot.live.config import LiveConfig
+from robot.live.live_config import LiveConfig
 from robot.simulation.head.kinematic import HeadSetup, simulate_kinematic
 from robot.sources.source import Sample
 from robot.world.head_trajectory import HeadPath

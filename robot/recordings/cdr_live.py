@@ -12,7 +12,7 @@ import numpy as np
 
 from robot.drivers.head.cycle_assembly import Cut
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import CHANNELS
+from robot.drivers.head.usb_protocol import CHANNELS
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.recordings.cdr import CDR, MAX_NUMBERS, Malformed
 from tactile.base.types import Odometry

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, PositiveFloat
 
 from robot.recordings.csv_units import AngleUnit, LengthUnit, TimeUnit
-from tactile.base.config import Settings, Side
+from tactile.base.settings import Settings, Side
 from tactile.whiskers.head_geometry import Degrees
 
 Quaternion = Annotated[list[str], Field(min_length=4, max_length=4)]

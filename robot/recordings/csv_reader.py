@@ -32,10 +32,10 @@ from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
-from robot.sources.registry import Warn
 from robot.sources.source_info import PlanarWhiskersInfo
-from tactile.base.config import Settings
+from robot.sources.source_registry import Warn
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from robot.recordings.bags.config import TopicsConfig
+from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.stretch import Stretch
 from robot.sources.input_files import require_file
 from robot.sources.odometry_correction import correct_odometry
-from robot.sources.registry import SOURCES, SourceEntry, Warn
 from robot.sources.source import Source
+from robot.sources.source_registry import SOURCES, SourceEntry, Warn
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 
@@ -27,7 +27,7 @@ def _open_mcap(config: RecordingConfig, judge: InputJudge) -> Source:
 
 
 def _open_bag(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.bags.reader import read_bag
+    from robot.recordings.bags.bag_reader import read_bag
 
     return read_bag(
         config.file,

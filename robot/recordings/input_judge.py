@@ -36,9 +36,9 @@ from robot.sources.odometry_correction import (
     correct_motions,
     replace_steps,
 )
-from robot.sources.registry import Warn
-from tactile.base.config import Settings
+from robot.sources.source_registry import Warn
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 GLITCHES, GLITCH_SHARE = 2, 0.01  # number of fastest steps that are ignored, or share of all if that is more
 PAUSE = 1000.0  # median steps: a longer step is an error of the clock and is ignored

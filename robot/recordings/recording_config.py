@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from robot.recordings.bags.config import TopicsConfig
+from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.video import VideoConfig
 from robot.recordings.camera.visual_odometry import VisualOdometryConfig

@@ -8,8 +8,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field, create_model
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 
 def utc_seconds(text: str) -> float:

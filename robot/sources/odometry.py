@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from robot.sources.source import Source
-from tactile.base.config import Settings
 from tactile.base.se2 import between, integrate, wrap
+from tactile.base.settings import Settings
 
 TURN_THEN_MOVE = 1.0  # share of the turn before the robot moves: all of it, as in OpenRatSLAM
 MIDPOINT = 0.5  # half of it: second order, exact to O(turn^2) for a constant twist

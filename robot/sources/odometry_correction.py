@@ -11,8 +11,8 @@ from pydantic import PositiveFloat
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of
 from robot.sources.source import Sample, Source
-from tactile.base.config import Settings
 from tactile.base.se2 import correct_heading
+from tactile.base.settings import Settings
 from tactile.base.types import Observation, Odometry
 
 

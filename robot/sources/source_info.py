@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, NonNegativeInt, PlainSerializer, PlainValidator, PositiveFloat
 
 from tactile.base.bounded import SPOILT, reason
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.features.calibration import Calibration, calibration_from_arrays, calibration_json
 from tactile.whiskers.head_geometry import HeadConfig
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from robot.world.maze import Cell, cell_centre
-from tactile.base.config import Settings
 from tactile.base.se2 import wrap
+from tactile.base.settings import Settings
 
 
 class JitterConfig(Settings):

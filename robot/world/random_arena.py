@@ -14,9 +14,9 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
 from robot.world.arena import Arena, has_clearance, read_arena
 from robot.world.polygons import polygon_contains, polygon_gap, square
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 Share = Annotated[float, Field(ge=0, le=1)]
 MAX_OBJECT_TRIES = 200

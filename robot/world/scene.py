@@ -27,9 +27,9 @@ from robot.world.maze import (
 )
 from robot.world.maze_routes import check_route, circuit_route, exploration_route, make_anticlockwise
 from robot.world.walls import Surroundings, Walls
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 from tactile.whiskers.head_geometry import Head, tip_points
 
 PAPER_CIRCUITS = "CCCAAACACA"

@@ -10,8 +10,8 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import Field, ValidationError
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 Entry = TypeVar("Entry")
 Model = TypeVar("Model", bound=Settings)

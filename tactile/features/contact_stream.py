@@ -20,7 +20,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.features.free_record import FreeBaseline
 
 

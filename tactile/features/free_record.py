@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.samples import longest_run
+from tactile.base.settings import Settings
 from tactile.features.signal_noise import LAG, WINDOW, estimate_noise, quiet_windows, window_variances
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.types import Cycle
 from tactile.features.calibration import Calibration
 

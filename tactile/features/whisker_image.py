@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import PositiveFloat
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.types import Observation, Whisk, observation
 from tactile.whiskers.head_geometry import Head, shaft_points, tip_height
 

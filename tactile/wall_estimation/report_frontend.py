@@ -12,9 +12,9 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose
+from tactile.base.settings import Settings
 from tactile.base.types import MotionKind, Observation, Odometry, Report, StepEnd, observation
 from tactile.wall_estimation.estimators import (
     Wall,

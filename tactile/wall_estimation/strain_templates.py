@@ -14,9 +14,9 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
+from tactile.base.settings import Settings
 from tactile.base.types import Report
 
 FILE_VERSION = 1

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.types import Array
 
 Degrees = Annotated[float, Field(ge=-360, le=360)]

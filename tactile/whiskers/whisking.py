@@ -12,8 +12,8 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 from tactile.base.types import Array
 from tactile.whiskers.head_geometry import Head
 

@@ -10,7 +10,7 @@ from jax import lax
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
 from ratslam.methods.grid import GridBackend
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
+from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import open_touch_source, planar_whiskers_of
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig

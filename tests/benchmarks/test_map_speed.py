@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
-from ratslam.core.types import Action, Estimate
+from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.edges import Edges
 from ratslam.mapping.least_squares import GraphEquations, Termination, least_squares
 from tactile.base.se2 import between, wrap

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.experience_metric import experience_metric
+from evaluation.metrics.exm import experience_metric
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_source, read_observations
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_source, read_observations
 from robot.touch_source import open_touch_source
 
 JITTER = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}

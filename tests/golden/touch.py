@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.metrics.experience_metric import experience_metric
-from ratslam.core.types import Action
+from evaluation.metrics.exm import experience_metric
+from ratslam.core.estimates import Action
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations, read_observations
 from tactile.base.types import Observation
 
 FOLDER = Path(__file__).parent

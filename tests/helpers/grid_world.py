@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.core.estimates import Estimate
 from ratslam.core.packing import allocate, layout_of
 from ratslam.core.session import CHUNK, run_chunk
-from ratslam.core.types import Estimate
 from ratslam.grid.config import GridConfig
 from ratslam.methods.grid import GridBackend, GridEvidence, GridState
 from tactile.base.types import MotionKind, Observation, Odometry, observation

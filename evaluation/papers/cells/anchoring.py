@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.cells.drift import packet_pose
+from evaluation.cells.packet_drift import packet_pose
 from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.packet_error import error_size, shortest, torus_error
 from evaluation.papers.cells.panel_grid import head_panel, panel_grid

@@ -25,7 +25,7 @@ from evaluation.papers.cells.timing import time_call
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording
-from evaluation.papers.tables.touch import SessionFigures, TouchTask, run_and_measure, task_config
+from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
 from evaluation.papers.trials.recording_trial import closure_claims, run_recording
 from evaluation.papers.trials.touch_trial import collect_session, new_session
 from evaluation.plots import style

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.cells.drift import packet_pose, torus_sides, truth_in_sheet
+from evaluation.cells.packet_drift import packet_pose, torus_sides, truth_in_sheet
 from evaluation.cells.recording import CellRecording
 
 

@@ -11,9 +11,9 @@ from ratslam.core.session import Session, Step
 from ratslam.runs.build_session import build_session
 from ratslam.runs.cell_plan import RecordingPlan, plan_recording
 from ratslam.runs.cell_recorder import CellSums
+from ratslam.runs.open_source import open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from ratslam.runs.source import open_observations, read_observations
-from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Sample, Source
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
-from evaluation.cells.drift import packet_pose, truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
+from evaluation.cells.packet_drift import packet_pose, truth_in_sheet
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.papers.cells.figure import CellFigure, CellTask

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.grid_error import CONVENTIONS, DISTINCT_CONVENTIONS, MAIN_CONVENTION, Convention
-from evaluation.metrics.grid_score import GridScore, pool_grids, render_grid_scores, score_grid
 from evaluation.metrics.occupancy_grid import OccupancyGrid, mean_grid
+from evaluation.metrics.occupancy_score import GridScore, pool_grids, render_grid_scores, score_grid
 from evaluation.metrics.revisits import CLOSED_GAP, path_metrics
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation import RIGHT, WRONG, MapSteps, is_within, known_steps
+from evaluation.metrics.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
 from evaluation.papers.maps.localising import Judged, judge
 from evaluation.papers.maps.pictures import Panel, draw_panels
 from evaluation.papers.maps.row import Line, Localised, MapRow, MapTask, count, median, spread
@@ -29,10 +29,10 @@ from ratslam.core.session import Session
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.runs.build_session import build_session
 from ratslam.runs.localise import localising
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
-from evaluation.metrics.localisation import RIGHT, localisation_errors, true_places
+from evaluation.metrics.localisation_metrics import RIGHT, localisation_errors, true_places
 from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
 from evaluation.papers.maps.row import Line, MapRow, MapTask, count, median, spread
 from evaluation.papers.maps.scenarios import open_world, ten_circuits
@@ -28,10 +28,10 @@ from ratslam.runs.localise import localising_for_goals
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.slam import Slam
-from robot.live.config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute
+from robot.live.live_config import LiveConfig
 from robot.live.virtual_arm import VirtualArm
 from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
 from robot.world.scene import Scene, make_scene, maze_seed
@@ -59,11 +59,11 @@ class Drive(NamedTuple):
     Attributes:
         state, reason: its end. whisks: their number. replans: new ways.
         error: true distance from the goal at the end, m, by the nearest step of the map
-            (`evaluation.metrics.localisation`). reckoned: true distance, m, from where the noisy odometry
-            puts the robot, summed from the start of the first drive on. by_arm: distance from the goal,
-            m, at which exact motion from the end of the map to the goal's pose in the map would have ended.
-        length: of the true path, m. shortest: way over driven cells, m. clearance: least distance of the
-            head's axis from a wall on the way, m. clear: whether no whisker at rest was inside a wall.
+            (`evaluation.metrics.localisation_metrics`). reckoned: true distance, m, from where the noisy
+            odometry puts the robot, summed from the start of the first drive on. by_arm: distance from the
+            goal, m, at which exact motion from the end of the map to the goal's pose in the map would have
+            ended. length: of the true path, m. shortest: way over driven cells, m. clearance: least distance
+            of the head's axis from a wall on the way, m. clear: whether no whisker at rest was inside a wall.
         path: [n, 2] true, m. goal: [2] its true place, m.
     """
 

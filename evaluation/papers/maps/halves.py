@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation import (
+from evaluation.metrics.localisation_metrics import (
     BUILDING,
     aligned_errors,
     exceeds,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation import (
+from evaluation.metrics.localisation_metrics import (
     RIGHT,
     SAME_HEADING,
     WRONG,

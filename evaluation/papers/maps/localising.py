@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation import (
+from evaluation.metrics.localisation_metrics import (
     RIGHT,
     WRONG,
     MapSteps,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from evaluation.papers.maps.registry import ROWS
+from evaluation.papers.maps.map_rows import ROWS
 from evaluation.papers.maps.row import MapTask, Methods
 from evaluation.papers.tables.comparison import Files, SessionLog, compare_figures
 from evaluation.studies.executor import run_tasks

@@ -13,7 +13,7 @@ import networkx
 import numpy as np
 
 from evaluation.papers.maps.sessions import Recipe, draw_seed, record, touch_config
-from evaluation.papers.tables.touch import KIDNAPS, MAIN
+from evaluation.papers.tables.touch_table import KIDNAPS, MAIN
 from ratslam.runs.settings.run_config import RunConfig
 from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, is_open, neighbours
 from robot.world.maze_routes import exploration_route

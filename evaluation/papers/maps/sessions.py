@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.papers.trials.touch_trial import collect_session
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations
 from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream

@@ -18,7 +18,7 @@ from evaluation.metrics.direction_metrics import (
     lap_of_step,
 )
 from evaluation.metrics.energy_metric import energy, energy_all_pairs, successive_pairs
-from evaluation.metrics.experience_metric import experience_metric
+from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.session_metrics import (
     SessionResult,
     TouchMetrics,

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.experience_metric import base_end, experience_metric
+from evaluation.metrics.exm import base_end, experience_metric
 from evaluation.metrics.session_metrics import lap_ends
 from evaluation.metrics.view_separation import ViewDifferences, compare_views
 from evaluation.papers.trials.threshold_sweep import sweep_thresholds

@@ -26,8 +26,8 @@ from ratslam.core.precision import prepare_precision
 from ratslam.methods.recall import RecallBackend
 from ratslam.methods.session_batch import Recording, RecordingSession, SessionBatch
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 

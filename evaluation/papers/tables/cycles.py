@@ -25,8 +25,8 @@ from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.mapping import archive_selection, selection_worker
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 from tactile.base.types import Observation
@@ -57,7 +57,7 @@ VERBS = {
     "judge": ("mapping/closure_judge.py",),
     "selection": (
         "mapping/selection_worker.py", "mapping/closure_selection.py", "mapping/map_solution.py",
-        "mapping/map_hypotheses.py", "mapping/calibration.py", "mapping/delayed_job.py",
+        "mapping/map_hypotheses.py", "mapping/odometry_calibration.py", "mapping/delayed_job.py",
     ),
     "merging": ("mapping/archive", "mapping/keyframe_merger.py", "mapping/merg"),
     "solver": ("mapping/optimizer.py", "mapping/linea", "mapping/block_", "mapping/least_", "mapping/edges"),

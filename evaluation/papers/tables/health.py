@@ -23,7 +23,7 @@ from evaluation.metrics.trajectory import ate
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
-from evaluation.papers.tables.touch import MAIN, ROWS
+from evaluation.papers.tables.touch_table import MAIN, ROWS
 from evaluation.papers.trials.recording_trial import run_recording
 from evaluation.papers.trials.spoilt_maps import spoilt_maps
 from evaluation.studies.executor import run_tasks

@@ -20,7 +20,11 @@ from ratslam.grid.likelihoods import distinct_cells
 from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
 from ratslam.methods.grid import GridBackend
 from ratslam.runs.settings.run_config import RunConfig
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
+from robot.simulation.create.simulated_session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    train_strain_templates,
+)
 from robot.touch_source import TouchSource, observation_of, report_config_of
 from robot.world.arena import Arena, arena_text
 from robot.world.random_arena import make_arena, place_start

@@ -12,8 +12,8 @@ import numpy as np
 from evaluation.metrics.trajectory import ate
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations
 from robot.sources.in_memory import load_into_memory
 from robot.sources.perturbation import Perturbation
 from robot.touch_source import observation_of

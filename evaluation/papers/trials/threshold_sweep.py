@@ -14,8 +14,8 @@ import numpy as np
 from jax import lax
 
 from evaluation.papers.trials.touch_trial import capacity_for
+from ratslam.core.estimates import Estimate
 from ratslam.core.precision import prepare_precision
-from ratslam.core.types import Estimate
 from ratslam.methods.classic import ClassicBackend, ClassicEvidence
 from ratslam.methods.config import ClassicBackendConfig, select_settings
 from ratslam.runs.settings.run_config import RunConfig

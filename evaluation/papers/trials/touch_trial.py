@@ -15,14 +15,14 @@ from evaluation.metrics.session_metrics import SessionResult
 from ratslam.core.backend import Backend
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
-from ratslam.methods.registry import Sensors, backend_settings, build
+from ratslam.methods.method_registry import Sensors, backend_settings, build
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.source import open_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.touch_source import observation_of
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
+from tactile.base.settings import Settings
 
 
 def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:

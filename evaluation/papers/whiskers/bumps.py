@@ -16,11 +16,11 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from evaluation.papers.whiskers.wall_distance import wall_distances
 from evaluation.plots import style
+from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
-from ratslam.core.types import GridDrawing
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.source import open_observations
 from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
 from robot.sources.odometry_correction import correct_observations
 from robot.touch_source import observation_of

@@ -10,11 +10,11 @@ import numpy as np
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
 from evaluation.plots import style
+from ratslam.runs.open_source import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.source import open_source
 from ratslam.service.fit.record import RevisitFit, fit_revisits
-from ratslam.service.fit.wheels import WheelFit, fit_wheels
-from ratslam.service.fit.whiskers import read_signals_of_reach
+from ratslam.service.fit.wheel_fit import WheelFit, fit_wheels
+from ratslam.service.fit.whisker_fit import read_signals_of_reach
 from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.plugins import PluginConfig

@@ -30,7 +30,7 @@ from evaluation.papers.whiskers.walk_source import (
 )
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import OdometryConfig, simulate_odometry
 from tactile.base.random_streams import stream

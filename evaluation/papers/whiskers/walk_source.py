@@ -14,17 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeInt
 
-from evaluation.papers.tables.touch import TouchTask, task_config
+from evaluation.papers.tables.touch_table import TouchTask, task_config
 from robot.recordings.whiskers.objects import WHISKERS, ObjectRecord, read_object
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of
-from robot.sources.registry import SourceEntry
 from robot.sources.source_info import SourceInfo
+from robot.sources.source_registry import SourceEntry
 from robot.world.maze import CELL_SIDE
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 CIRCUITS = "CCCA"
 FACINGS = 4

@@ -10,23 +10,23 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
-from evaluation.metrics.experience_metric import ExmConfig
-from evaluation.metrics.registry import METRICS
+from evaluation.metrics.exm import ExmConfig
+from evaluation.metrics.metric_registry import METRICS
 from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
-from ratslam.classic.recording_config import CellsConfig
+from ratslam.classic.cells_config import CellsConfig
 from ratslam.runs.settings.includes import merge_includes
 from ratslam.runs.settings.packaged import PresetName, find_config
 from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
 from ratslam.runs.settings.strict_yaml import load, validate
 from ratslam.runs.settings.strict_yaml.document import Document, KeyPath
-from robot.live.config import LiveConfig
+from robot.live.live_config import LiveConfig
 from robot.recordings.recording_config import RecordingConfig
-from robot.simulation.create.session import CreateSimulationConfig
-from robot.simulation.head.session import SimulationConfig
-from robot.simulation.rat.session import RatSimulationConfig
-from robot.sources.registry import SOURCES
+from robot.simulation.create.simulated_session import CreateSimulationConfig
+from robot.simulation.head.simulated_session import SimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulationConfig
+from robot.sources.source_registry import SOURCES
 from robot.touch_source import TOUCH
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.plugins import PluginConfig, Registry, read_settings
 from tactile.frontend import TouchConfig
@@ -226,7 +226,7 @@ def resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path)
 
 
 def _chosen(config: RunConfig) -> Iterator[Chosen]:
-    from ratslam.methods.registry import BACKENDS  # loads JAX
+    from ratslam.methods.method_registry import BACKENDS  # loads JAX
 
     yield Chosen(("backend",), ("backend_settings",), BACKENDS, config.backend)
     parts: list[tuple[KeyPath, Registry[Any], PluginConfig | None]] = [

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from ratslam.core.estimates import Action
 from ratslam.core.session import CHUNK, Session, Step, capacity_at
-from ratslam.core.types import Action
 from ratslam.service.checks.backend_trial import CAPACITY, STEPS, VIEW, BackendTrial
-from ratslam.service.checks.common import Check, Violation, leaves, require, require_equal
+from ratslam.service.checks.check_results import Check, Violation, leaves, require, require_equal
 from tactile.base.types import Odometry
 
 LIVE, SHORT, BATCHED = 150, 3 * CHUNK, 20

@@ -11,7 +11,7 @@ import numpy as np
 
 from ratslam.core.backend import Backend, Map
 from ratslam.core.session import Session, Step
-from ratslam.methods.registry import BackendEntry, Sensors
+from ratslam.methods.method_registry import BackendEntry, Sensors
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 from tactile.whiskers.planar_whiskers import PlanarWhiskers

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ratslam.service.checks.common import Violation, leaves, require
-from robot.sources.registry import SourceEntry
+from ratslam.service.checks.check_results import Violation, leaves, require
 from robot.sources.source import ClosedSource, Sample, Source
+from robot.sources.source_registry import SourceEntry
 from robot.touch_source import head_config_of, open_touch_source, report_config_of
 from tactile.base.plugins import PluginConfig
 from tactile.base.types import Observation

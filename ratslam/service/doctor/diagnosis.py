@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from ratslam.service.fit.rig import aligned
+from ratslam.service.fit.rig_fit import aligned
 from tactile.base.errors import printable
 
 

@@ -9,20 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.runs.map_settings import differing_settings
+from ratslam.runs.open_source import open_source
 from ratslam.runs.saved_map import SavedMap
 from ratslam.runs.sensor import check_same_fov, check_same_sensor, differences, sensor_of, settings_of_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.other_files import FOLDER, RECORDING, kind_of, refuse_other_files
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump_data, override, parse, validate
-from ratslam.runs.source import open_source
 from ratslam.service.doctor.diagnosis import Diagnosis
 from ratslam.service.doctor.recording_kinds import describe_file
 from ratslam.service.fit.record import shows_place
 from robot.recordings.bags.bag import METADATA
 from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
-from robot.sources.registry import SOURCES
 from robot.sources.source import Source
+from robot.sources.source_registry import SOURCES
 from tactile.base.errors import InputError
 
 CELLS_IN_RANGE = 13

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.description import (
+from robot.recordings.bags.bag_description import (
     BagDescription,
     CloudShape,
     ImageShape,
@@ -114,8 +114,8 @@ def _mcap(path: Path) -> FileContents:
 
 
 def _bag(path: Path) -> FileContents:
-    from robot.recordings.bags.description import describe_bag
-    from robot.recordings.bags.suggestion import robots_of, suggested_topics
+    from robot.recordings.bags.bag_description import describe_bag
+    from robot.recordings.bags.topic_suggestion import robots_of, suggested_topics
 
     found = describe_bag(path)
     rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]

@@ -9,7 +9,7 @@ import numpy as np
 
 from evaluation.artifacts.closure_table import Closures, count_closures
 from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_directory import check_run_directory, has_steps, read_run
+from evaluation.artifacts.run_reader import check_run_directory, has_steps, read_run
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.trajectory import ate
 from evaluation.report.verdict import CAUTION, judge_map

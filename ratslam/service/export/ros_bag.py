@@ -11,7 +11,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from ratslam.service.export.ros_messages import LINES, POINTS, RosMessages
-from ratslam.service.export.run_files import ExportedRun
+from ratslam.service.export.run_export import ExportedRun
 from tactile.base.se2 import between, compose, inverse
 
 GREY, GREEN, ORANGE, RED = (

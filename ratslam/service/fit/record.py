@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations, open_source
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load
-from ratslam.runs.source import open_observations, open_source
-from ratslam.service.fit.rig import Quantity, Rig, join_rigs
-from ratslam.service.fit.wheels import LEAST_TURNED, WheelFit, fit_wheels
-from ratslam.service.fit.whiskers import fit_signals_of, has_signals_only
+from ratslam.service.fit.rig_fit import Quantity, Rig, join_rigs
+from ratslam.service.fit.wheel_fit import LEAST_TURNED, WheelFit, fit_wheels
+from ratslam.service.fit.whisker_fit import fit_signals_of, has_signals_only
 from robot.recordings.whiskers.stage import StageCalibration, StageConfig, read_stage_calibration
 from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection
 from robot.sources.source import Sample

@@ -9,7 +9,7 @@ import numpy as np
 from robot.simulation.rat.box import BoxConfig
 from robot.simulation.rat.rat_odometry import RatOdometryConfig, measure_motion
 from robot.simulation.rat.rat_path import RatPath
-from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of
 from robot.sources.odometry import from_poses

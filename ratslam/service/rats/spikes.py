@@ -26,10 +26,10 @@ from pydantic import NonNegativeInt, PositiveFloat
 
 from evaluation.cells.recording import CellRecording
 from ratslam.service.rats.cell_poses import check_cells
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.npz import read_npz
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 BLOCK = 1024
 """Arrivals drawn at a time."""

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ratslam.core.estimates import GridDrawing, PoseCellActivity
 from ratslam.core.growable_array import GrowableArray
-from ratslam.core.types import GridDrawing, PoseCellActivity
 from ratslam.runs.progress import MapReport, RunDescription, StepReport
 from tactile.whiskers.head_geometry import Head
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from robot.drivers.create import protocol
-from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged
 from robot.drivers.create.stop_reasons import CommandRefused, StopEvent, StopReason, stop_reason, wheel_speeds
 from tactile.base.types import Odometry

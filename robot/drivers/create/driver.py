@@ -9,8 +9,8 @@ import time
 from typing import Self
 
 from robot.drivers.create import protocol
-from robot.drivers.create.config import CreateConfig
 from robot.drivers.create.control_loop import PAUSE, ControlLoop
+from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged, open_port
 from robot.drivers.create.stop_reasons import CommandRefused, StopEvent, StopReason
 from robot.drivers.create.watchdog import Watchdog

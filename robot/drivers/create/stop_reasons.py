@@ -6,7 +6,7 @@ import math
 from enum import Enum
 from typing import NamedTuple
 
-from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.protocol import Bumps, Mode, SensorReply, describe_bumps
 
 

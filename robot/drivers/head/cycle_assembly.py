@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import CHANNELS, to_radians
+from robot.drivers.head.usb_protocol import CHANNELS, to_radians
 from tactile.base.types import Cycle, Odometry
 
 MAX_FRAMES = 1 << 16

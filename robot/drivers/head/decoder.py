@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.head.protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFlag, frame_dtype
 from robot.drivers.head.sequence_numbers import HALF, SequenceUnwrapper
+from robot.drivers.head.usb_protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFlag, frame_dtype
 
 BATCH, MAX_BATCH = 32, 1024
 """Frames checked at once: the first number after a fault, doubled after every batch without one."""
@@ -82,7 +82,7 @@ class FrameDecoder(Protocol):
 
 
 class Decoder:
-    """Decodes the frames of `robot.drivers.head.protocol`.
+    """Decodes the frames of `robot.drivers.head.usb_protocol`.
 
     Args:
         whiskers: number on the head. channels: per whisker.

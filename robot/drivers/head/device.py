@@ -11,8 +11,9 @@ import json
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from robot.drivers.head.config import Address
-from robot.drivers.head.protocol import (
+from robot.drivers.head.driver_config import Address
+from robot.drivers.head.emulated_cable import SocketBackend
+from robot.drivers.head.usb_protocol import (
     ENDPOINT_IN,
     ENDPOINT_OUT,
     INTERFACE,
@@ -21,7 +22,6 @@ from robot.drivers.head.protocol import (
     REQUEST_OUT,
     Request,
 )
-from robot.drivers.head.usb_tcp_backend import SocketBackend
 from tactile.base.errors import InputError
 
 T = TypeVar("T")

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.decoder import Decoder, FrameDecoder, Frames
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, read_identity
-from robot.drivers.head.protocol import (
+from robot.drivers.head.driver_config import HeadLinkConfig
+from robot.drivers.head.usb_protocol import (
     ANGLE,
     CHANNELS,
     KEEP_ALIVE,
@@ -68,7 +68,7 @@ class HeadReader:
 
     Args:
         connect: opens the bridge; called again when the head was disconnected. whiskers: required number.
-        config: time limits. decoder: of the stream; None for that of `robot.drivers.head.protocol`.
+        config: time limits. decoder: of the stream; None for that of `robot.drivers.head.usb_protocol`.
         alive: [W] whiskers checked for overload; None for all. on_overload: called with the whisker for each
             block of samples with an overload.
 

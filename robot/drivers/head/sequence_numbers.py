@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot.drivers.head.protocol import WRAP
+from robot.drivers.head.usb_protocol import WRAP
 
 LATE = 4096
 """Largest distance of a late frame behind the newest; a head buffers no more frames."""

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import (
+from robot.drivers.head.reader import HeadReader
+from robot.drivers.head.usb_protocol import (
     ANGLE,
     NO_THRESHOLD,
     Command,
@@ -17,7 +18,6 @@ from robot.drivers.head.protocol import (
     FrameFlag,
     to_counts,
 )
-from robot.drivers.head.reader import HeadReader
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import (

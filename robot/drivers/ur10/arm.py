@@ -17,7 +17,7 @@ import numpy as np
 
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.process_handle import ArmProcess
 from robot.drivers.ur10.safety import Finding, Move, TargetRefused, plan_move
 from robot.drivers.ur10.shared_state import SharedState

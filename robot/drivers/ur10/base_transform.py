@@ -12,8 +12,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from tactile.base.config import Settings
 from tactile.base.se2 import between, compose
+from tactile.base.settings import Settings
 
 
 class BaseTransformConfig(Settings):

@@ -17,7 +17,7 @@ import numpy as np
 
 from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import (
     MOVED_ON,
     RETREAT_SPEED,

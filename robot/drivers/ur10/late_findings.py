@@ -6,7 +6,7 @@ A machine that is late by half of a limit explains why the limit was exceeded.
 from __future__ import annotations
 
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import Finding
 
 EXPLAINED_SHARE = 0.5

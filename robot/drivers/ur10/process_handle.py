@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import Finding
 from robot.drivers.withheld_signals import withheld_signals
 

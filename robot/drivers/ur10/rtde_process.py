@@ -28,7 +28,7 @@ from robot.drivers.outcome import SessionOutcome
 from robot.drivers.process_priority import become_urgent
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.command_thread import MAX_MISSING_STATES, ArmCommand, CommandThread
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.late_findings import ended_script_finding, silent_session_finding
 from robot.drivers.ur10.safety import Finding, at_rest
 from robot.drivers.ur10.shared_state import ARM_STATE, SharedState

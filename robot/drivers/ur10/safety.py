@@ -12,7 +12,7 @@ import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.base_transform import tcp_tilt
-from robot.drivers.ur10.config import SPEED_CAP, ArmConfig
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig
 
 REACH = 3.0  # m; a UR-10 reaches 1.3. A larger distance means an invalid state
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way

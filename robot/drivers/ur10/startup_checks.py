@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.ur10 import dashboard
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import in_box
 from tactile.base.errors import InputError
 

@@ -11,7 +11,7 @@ import numpy as np
 from robot.drivers.lateness import LatenessMeter
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.late_findings import stale_finding
 from robot.drivers.ur10.process_handle import ArmProcess
 from robot.drivers.ur10.safety import RETREAT_SPEED, Finding, Move, at_rest, at_target, retreat_target

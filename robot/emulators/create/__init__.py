@@ -1,6 +1,6 @@
 """An emulated iRobot Create on a pseudo-terminal, with whiskers in an arena if it is given one."""
 
-from robot.emulators.create.config import CreateEmulatorConfig
+from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.emulators.create.robot import EmulatedCreate
 from robot.emulators.create.server import serve
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from robot.emulators.create.config import CreateEmulatorConfig
+from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.emulators.create.server import serve
 from tactile.base.errors import InputError
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.drivers.create.protocol import TOP_SPEED, Bumps, Mode
-from robot.emulators.create.config import CreateEmulatorConfig
+from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.simulation.create.wheel_odometry import simulate_wheel_odometry
 from robot.world.arena import Arena, wall_segments
 from robot.world.polygons import segment_distance

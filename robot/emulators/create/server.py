@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.create.protocol import Bumps
-from robot.drivers.head.protocol import Command
+from robot.drivers.head.usb_protocol import Command
 from robot.drivers.process_priority import urgent
-from robot.emulators.create.config import CreateEmulatorConfig, CreateWorldConfig
+from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
 from robot.emulators.create.serial_line import LineFaults, Terminal
-from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.sensor_array import Block, block_samples
 from robot.emulators.head.server import open_server
 from robot.simulation.create.strain_sensors import (

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
 from tactile.base.bounded import read_json
 from tactile.base.errors import InputError

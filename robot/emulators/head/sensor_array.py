@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.head.protocol import Command
+from robot.drivers.head.usb_protocol import Command
 
 BLOCK = 0.01
 """Samples are made and sent in blocks of this duration, s."""

@@ -15,13 +15,13 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-from robot.drivers.head.protocol import ENDPOINT_IN
-from robot.drivers.head.usb_tcp_protocol import ANSWER, IN, REQUEST, Op
+from robot.drivers.head.emulated_cable_protocol import ANSWER, IN, REQUEST, Op
+from robot.drivers.head.usb_protocol import ENDPOINT_IN
 from robot.drivers.process_priority import urgent
 from robot.drivers.ur10.pose_listener import PoseListener
 from robot.emulators.head import usb_descriptors
-from robot.emulators.head.config import BridgeEmulatorConfig, HeadEmulatorConfig
-from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.emulated_device import EmulatedHead
+from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, maze_whiskers
 from robot.emulators.listening import listening
 from robot.world.head_trajectory import HeadPath
@@ -113,7 +113,7 @@ class HeadServer:
                 await asyncio.sleep(self.bridge.due - time.monotonic())
 
     async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serves a connection of `robot.drivers.head.usb_tcp_protocol` until the head is unplugged."""
+        """Serves a connection of `robot.drivers.head.emulated_cable_protocol` until the head is unplugged."""
         plugs = self.bridge.faults.plugs
         try:
             while True:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from robot.drivers.head.protocol import ENDPOINT_IN, ENDPOINT_OUT, INTERFACE, PRODUCT, VENDOR
+from robot.drivers.head.usb_protocol import ENDPOINT_IN, ENDPOINT_OUT, INTERFACE, PRODUCT, VENDOR
 
 STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
 """String descriptors by index: none, manufacturer, product, serial."""

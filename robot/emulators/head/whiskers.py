@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from pydantic import ValidationError
 
-from robot.drivers.head.protocol import (
+from robot.drivers.head.usb_protocol import (
     ANGLE,
     COMMAND_TIMEOUT,
     NO_THRESHOLD,
@@ -22,7 +22,7 @@ from robot.drivers.head.protocol import (
 )
 from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
 from robot.drivers.ur10.pose_listener import PoseListener
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.emulators.head.sensor_array import Block, block_samples
 from robot.simulation.head.baseline import Baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig

@@ -30,8 +30,8 @@ import time
 from typing import Any, Protocol
 
 from robot.drivers.ur10 import rtde_protocol
-from robot.emulators.ur10.config import WallConfig
 from robot.emulators.ur10.controller import EmulatedController
+from robot.emulators.ur10.emulator_config import WallConfig
 from robot.emulators.ur10.registers import Value
 
 NAN: Value = (math.nan,) * 6

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from robot.emulators.ur10.rotation import Vector6, matrix, quaternion, quaternion_of, rotation_vector
+from robot.emulators.ur10.rotations import Vector6, matrix, quaternion, quaternion_of, rotation_vector
 
 EDGE = 1e-9  # rounding tolerance at full extension
 FREE = 1e-6  # sine of joint 5 below which joints 4 and 6 count as coaxial

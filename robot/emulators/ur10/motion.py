@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from robot.emulators.ur10 import kinematics
-from robot.emulators.ur10.rotation import Vector6, compose_poses, invert_pose, rotate_by, rotation_between
+from robot.emulators.ur10.rotations import Vector6, compose_poses, invert_pose, rotate_by, rotation_between
 
 ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

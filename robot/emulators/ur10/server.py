@@ -23,9 +23,9 @@ from robot.drivers.process_priority import urgent
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.listening import listening
-from robot.emulators.ur10.config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.control_program import load_program
 from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime
+from robot.emulators.ur10.emulator_config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.fault_server import ControllerFaults, FaultSession
 from robot.emulators.ur10.motion import Unreachable
 from robot.emulators.ur10.registers import Value

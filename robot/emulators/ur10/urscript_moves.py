@@ -15,7 +15,7 @@ from robot.emulators.ur10.motion import (
     ToolSpeedMotion,
     linear_motion,
 )
-from robot.emulators.ur10.rotation import Vector6
+from robot.emulators.ur10.rotations import Vector6
 
 SMALL = 1e-9  # least speed and acceleration; the client accepts 0, at which a move never ends
 

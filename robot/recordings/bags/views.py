@@ -9,7 +9,6 @@ import numpy as np
 
 from robot.recordings.alignment import range_errors
 from robot.recordings.bags.bag import Bag, Topic
-from robot.recordings.bags.config import ViewsTopic
 from robot.recordings.bags.images import IMAGES, grey_image
 from robot.recordings.bags.scans import (
     CLOUD,
@@ -24,6 +23,7 @@ from robot.recordings.bags.scans import (
     wider_extent,
 )
 from robot.recordings.bags.stamps import Clock, Report, Series, as_series, read_usable
+from robot.recordings.bags.topics_config import ViewsTopic
 from robot.recordings.bags.transforms import FORWARD, Mount, mount_of
 from robot.recordings.camera.image_view import ImageViewConfig
 from robot.recordings.camera.rows import Frame, camera_rows

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import NonNegativeInt, PositiveInt
 
-from tactile.base.config import Settings, Side
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings, Side
 
 
 class Crop(Settings):

@@ -17,9 +17,9 @@ from robot.recordings.camera.rows import Frame
 from robot.recordings.csv_file import CsvFile
 from robot.recordings.sanity_checks import clock_errors
 from robot.sources.input_files import require_file
-from robot.sources.registry import Warn
-from tactile.base.config import Settings
+from robot.sources.source_registry import Warn
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 

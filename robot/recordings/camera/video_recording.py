@@ -16,7 +16,7 @@ from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
-from robot.sources.registry import Warn
+from robot.sources.source_registry import Warn
 from tactile.base.errors import InputError
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from robot.recordings.camera.image_view import Crop, cropped
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 
 class VisualOdometryConfig(Settings):

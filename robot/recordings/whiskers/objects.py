@@ -16,10 +16,10 @@ import numpy as np
 
 from robot.recordings.whiskers.number_table import read_rows
 from robot.sources.in_memory import InMemorySource
-from robot.sources.registry import SourceEntry
 from robot.sources.source_info import SourceInfo
-from tactile.base.config import Settings
+from robot.sources.source_registry import SourceEntry
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 WHISKERS, VALUES = 8, 16
 

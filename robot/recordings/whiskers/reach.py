@@ -16,9 +16,9 @@ from pydantic import PositiveFloat, PositiveInt
 
 from robot.recordings.whiskers.number_table import read_columns
 from robot.sources.in_memory import InMemorySource
-from robot.sources.registry import SourceEntry
-from tactile.base.config import Settings
+from robot.sources.source_registry import SourceEntry
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 from tactile.features.contact_stream import ContactStreamConfig, Touch, find_contacts, start_stream
 from tactile.features.free_record import DirtyRecordConfig, calibrate_free
 

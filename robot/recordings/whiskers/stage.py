@@ -16,11 +16,11 @@ from pydantic import PositiveFloat
 from robot.recordings.whiskers.number_table import read_columns
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_motions
-from robot.sources.registry import SourceEntry
 from robot.sources.source import Source
-from tactile.base.config import Settings
+from robot.sources.source_registry import SourceEntry
 from tactile.base.errors import InputError
 from tactile.base.samples import longest_run
+from tactile.base.settings import Settings
 
 COLUMNS = ("", "px", "py", "pz", "sx", "sy", "sz")
 """The index has no name."""

@@ -17,10 +17,10 @@ from scipy.io import loadmat
 
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, read_bytes
-from robot.sources.registry import SourceEntry
 from robot.sources.source_info import SourceInfo
-from tactile.base.config import Settings
+from robot.sources.source_registry import SourceEntry
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 FINGERS, TAXELS = 3, 22
 ARRAYS = ("TXZY_dataI", "TXZY_data")

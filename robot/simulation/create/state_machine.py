@@ -14,7 +14,7 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.types import MotionKind, StepEnd
 
 Share = Annotated[float, Field(ge=0, le=1)]

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, model_validator
 
 from robot.simulation.create.whisker_bending import Bending, Shaft, base_strain, bend_shafts
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.whiskers.head_geometry import Degrees
 
 MAX_LEAN = np.radians(75.0)

@@ -8,7 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.simulation.create.session import CreateSimulationConfig, drive_into_wall, train_strain_templates
+from robot.simulation.create.simulated_session import (
+    CreateSimulationConfig,
+    drive_into_wall,
+    train_strain_templates,
+)
 from tactile.base.new_file import require_new_file
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import NonNegativeFloat
 
 from robot.sources.odometry_correction import OdometryCorrection
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 
 BIAS_WHITE_SHARE = 0.2
 """White noise in addition to a bias, as a fraction of the level: 1 % with 5 %."""

@@ -13,8 +13,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from tactile.base.config import Settings
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 
 class BaselineConfig(Settings):

@@ -16,8 +16,8 @@ from robot.simulation.head.baseline import BaselineConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.world.head_trajectory import HeadPath, poses_at
 from robot.world.walls import Surroundings
-from tactile.base.config import Settings
-from tactile.features.contact import ShaftConfig, stiffness
+from tactile.base.settings import Settings
+from tactile.features.contact_threshold import ShaftConfig, stiffness
 from tactile.whiskers.head_geometry import Head
 from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
 

@@ -16,7 +16,7 @@ import numpy as np
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
 from robot.simulation.head.whisk_stream import WallSweep
-from tactile.features.contact import stiffness
+from tactile.features.contact_threshold import stiffness
 from tactile.whiskers.whisking import WhiskDrive, initial_drive, whisk_command
 
 WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]

@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from tactile.base.config import Settings
 from tactile.base.se2 import wrap
+from tactile.base.settings import Settings
 
 Brightness = Annotated[float, Field(ge=0, le=1)]
 RAYS = 5

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import NonNegativeFloat
 
-from tactile.base.config import Settings
 from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
 
 
 class RatOdometryConfig(Settings):

@@ -9,8 +9,8 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from robot.recordings.sanity_checks import RowName, clock_errors, nonfinite_errors
 from robot.sources.input_files import raise_errors
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 SPEED_WINDOW = 0.1
 """Shortest time over which a speed is measured, s: a tracker's jitter within it is not motion."""

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import ratslam
-from ratslam.runs.map_archive import FORMAT
+from ratslam.runs.checkpoint_file import FORMAT
 from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.runs.settings.strict_yaml import parse, validate
 from robot.recordings.formats import open_recording

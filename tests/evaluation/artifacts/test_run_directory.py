@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from evaluation.artifacts.closure_table import read_closures
-from evaluation.artifacts.run_directory import read_scorecard, read_walls, write_walls
+from evaluation.artifacts.run_reader import read_scorecard, read_walls, write_walls
 from evaluation.metrics.scorecard import score_run
 from tactile.base.errors import InputError
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.experience_log import change_rows
-from evaluation.metrics.experience_metric import (
+from evaluation.metrics.exm import (
     EXM_MODES,
     LITERAL_WARNING,
     NO_RELOCALISATION,
@@ -17,6 +16,7 @@ from evaluation.metrics.experience_metric import (
     experience_metric,
     relocalisations,
 )
+from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.statistics import bootstrap
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap

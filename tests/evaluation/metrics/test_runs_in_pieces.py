@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.artifacts.pieces_table import read_pieces, write_pieces
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics.map_pieces import arrange_pieces, ate_within_pieces
 from evaluation.metrics.run_metrics import PIECES
 from evaluation.metrics.scorecard import score_run, scorecard_lines

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.energy_metric import Relations
-from evaluation.metrics.experience_metric import ExmConfig
+from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.metric import Finding, Metric
-from evaluation.metrics.registry import METRICS, MetricEntry, build_metrics
+from evaluation.metrics.metric_registry import METRICS, MetricEntry, build_metrics
 from evaluation.metrics.scorecard import Scorecard, render_scorecard, score_run
-from tactile.base.config import Settings
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
+from tactile.base.settings import Settings
 
 
 def values(card):

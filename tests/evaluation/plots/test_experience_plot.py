@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.metrics.experience_metric import experience_metric
+from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.experience_plot import draw_experience_history
 

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 
-from evaluation.metrics.grid_score import score_grid
 from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, GridTruth, OccupancyGrid
+from evaluation.metrics.occupancy_score import score_grid
 from evaluation.plots.grid_plot import (
     GridPanel,
     GridPaths,

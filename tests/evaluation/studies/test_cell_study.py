@@ -29,8 +29,8 @@ from ratslam.classic.batch import Network
 from ratslam.classic.cell_batch import CellSets, walk
 from ratslam.cli import main
 from ratslam.runs.build_session import build_session
+from ratslam.runs.open_source import open_observations, read_observations
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.source import open_observations, read_observations
 
 ROOT = Path(__file__).parents[3]
 SMALL = ["sets=4", "steps=100", "chunk=2", "bins=5", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]

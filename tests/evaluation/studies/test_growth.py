@@ -17,7 +17,7 @@ from evaluation.studies.growth import GrowthPlan, GrowthTask, growth_study
 from evaluation.studies.growth_report import FILE, read_rows
 from evaluation.studies.growth_session import measure_growth
 from ratslam.cli import main
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze import CELL_SIDE
 
 ROOT = Path(__file__).parents[3]

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from evaluation.metrics.run_metrics import recognition_error
 from evaluation.metrics.statistics import pareto_optimal
 from evaluation.studies.metrics import COLUMNS, METRICS, find_error
-from evaluation.studies.report import make_report, render, save_report
 from evaluation.studies.schema import StudyPlan
-from evaluation.studies.summary import default_error, label, mark_optimal, spread, summarise
+from evaluation.studies.study_report import make_report, render, save_report
+from evaluation.studies.study_summary import default_error, label, mark_optimal, spread, summarise
 from tactile.base.errors import InputError
 from tests.evaluation.studies.conftest import record
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from evaluation.artifacts.run_directory import read_scorecard
+from evaluation.artifacts.run_reader import read_scorecard
 from evaluation.metrics.grid_metrics import GRID_METRICS
 from evaluation.studies.machine import COMPILED, Stopwatch
 from evaluation.studies.metrics import MEASURED, METRICS

@@ -11,10 +11,10 @@ import pytest
 
 from evaluation.studies.executor import Executor
 from evaluation.studies.metrics import MEASURED
+from evaluation.studies.parameter_search import search
 from evaluation.studies.records import FILE, RunLog
-from evaluation.studies.report import make_report
-from evaluation.studies.search import search
 from evaluation.studies.study import read_study
+from evaluation.studies.study_report import make_report
 from ratslam.cli import main
 from tactile.base.errors import InputError
 from tests.evaluation.studies.test_study_runner import start, wait_for

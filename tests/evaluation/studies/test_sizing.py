@@ -31,9 +31,9 @@ from evaluation.studies.trial_runs import cheaper_steps
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
 from ratslam.grid.particle_maps import LAYERS
+from ratslam.runs.open_source import open_source
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import override, parse, validate
-from ratslam.runs.source import open_source
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"

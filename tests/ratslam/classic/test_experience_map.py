@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
-from ratslam.core.types import Action, Estimate
+from ratslam.core.estimates import Action, Estimate
 from tactile.base.se2 import compose, integrate, inverse
 from tactile.base.types import Odometry, observation
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.classic.places import PlaceConfig, decide, distance, start
-from ratslam.core.types import Action
+from ratslam.core.estimates import Action
 
 CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)
 RINGS = np.array([11.0, 11.0, 36.0])

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.classic import pose_cells, window
+from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.level_step import StepInput, step_at
 from ratslam.classic.levels import from_full_torus, to_full_torus, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from ratslam.classic.pose_cells import Outcome
-from ratslam.classic.window import ring_difference
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
 

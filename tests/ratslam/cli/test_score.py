@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from evaluation.artifacts.run_directory import read_scorecard
+from evaluation.artifacts.run_reader import read_scorecard
 from ratslam.cli import main
 from tactile.base.errors import InputError
 from tests.ratslam.cli.run_cases import refuses

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
+from ratslam.runs.open_source import open_source
 from ratslam.runs.run import simulate
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from ratslam.runs.source import open_source
 from robot.recordings.mcap_reader import Recording
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tests.ratslam.cli.run_cases import refuses
 

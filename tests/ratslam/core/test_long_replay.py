@@ -114,7 +114,7 @@ def process_source(kind: str, steps: int, folder: Path) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.methods.registry import BACKENDS
+    from ratslam.methods.method_registry import BACKENDS
     from ratslam.runs.build_session import build_session
     from ratslam.runs.run import process_source
     from ratslam.runs.run_directory import RunDirectory

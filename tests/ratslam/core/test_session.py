@@ -14,7 +14,7 @@ import pytest
 from ratslam.core.path_map import PathMap
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.examples import dead_reckoning
-from ratslam.methods.registry import Sensors
+from ratslam.methods.method_registry import Sensors
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry, observation
 

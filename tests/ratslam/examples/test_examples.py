@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import ratslam.examples
-from evaluation.metrics.registry import METRICS
+from evaluation.metrics.metric_registry import METRICS
 from ratslam.examples import own_arrays, taxel_array
-from ratslam.methods.registry import BACKENDS
-from robot.sources.registry import SOURCES
+from ratslam.methods.method_registry import BACKENDS
+from robot.sources.source_registry import SOURCES
 from robot.touch_source import TOUCH
 
 NAMES = ("dead_reckoning", "own_arrays", "own_loop", "own_metric", "taxel_array")

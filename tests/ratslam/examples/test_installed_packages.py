@@ -11,7 +11,7 @@ import pytest
 
 from ratslam.__main__ import main
 from ratslam.examples import dead_reckoning
-from ratslam.methods.registry import BACKENDS
+from ratslam.methods.method_registry import BACKENDS
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config
 from tests.helpers.distributions import install

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.core.types import Estimate
+from ratslam.core.estimates import Estimate
 from ratslam.grid import genealogy
 from ratslam.methods.grid import GridEvidence
 from tactile.base.types import MotionKind

@@ -12,7 +12,7 @@ import numpy as np
 
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import HEAD_FAULTS, PATIENCE, Faults, emulator, until, ur_emulator
 from tests.ratslam.live.forked_process import raise_priority
 from tests.ratslam.live.live_session import Session

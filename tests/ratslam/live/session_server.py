@@ -21,10 +21,10 @@ from typing import Any
 
 LOADED = (
     "ratslam.cli.live",
-    "ratslam.live.session",
+    "ratslam.live.live_session",
     "ratslam.live.mapper_process",
     "robot.live.whisk_loop",
-    "robot.drivers.head.usb_tcp_backend",
+    "robot.drivers.head.emulated_cable",
     "evaluation.metrics.scorecard",
     "usb.core",
     "usb.util",
@@ -62,7 +62,7 @@ def _fork() -> int:
 
 def _become_session(order: dict[str, Any], program: Any) -> None:
     """Runs the program in a new session of processes; does not return."""
-    import ratslam.live.session
+    import ratslam.live.live_session
     from robot.live import selftest
     from tests.ratslam.live import stub_mapper
 
@@ -74,9 +74,9 @@ def _become_session(order: dict[str, Any], program: Any) -> None:
     arguments = order["arguments"]
     directory, takes = arguments[arguments.index("-o") + 1], order["mapper"]
     mapping = None if takes is None else partial(stub_mapper.mapping, directory, takes)
-    run = ratslam.live.session.run_live_session
+    run = ratslam.live.live_session.run_live_session
     # Without the process that draws the map.
-    ratslam.live.session.run_live_session = lambda *given, armed, view: run(
+    ratslam.live.live_session.run_live_session = lambda *given, armed, view: run(
         *given, mapping=mapping, view=view
     )
     if not order["rate_check"]:

@@ -14,10 +14,10 @@ import pytest
 from evaluation.metrics.trajectory import write_tum
 from evaluation.papers.maps.sessions import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
-from evaluation.papers.tables.touch import MAIN
+from evaluation.papers.tables.touch_table import MAIN
 from ratslam.live.goal_steering import plan_goals
 from ratslam.runs.settings.run_config import load_config
-from robot.live.route import plan_path
+from robot.live.arm_route import plan_path
 from tactile.whiskers.head_geometry import ur10_head
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS
 from tests.ratslam.live.test_complete_session import CONFIG, PATIENT, emulated

@@ -7,13 +7,13 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from ratslam.mapping.calibration import (
+from ratslam.mapping.config import KeyframeMapConfig
+from ratslam.mapping.odometry_calibration import (
     HeadingNoise,
     starting_calibration,
     starting_noise,
     write_calibration,
 )
-from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.optimizer import CalibrationPrior, MapCovariance
 from tactile.base.se2 import wrap
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, TRUE, drive, new_map

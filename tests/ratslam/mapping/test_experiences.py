@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.types import Action
+from ratslam.core.estimates import Action
 from ratslam.mapping.experiences import ExperienceChange, Experiences
 from tactile.base.se2 import between, compose, wrap
 

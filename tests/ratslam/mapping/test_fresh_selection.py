@@ -9,9 +9,9 @@ import pytest
 
 from evaluation.papers.maps.scenarios import ten_circuits
 from evaluation.papers.maps.stored_maps import store_map
-from ratslam.mapping.calibration import HeadingNoise
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT, STEPS, SelectionProblem, select_closures
 from ratslam.mapping.map_solution import NOISY, reconsidered, seems_noisy
+from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.mapping.optimizer import solve
 from tests.ratslam.mapping.selection_cases import off, world
 

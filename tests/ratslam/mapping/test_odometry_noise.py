@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping.calibration import (
+from ratslam.mapping.odometry_calibration import (
     LARGEST_STEP,
     LEAST_FACTOR,
     SPREAD,

@@ -13,9 +13,9 @@ from ratslam.core.session import CHUNK, capacity_at
 from ratslam.examples import dead_reckoning
 from ratslam.methods.grid import GridOutcome
 from ratslam.methods.localise_grid import GridLocaliseOutcome
-from ratslam.methods.registry import BACKENDS
+from ratslam.methods.method_registry import BACKENDS
 from ratslam.places.localiser import Localisation
-from ratslam.service.checks.backend import CHECKS
+from ratslam.service.checks.backend_checks import CHECKS
 from ratslam.service.checks.backend_trial import CIRCUIT, BackendTrial
 
 

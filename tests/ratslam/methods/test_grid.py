@@ -10,7 +10,7 @@ import pytest
 from ratslam.core.session import Session
 from ratslam.methods.config import GridBackendConfig
 from ratslam.methods.grid import GridOutcome
-from ratslam.methods.registry import Sensors, build
+from ratslam.methods.method_registry import Sensors, build
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tests.helpers.grid_world import STEADY, create, drive, filter_of, initial, report, settings

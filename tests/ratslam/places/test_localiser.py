@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from ratslam.core.types import Action, Estimate
+from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.appearance import LabelAppearance
-from ratslam.mapping.calibration import HeadingNoise
 from ratslam.mapping.closure_odds import AcceptByOdds
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.ground import Ground
 from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.places.localiser import Localisation, Localiser, Place
 from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation, Odometry, observation

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ratslam
-from ratslam.methods.registry import Sensors
+from ratslam.methods.method_registry import Sensors
 from ratslam.classic.cell_probe import active_cells
 from ratslam.classic.levels import to_full_torus
 from ratslam.runs.settings.run_config import LoopConfig

@@ -18,7 +18,7 @@ from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
 from ratslam.runs.continuation import resume_session
-from ratslam.runs.map_archive import digest_of
+from ratslam.runs.checkpoint_file import digest_of
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map

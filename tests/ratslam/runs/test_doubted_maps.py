@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics import run_metrics
 from evaluation.metrics.scorecard import render_health, render_warnings, score_run
 from evaluation.metrics.trajectory import ate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ratslam.runs.goal_planner import GoalPlanner, felt_points
-from robot.live.config import LiveConfig
+from robot.live.live_config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute

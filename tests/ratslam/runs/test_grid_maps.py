@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from evaluation.papers.tables.grid import GridFigures, GridTask, measure_session
+from evaluation.papers.tables.grid_table import GridFigures, GridTask, measure_session
 
 ONE, FEW, MANY = (9100,), (9100, 9101), tuple(range(9100, 9108))
 ARENAS = pytest.mark.parametrize("arenas", [ONE, pytest.param(FEW, marks=pytest.mark.soak)])

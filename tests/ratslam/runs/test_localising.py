@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ratslam.methods.registry import LOCALISING
+from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.runs.localise import localising
-from ratslam.runs.map_archive import FORMAT
+from ratslam.runs.checkpoint_file import FORMAT
 from ratslam.runs.saved_map import SavedMap
 from robot.sources.description import SourceDescription
 from tactile.base.errors import InputError

@@ -14,7 +14,7 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs import merge as merging
 from ratslam.runs.merge import merge_maps
 from ratslam.runs.saved_map import describe_readings, read_map, write_map
-from robot.simulation.head.session import HeadSimulation
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap

@@ -13,8 +13,8 @@ from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.examples import taxel_array
 from ratslam.runs.run import run
-from ratslam.runs.source import open_source
-from robot.sources.registry import SOURCES
+from ratslam.runs.open_source import open_source
+from robot.sources.source_registry import SOURCES
 from robot.touch_source import TOUCH
 from tests.helpers import tactile_arrays
 

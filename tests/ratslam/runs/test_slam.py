@@ -12,8 +12,8 @@ import pytest
 import ratslam
 from ratslam.core.session import Step
 from ratslam.runs.estimate import pose_estimate
-from ratslam.runs.source import open_observations
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from ratslam.runs.open_source import open_observations
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.types import MotionKind, Report, Whisk
 
 ROOT = Path(__file__).parents[3]

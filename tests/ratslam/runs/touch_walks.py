@@ -14,8 +14,8 @@ from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.runs.build_session import build_session
-from ratslam.runs.source import read_observations
-from robot.simulation.head.session import HeadSimulation
+from ratslam.runs.open_source import read_observations
+from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation

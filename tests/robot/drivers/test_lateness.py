@@ -10,7 +10,7 @@ import pytest
 
 from robot.drivers.lateness import WINDOW, LatenessMeter
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.late_findings import ended_script_finding, silent_session_finding, stale_finding
 
 REAL = ArmConfig(host="192.168.1.10")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.base_transform import pose_from_tcp
-from robot.live.config import LiveConfig
-from robot.live.route import approach_route, descent_route, main_route, plan_path
+from robot.live.arm_route import approach_route, descent_route, main_route, plan_path
+from robot.live.live_config import LiveConfig
 from robot.world.head_trajectory import poses_at
 from robot.world.scene import make_scene
 from tactile.base.errors import InputError

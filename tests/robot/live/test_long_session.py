@@ -14,7 +14,7 @@ import pytest
 from robot.drivers.head.cycle_assembly import make_cut
 from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.live.arm_odometry import ArmOdometry
-from robot.live.config import LiveConfig
+from robot.live.live_config import LiveConfig
 from robot.sources.odometry import OdometryConfig
 from tests.robot.live.live_recordings import RATE, START, open_recorder, some_frames, some_states
 

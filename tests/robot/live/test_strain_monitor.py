@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import frame_values
+from robot.drivers.head.usb_protocol import frame_values
 from robot.live.create_rig import StrainMonitor
 
 RATE, PERIOD, SCALE, WHISKERS = 2000.0, 0.01, 0.01, 3

@@ -27,10 +27,10 @@ from robot.recordings.formats import FORMATS, open_recording
 from robot.recordings.mcap_reader import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.input_files import read_bytes
-from robot.sources.registry import SOURCES, SourceEntry
 from robot.sources.source import Source
-from tactile.base.config import Settings
+from robot.sources.source_registry import SOURCES, SourceEntry
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 from tests.helpers.distributions import install
 
 ROOT = Path(__file__).parents[3]

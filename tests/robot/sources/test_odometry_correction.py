@@ -10,7 +10,7 @@ import pytest
 from robot.recordings.formats import open_recording
 from robot.recordings.mcap_reader import record_source
 from robot.recordings.recording_config import RecordingConfig
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
 from robot.sources.odometry import from_motions
 from robot.sources.odometry_correction import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
 from robot.sources.view_controls import apply_control
 from robot.touch_source import open_touch_source

@@ -11,7 +11,13 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
 from tactile.features.calibration import Calibration
-from tactile.features.contact import ContactConfig, ShaftConfig, detect_contacts, radial_distance, stiffness
+from tactile.features.contact_threshold import (
+    ContactConfig,
+    ShaftConfig,
+    detect_contacts,
+    radial_distance,
+    stiffness,
+)
 
 AMPLITUDE = 1.134
 W = 18

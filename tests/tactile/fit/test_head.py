@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
 from tactile.fit.head import HeadFit, fit_head

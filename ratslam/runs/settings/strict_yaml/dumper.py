@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from ratslam.runs.settings.strict_yaml.reader import read_word
+from ratslam.runs.settings.strict_yaml.yaml_reader import read_word
 
 _TEXT = "tag:yaml.org,2002:str"
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ratslam.runs.settings.strict_yaml.document import Document, KeyPath, describe, join_keys, join_words
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.errors import InputError
 
 _MAX_ERRORS = 50

@@ -23,7 +23,7 @@ from evaluation.papers.cells.belief_lesions import (
     table_lesions,
 )
 from evaluation.papers.cells.figure import CellTask
-from evaluation.papers.tables import touch
+from evaluation.papers.tables import touch_table as touch
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
 from ratslam.network.pose_cells import ViewCells

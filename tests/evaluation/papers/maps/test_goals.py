@@ -22,7 +22,7 @@ from evaluation.papers.maps.goals import (
 )
 from evaluation.papers.maps.sessions import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
-from evaluation.papers.tables.touch import MAIN
+from evaluation.papers.tables.touch_table import MAIN
 from robot.live.goal_drive import DriveState
 from robot.world.maze import cell_centre
 

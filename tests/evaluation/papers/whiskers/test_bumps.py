@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.papers.whiskers import bumps
 from evaluation.papers.whiskers.bumps import BumpsResult
-from ratslam.core.types import GridDrawing
+from ratslam.core.estimates import GridDrawing
 from tactile.base.errors import InputError
 
 

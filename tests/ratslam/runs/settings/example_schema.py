@@ -9,7 +9,7 @@ import pytest
 from pydantic import Field, model_validator
 
 from ratslam.runs.settings.strict_yaml import override, parse, validate
-from tactile.base.config import Settings
+from tactile.base.settings import Settings
 from tactile.base.errors import InputError
 
 

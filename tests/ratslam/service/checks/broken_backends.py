@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.core.backend import Backend
+from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.core.path_map import PathMap
-from ratslam.core.types import Action, Estimate, Scalar
-from ratslam.methods.registry import BackendEntry
+from ratslam.methods.method_registry import BackendEntry
 from tactile.base.errors import InputError
 from tactile.base.plugins import NoSettings
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import pytest
 
 from evaluation.metrics.metric import Finding, Metric
-from evaluation.metrics.registry import METRICS, MetricEntry
+from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from ratslam.cli import main
 from ratslam.examples import dead_reckoning
-from ratslam.methods.registry import BACKENDS
-from ratslam.service.checks import backend, metric, source, touch
+from ratslam.methods.method_registry import BACKENDS
+from ratslam.service.checks import backend_checks as backend
+from ratslam.service.checks import metric, source, touch
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
-from robot.sources.registry import SOURCES, SourceEntry
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
+from robot.sources.source_registry import SOURCES, SourceEntry
 from robot.touch_source import TOUCH, TouchEntry
-from tactile.base.config import Settings
 from tactile.base.plugins import NoSettings
+from tactile.base.settings import Settings
 from tactile.frontend import Frontend, TouchConfig
 from tactile.whiskers.head_geometry import HeadConfig
 from tests.ratslam.service.checks import broken_backends

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.metric import Finding, Metric
-from evaluation.metrics.registry import MetricEntry
+from evaluation.metrics.metric_registry import MetricEntry
 from evaluation.metrics.run_metrics import RUN_METRICS
-from ratslam.service.checks.common import run_checks
-from ratslam.service.checks.metric import CHECKS, GROUPS, MetricTrial
+from ratslam.service.checks.check_results import run_checks
+from ratslam.service.checks.metric_checks import CHECKS, GROUPS, MetricTrial
 from tactile.base.plugins import NoSettings
 
 

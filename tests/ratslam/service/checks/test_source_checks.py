@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.service.checks.common import run_checks
-from ratslam.service.checks.source import CHECKS, GROUPS
+from ratslam.service.checks.check_results import run_checks
+from ratslam.service.checks.source_checks import CHECKS, GROUPS
 from ratslam.service.checks.source_trial import SourceTrial
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.whiskers import objects
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
-from robot.sources.registry import SourceEntry
+from robot.sources.source_registry import SourceEntry
 from robot.touch_source import TOUCH, TouchEntry
 from tactile.base.plugins import NoSettings, PluginConfig
 from tactile.base.types import Odometry, observation

@@ -14,7 +14,7 @@ from evaluation.cells.analysis import AnalysisSettings, analyse_cells
 from evaluation.cells.recording import write_recording
 from ratslam.classic.pose_cell_config import NetworkConfig
 from ratslam.cli import main
-from ratslam.service.export.formats import export_run
+from ratslam.service.export.export_formats import export_run
 from ratslam.service.export.nwb import EPOCH, write_nwb
 from ratslam.service.rats.cell_poses import cell_poses
 from ratslam.service.rats.settled_peak import settled_peak

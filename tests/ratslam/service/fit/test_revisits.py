@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ratslam.runs.open_source import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.source import open_source
 from ratslam.service.fit.record import RevisitFit, fit_record, fit_revisits, fit_wheels_of
-from ratslam.service.fit.rig import rig_settings
-from ratslam.service.fit.wheels import fit_wheels
+from ratslam.service.fit.rig_fit import rig_settings
+from ratslam.service.fit.wheel_fit import fit_wheels
 from robot.sources.in_memory import load_into_memory
 
 ROOT = Path(__file__).parents[4]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
-from ratslam.service.fit.wheels import WheelFit, fit_wheels
+from ratslam.service.fit.wheel_fit import WheelFit, fit_wheels
 from robot.sources.odometry import from_motions
 from robot.sources.odometry_correction import correct_motions
 from tactile.base.errors import InputError

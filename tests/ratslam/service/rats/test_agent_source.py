@@ -10,7 +10,7 @@ from ratinabox.Environment import Environment
 import ratslam
 from ratslam.service.rats.agent_source import agent_in_box, agent_path, agent_source
 from robot.simulation.rat.rat_odometry import RatOdometryConfig
-from robot.simulation.rat.session import RatSimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulationConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, integrate, inverse, wrap

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from ratslam.core.types import GridDrawing
+from ratslam.core.estimates import GridDrawing
 from ratslam.runs.progress import MapReport, RunDescription, StepReport
 from ratslam.service.viewer.drawing import Drawing, open_recording, whisker_curves
 from tactile.base.types import Odometry, observation

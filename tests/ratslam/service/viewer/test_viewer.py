@@ -16,7 +16,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from evaluation.artifacts.closure_table import read_closure_table
-from evaluation.artifacts.run_directory import read_run
+from evaluation.artifacts.run_reader import read_run
 from ratslam.cli import main
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config

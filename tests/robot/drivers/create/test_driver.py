@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from robot.drivers.create.config import CreateConfig
 from robot.drivers.create.driver import CreateDriver, NoAnswer, NotSafe
+from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.serial_link import NoPort
 from robot.drivers.create.stop_reasons import CommandRefused, StopReason
 from tactile.base.errors import InputError
@@ -213,7 +213,7 @@ def test_switching_off_is_reported(emulated: Emulated) -> None:
 DRIVES = """
 import sys, time
 from robot.drivers.create.driver import CreateDriver
-from robot.drivers.create.config import CreateConfig
+from robot.drivers.create.driver_config import CreateConfig
 driver = CreateDriver(CreateConfig(port=sys.argv[1], patience=1.0, silence=5.0))
 driver.start()
 while True:

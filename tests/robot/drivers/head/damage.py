@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import strategies as st
 
-from robot.drivers.head.protocol import pack_frames
+from robot.drivers.head.usb_protocol import pack_frames
 
 GARBAGE = (b"", b"\0", b"W", b"WH", b"WHK", b"WHK1", b"WHK1WHK1", b"WHKC", b"1", b"WWHK1", b"\xff" * 9)
 

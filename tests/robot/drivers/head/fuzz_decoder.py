@@ -13,7 +13,7 @@ import atheris
 with atheris.instrument_imports(include=["robot.drivers.head"]):
     from robot.drivers.head.decoder import Decoder, DecoderCounts
 
-from robot.drivers.head.protocol import pack_frames
+from robot.drivers.head.usb_protocol import pack_frames
 from tests.robot.drivers.head.oracle import decode_reference
 
 SHAPE = (2, 1)

@@ -9,7 +9,7 @@ import threading
 import numpy as np
 
 from robot.drivers.head.device import Disconnected, Stalled
-from robot.drivers.head.protocol import CHANNELS, Command, Request, pack_frames, unpack_command
+from robot.drivers.head.usb_protocol import CHANNELS, Command, Request, pack_frames, unpack_command
 
 WHISKERS = 2
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import Decoder, DecoderCounts, Frames
-from robot.drivers.head.protocol import FrameFlag, pack_frames
+from robot.drivers.head.usb_protocol import FrameFlag, pack_frames
 from tests.robot.drivers.head.damage import damaged_stream, flip_bits, streams
 from tests.robot.drivers.head.oracle import Sample, decode_reference
 

@@ -9,7 +9,6 @@ from array import array
 
 import pytest
 
-from robot.drivers.head.config import Address, HeadLinkConfig
 from robot.drivers.head.device import (
     Disconnected,
     HeadIdentity,
@@ -18,7 +17,8 @@ from robot.drivers.head.device import (
     open_bridge,
     read_identity,
 )
-from robot.drivers.head.protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
+from robot.drivers.head.driver_config import Address, HeadLinkConfig
+from robot.drivers.head.usb_protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
 from tactile.base.errors import InputError
 from tests.robot.drivers.head.memory import MemoryHead
 
@@ -182,7 +182,7 @@ def test_usb_is_imported_lazily():
     code = """
 import sys
 import robot.drivers.head.device, robot.drivers.head.reader
-import robot.drivers.head.whisk_control, robot.drivers.head.config
+import robot.drivers.head.whisk_control, robot.drivers.head.driver_config
 print([name for name in ("usb", "libusb_package", "jax", "robot.emulators") if name in sys.modules])
 """
     done = subprocess.run(

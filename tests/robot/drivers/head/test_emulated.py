@@ -11,10 +11,10 @@ import time
 import numpy as np
 import pytest
 
-from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.device import open_bridge
-from robot.drivers.head.protocol import ANGLE, FrameFlag
+from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.head.usb_protocol import ANGLE, FrameFlag
 from robot.drivers.head.whisk_control import HeadDriver
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head
 from tactile.whiskers.whisking import WhiskingConfig

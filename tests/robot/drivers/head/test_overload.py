@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.head.protocol import ANGLE
 from robot.drivers.head.reader import OverloadDetector
+from robot.drivers.head.usb_protocol import ANGLE
 
 LIMIT = 1000
 

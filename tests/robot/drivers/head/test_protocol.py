@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.head.protocol import (
+from robot.drivers.head.usb_protocol import (
     ANGLE,
     KEEP_ALIVE,
     Command,

@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from robot.drivers.head.config import HeadLinkConfig
-from robot.drivers.head.protocol import Command, CommandKind, FeedbackMode, Request
+from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.head.usb_protocol import Command, CommandKind, FeedbackMode, Request
 from robot.drivers.outcome import SessionOutcome
 from tactile.base.errors import InputError
 from tests.helpers.live import until

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.head.decoder import Decoder, Frames
-from robot.drivers.head.protocol import (
+from robot.drivers.head.emulated_cable import SocketBackend
+from robot.drivers.head.usb_protocol import (
     ENDPOINT_IN,
     ENDPOINT_OUT,
     KEEP_ALIVE,
@@ -29,8 +30,7 @@ from robot.drivers.head.protocol import (
     Request,
     pack_command,
 )
-from robot.drivers.head.usb_tcp_backend import SocketBackend
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import Faults, until
 from tests.robot.emulators.head.heads import drive, running
 

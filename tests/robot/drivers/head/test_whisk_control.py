@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.config import HeadLinkConfig
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.protocol import ANGLE, NO_THRESHOLD, CommandKind, FeedbackMode, FrameFlag, to_counts
+from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.reader import HeadReader
+from robot.drivers.head.usb_protocol import (
+    ANGLE,
+    NO_THRESHOLD,
+    CommandKind,
+    FeedbackMode,
+    FrameFlag,
+    to_counts,
+)
 from robot.drivers.head.whisk_control import HeadDriver, HostRcp, whisk_commands
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, ur10_head

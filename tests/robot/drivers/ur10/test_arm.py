@@ -11,8 +11,8 @@ import pytest
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.config import BoxConfig
 from robot.drivers.ur10.dashboard import Dashboard
+from robot.drivers.ur10.driver_config import BoxConfig
 from robot.drivers.ur10.safety import TargetRefused
 from tests.helpers.live import PATIENCE, Faults, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings

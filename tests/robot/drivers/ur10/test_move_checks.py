@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.config import SPEED_CAP
+from robot.drivers.ur10.driver_config import SPEED_CAP
 from robot.drivers.ur10.safety import TargetRefused, in_box
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.test_command_thread import poses, speeds

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.drivers.ur10.config import SPEED_CAP, ArmConfig, BoxConfig
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig
 from robot.drivers.ur10.safety import (
     MIN_SPEED,
     MOVED_ON,

@@ -10,12 +10,12 @@ import pytest
 
 from robot.drivers.create.protocol import QUERY, REPLY, SAFE, START, Bumps, drive
 from robot.drivers.head.decoder import Decoder
-from robot.drivers.head.protocol import ANGLE, REQUEST_OUT, Request, to_radians
+from robot.drivers.head.usb_protocol import ANGLE, REQUEST_OUT, Request, to_radians
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
-from robot.emulators.create.config import CreateWorldConfig
+from robot.emulators.create.emulator_config import CreateWorldConfig
 from robot.emulators.create.serial_line import Terminal
 from robot.emulators.create.server import CreateWhiskers
-from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.emulated_device import EmulatedHead
 from robot.simulation.create.strain_sensors import (
     ShakeConfig,
     WhiskersConfig,

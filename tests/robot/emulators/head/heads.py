@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.head.decoder import Decoder, Frames
-from robot.drivers.head.protocol import (
+from robot.drivers.head.usb_protocol import (
     KEEP_ALIVE,
     REQUEST_OUT,
     Command,
@@ -19,8 +19,8 @@ from robot.drivers.head.protocol import (
     pack_command,
     to_counts,
 )
-from robot.emulators.head.config import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.device import EmulatedHead
+from robot.emulators.head.emulated_device import EmulatedHead
+from robot.emulators.head.emulator_config import CONTROL_PORT, HeadEmulatorConfig
 from robot.emulators.head.sensor_array import BLOCK
 from robot.emulators.head.whiskers import AlongPath, PoseSource, maze_whiskers
 from robot.world.scene import KidnapConfig, Scene, make_scene

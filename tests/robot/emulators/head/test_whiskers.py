@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.drivers.head.protocol import (
+from robot.drivers.head.usb_protocol import (
     ANGLE,
     COMMAND_TIMEOUT,
     Command,
@@ -18,7 +18,7 @@ from robot.drivers.head.protocol import (
 )
 from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.pose_listener import ToolPose
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.emulators.head.sensor_array import BLOCK
 from robot.emulators.head.whiskers import AHEAD, AlongPath, CarriedByArm
 from robot.simulation.head.baseline import HALL_BASELINE, BaselineConfig, make_baseline

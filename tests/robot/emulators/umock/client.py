@@ -10,8 +10,8 @@ from typing import Any
 
 from robot.drivers.head.decoder import Decoder
 from robot.drivers.head.device import Bridge, Disconnected, Stalled, open_bridge, read_identity
-from robot.drivers.head.protocol import KEEP_ALIVE, Request, pack_command
-from robot.emulators.head.config import CONTROL_PORT
+from robot.drivers.head.usb_protocol import KEEP_ALIVE, Request, pack_command
+from robot.emulators.head.emulator_config import CONTROL_PORT
 from tests.robot.emulators.head.heads import drive
 
 

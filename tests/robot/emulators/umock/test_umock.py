@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from robot.emulators.head.config import HeadEmulatorConfig
+from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import ROOT
 from tests.robot.emulators.head.heads import running
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from robot.emulators.ur10.config import UrEmulatorConfig
 from robot.emulators.ur10.controller import Runtime
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.server import DashboardSession, ScriptSession, emulated_controller
 
 PROGRAM = b"def rtde_control():\n    global reg_offset_int = # int register offset\n0\nend\n"

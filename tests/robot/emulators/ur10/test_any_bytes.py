@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import DATA, INPUTS, OUTPUTS, PROTOCOL, START, TEXT
-from robot.emulators.ur10.config import UrEmulatorConfig
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.server import (
     Claims,
     DashboardSession,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robot.emulators.ur10.kinematics import UR10, UR10E, Geometry, backward, forward, solutions
-from robot.emulators.ur10.rotation import (
+from robot.emulators.ur10.rotations import (
     compose_poses,
     invert_pose,
     quaternion,

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from robot.emulators.ur10.arm import EmulatedArm
-from robot.emulators.ur10.config import UrEmulatorConfig, WallConfig
+from robot.emulators.ur10.emulated_arm import EmulatedArm
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.motion import Profile, Unreachable
-from robot.emulators.ur10.rotation import rotation_between
+from robot.emulators.ur10.rotations import rotation_between
 from robot.emulators.ur10.urscript_moves import MoveL, StopL, parse_moves
 
 DOWN = (math.pi, 0.0, 0.0)

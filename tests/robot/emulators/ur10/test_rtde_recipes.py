@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from robot.drivers.ur10 import rtde_protocol
-from robot.emulators.ur10.config import UrEmulatorConfig
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.server import Claims, RtdeSession, emulated_controller
 from tests.robot.emulators.ur10.controller_bench import HERE, Bench
 

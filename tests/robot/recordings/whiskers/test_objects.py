@@ -10,7 +10,7 @@ import pytest
 
 import ratslam
 from robot.recordings.whiskers.objects import ObjectConfig, open_object, read_object
-from robot.sources.registry import SOURCES
+from robot.sources.source_registry import SOURCES
 from tactile.base.errors import InputError
 
 CHERRY = Path(__file__).parents[3] / "data" / "real_touch" / "purdue" / "cherry.csv"

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.service.checks.source import check_source
+from ratslam.service.checks.source_checks import check_source
 from robot.recordings.whiskers.reach import COLUMNS, ENTRY, WHISKERS, ReachConfig, open_reach, read_reach
-from robot.sources.registry import SOURCES
+from robot.sources.source_registry import SOURCES
 from tactile.base.errors import InputError
 
 FILE = Path(__file__).parents[3] / "data" / "real_touch" / "stanford" / "reach_free_rows.csv"

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from robot.recordings.whiskers.taxels import TaxelConfig, open_contacts, read_contacts
-from robot.sources.registry import SOURCES
+from robot.sources.source_registry import SOURCES
 from tactile.base.errors import InputError
 
 SLICE = Path(__file__).parents[3] / "data" / "real_touch" / "sheffield" / "TXZY_dataI.mat"

@@ -10,7 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, drive_into_wall
+from robot.simulation.create.simulated_session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    drive_into_wall,
+)
 from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import Sample, Source
 from robot.world.arena import arena_text, in_free_space, wall_segments

@@ -22,7 +22,7 @@ from robot.world.arena import Arena, has_clearance, wall_segments
 from robot.world.polygons import polygon_edges, segment_distance, segments_cross, square
 from robot.world.random_arena import ArenaConfig, make_arena
 from tactile.base.random_streams import stream
-from tactile.features.contact import ShaftConfig, stiffness
+from tactile.features.contact_threshold import ShaftConfig, stiffness
 
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()

@@ -9,7 +9,11 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, train_strain_templates
+from robot.simulation.create.simulated_session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    train_strain_templates,
+)
 from robot.simulation.create.template_training import (
     DURATIONS,
     ESTIMATORS,

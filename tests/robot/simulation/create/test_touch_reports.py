@@ -7,7 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.simulation.create.session import CreateSimulation, CreateSimulationConfig, drive_into_wall
+from robot.simulation.create.simulated_session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    drive_into_wall,
+)
 from robot.world.arena import wall_segments
 from robot.world.polygons import segment_distance
 from robot.world.random_arena import ArenaConfig

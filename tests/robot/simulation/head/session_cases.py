@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.simulation.head.session import HeadSimulation, SimulationConfig
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import Sample, Source
 from tactile.base.types import Cycle
 from tactile.whiskers.head_geometry import HeadConfig

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig, make_baseline
-from robot.simulation.head.session import HeadSimulation, SimulationConfig, choose_tier
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig, choose_tier
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from robot.simulation.head.session import HeadSimulation, SimulationConfig, choose_tier
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig, choose_tier
 from tactile.base.errors import InputError
 from tactile.whiskers.head_geometry import HeadConfig, RingConfig
 from tests.robot.simulation.head.session_cases import LOOP, simulate

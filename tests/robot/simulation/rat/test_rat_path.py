@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.simulation.rat.rat_path import MotionConfig, RatPath, sample_path
-from robot.simulation.rat.session import (
+from robot.simulation.rat.simulated_session import (
     PACKAGED,
     PathFileConfig,
     RandomWalkConfig,

@@ -7,7 +7,7 @@ import pytest
 
 from robot.simulation.rat.box import BoxConfig
 from robot.simulation.rat.rat_path import RatPath
-from robot.simulation.rat.session import RatSimulation, RatSimulationConfig
+from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, integrate
 

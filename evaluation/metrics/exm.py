@@ -1,0 +1,249 @@
+"""The Experience Metric: the rates of re-localisation (ARR) and of correct re-localisation (ARCR).
+
+Source: Salman & Pearson 2016, Algorithm 1; "line" below is a line of it. As printed, its ARCR is always 0
+(the set of correct re-localisations only grows from its own members), so there are four modes:
+
+    strict   the verdict on the first step of a visit holds for the visit; the pose of an experience is the
+             one at its creation; a new experience is valid if the last re-localisation was correct
+    paper    the printed listing with line 26 corrected in analogy to lines 10 and 11
+    or       line 26 with "or": a wrong visit counts as correct from its second step; for comparison only
+    literal  the printed listing
+
+ARR is the same in all four.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import NonNegativeInt, PositiveFloat
+
+from evaluation.metrics.experience_log import change_rows, creation_rows
+from tactile.base.errors import InputError
+from tactile.base.se2 import wrap
+from tactile.base.settings import Settings
+
+ExmMode = Literal["strict", "paper", "or", "literal"]
+EXM_MODES: tuple[ExmMode, ...] = ("strict", "paper", "or", "literal")
+
+NO_RELOCALISATION = "no re-localisation: ARCR is 0/0"
+LITERAL_WARNING = "0 by construction: the printed line 26 never holds"
+
+
+class ExmConfig(Settings):
+    """Settings of Algorithm 1."""
+
+    mode: ExmMode = "strict"
+    """Reading of the listing (see the module)."""
+    log: Literal["step", "action"] = "step"
+    """One entry per step (the paper's) or per change of experience; their values are not comparable."""
+    base: NonNegativeInt | None = None
+    """Number of steps in the base set (i_base); null: up to the first return to the start."""
+    position: PositiveFloat = 0.1
+    """Position threshold, m (Salman & Pearson 2016, section III-G)."""
+    heading_deg: PositiveFloat = 25.0
+    """Heading threshold, degrees (same source)."""
+
+
+DEFAULT_EXM = ExmConfig()
+
+
+class ExperienceMetric(NamedTuple):
+    """ARR and ARCR of one run with their counts.
+
+    Attributes:
+        arr: re-localisations / entries after the base set; NaN without entries.
+        arcr: correct re-localisations / re-localisations; NaN without re-localisations.
+        entries: entries after the base set. relocalisations: eta. correct: eta_c.
+        base: entries in the base set, in the log used.
+        mode, log: as in `ExmConfig`. note: reason for NaN, or a warning ('' for none).
+        counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
+        near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
+    """
+
+    arr: float
+    arcr: float
+    entries: int
+    relocalisations: int
+    correct: int
+    base: int
+    mode: ExmMode
+    log: str
+    note: str
+    counted: np.ndarray
+    right: np.ndarray
+    near: np.ndarray
+
+    @property
+    def arcr_chain_free(self) -> float:
+        """Share of the re-localisations that are near the truth, whether or not earlier ones were correct.
+
+        NaN without re-localisations.
+        """
+        return float(self.near[self.counted].mean()) if self.counted.any() else np.nan
+
+
+class _Reading(NamedTuple):
+    """The parts of the listing that differ between modes.
+
+    Attributes:
+        perceived: ids [N] -> [N], the entry whose true pose an entry is compared with (lines 18 to 21).
+        turn: heading difference -> the angle that is compared (line 23).
+        correct: (line 24 holds, this is a dwell step, verdict on the entry before) -> verdict (line 26).
+        back: 1 if the experience of the entry before becomes valid, 0 if that of this entry does when it is
+            new (lines 34 to 37).
+    """
+
+    perceived: Callable[[np.ndarray], np.ndarray]
+    turn: Callable[[np.ndarray], np.ndarray]
+    correct: Callable[[bool, bool, bool], bool]
+    back: int
+
+
+def experience_metric(
+    experience: np.ndarray, truth: np.ndarray, config: ExmConfig = DEFAULT_EXM
+) -> ExperienceMetric:
+    """ARR and ARCR of one run (Algorithm 1).
+
+    Args:
+        experience: [N] id of the current experience at each step, -1 for none (such steps are skipped).
+            Renumbering does not change the result.
+        truth: [N, 3] true poses, m, m, rad.
+
+    Raises:
+        InputError: the logs differ in length, a true pose is not finite, the base set is out of range, or
+            none is given and the run never returns to its start.
+    """
+    experience, truth = _check_log(experience, truth)
+    end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
+    rows = change_rows(experience) if config.log == "action" else np.flatnonzero(experience != -1)
+    base = int(np.searchsorted(rows, _check_base(end, len(experience))))
+    reading = _READINGS[config.mode]
+    ids, poses = experience[rows], truth[rows]
+    counted = relocalisations(ids, base)
+    near = _near(poses, poses[reading.perceived(ids)], reading, config)
+    right = _correct(ids, base, counted, near, config.mode)
+    eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
+    notes = [LITERAL_WARNING] if config.mode == "literal" else []
+    notes += [] if entries else ["no entry after the base set: ARR is 0/0"]
+    note = "; ".join(notes + ([] if eta else [NO_RELOCALISATION]))
+    counts = _ratio(eta, entries), _ratio(eta_c, eta), entries, eta, eta_c, base
+    return ExperienceMetric(*counts, config.mode, config.log, note, counted, right, near)
+
+
+def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
+    """Which entries are re-localisations: [N] bool (lines 9 to 15; needs no truth).
+
+    In closed form: the entries of an experience count from the first one after the base set that returns
+    to it, that is, whose previous entry is another experience and which was not created there.
+
+    Args:
+        experience: [N] ids. base: entries in the base set.
+    """
+    base = _check_base(base, len(experience))
+    entry = np.arange(len(experience))
+    _, code = np.unique(experience, return_inverse=True)
+    returns = (entry >= base) & (creation_rows(experience) < entry) & ~_dwell(experience)
+    since = np.full(len(experience) + 1, len(experience))
+    np.minimum.at(since, code[returns], entry[returns])
+    return entry >= since[code]
+
+
+def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0) -> int:
+    """The default end of the base set: the row of the first return to the start pose.
+
+    A return counts if the robot has left the start's surroundings and travelled more than half the length of
+    the first loop. A loop through the farthest point is at least twice as long as that point is far from the
+    start, so its distance stands for half a loop; turning around near the start is thus not a loop.
+
+    Args:
+        truth: [N, 3] true poses. position, heading_deg: thresholds of a return, m and degrees.
+
+    Raises:
+        InputError: the run never returns.
+    """
+    away = np.hypot(truth[:, 0] - truth[0, 0], truth[:, 1] - truth[0, 1])
+    turned = np.abs(wrap(truth[:, 2] - truth[0, 2]))
+    near = (away < position) & (turned < np.radians(heading_deg))
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    left = np.logical_or.accumulate(~near)
+    back = np.flatnonzero(near & left & (way > away.max()))
+    if len(back) == 0:
+        where = f"within {position} m and {heading_deg} degrees of its start"
+        cure = "set `base`, the end of the base set"
+        raise InputError("true trajectory", f"never returns {where}", "a closed loop", cure)
+    return int(back[0])
+
+
+def _check_log(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    experience, truth = np.asarray(experience), np.asarray(truth, float)
+    if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
+        found = f"shapes {experience.shape} and {truth.shape}"
+        raise InputError("experience log", found, "[N] and [N, 3], N at least 1")
+    if not np.isfinite(truth).all():
+        row = int(np.argmin(np.isfinite(truth).all(axis=1)))
+        raise InputError(f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "remove such rows")
+    return experience, truth
+
+
+def _check_base(base: int, length: int) -> int:
+    if not 0 <= base <= length:
+        raise InputError("i_base", str(base), f"0 to {length}, the length of the log")
+    return base
+
+
+def _dwell(experience: np.ndarray) -> np.ndarray:
+    """Whether each entry [N] equals the previous one."""
+    return np.concatenate([[False], experience[1:] == experience[:-1]])
+
+
+def _last_entry(experience: np.ndarray) -> np.ndarray:
+    """For each entry [N] the last earlier one with the same id, or itself."""
+    order = np.argsort(experience, kind="stable")
+    last = np.arange(len(experience))
+    again = _dwell(experience[order])
+    last[order[again]] = order[np.flatnonzero(again) - 1]
+    return last
+
+
+def _near(true: np.ndarray, perceived: np.ndarray, reading: _Reading, config: ExmConfig) -> np.ndarray:
+    """Lines 16 to 24 without the valid set: [N] bool."""
+    distance = np.hypot(*(true - perceived)[:, :2].T)
+    turn = np.abs(reading.turn(true[:, 2] - perceived[:, 2]))
+    return (distance < config.position) & (turn < np.radians(config.heading_deg))
+
+
+def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, mode: ExmMode) -> np.ndarray:
+    """Which re-localisations are correct: [N] bool (lines 15 to 38).
+
+    One sequential pass, because a verdict determines which experiences are valid later.
+    """
+    reading = _READINGS[mode]
+    ids_, dwell = ids.tolist(), _dwell(ids).tolist()
+    novel = (creation_rows(ids) == np.arange(len(ids))).tolist()
+    counted_, near_ = counted.tolist(), near.tolist()
+    valid = set(ids_[:base])
+    right = [False] * len(ids_)
+    sound = True  # the listing's r_c: the last re-localisation was correct
+    for i in range(base, len(ids_)):
+        if counted_[i]:
+            sound = right[i] = reading.correct(near_[i] and ids_[i] in valid, dwell[i], right[i - 1])
+        if sound and (i > 0 if reading.back else novel[i]):
+            valid.add(ids_[i - reading.back])
+    return np.array(right, bool)
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else np.nan
+
+
+# The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
+# as the verdict on the previous entry: if R_c only grew, one correct visit would make all later ones correct.
+_READINGS: dict[ExmMode, _Reading] = {
+    "strict": _Reading(creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
+    "paper": _Reading(_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),
+    "or": _Reading(_last_entry, wrap, lambda near, dwell, before: near or (dwell and before), 1),
+    "literal": _Reading(_last_entry, np.asarray, lambda near, dwell, before: near and dwell and before, 1),
+}

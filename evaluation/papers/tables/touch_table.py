@@ -1,0 +1,356 @@
+"""The touch table: whisker sessions in mazes never used for tuning.
+
+Each row is a condition, with the preset of the sensor and what the row changes; each session of it has its
+own maze, so that an unlucky maze counts once. Values are medians over the sessions; a failure is an Energy
+Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.exm import ExmConfig
+from evaluation.metrics.map_pieces import energy_within_pieces, unjoined_share
+from evaluation.metrics.session_metrics import (
+    FALSE_CLOSURE_DISTANCE,
+    SessionResult,
+    TouchMetrics,
+    closure_errors,
+    experience_metric_if_defined,
+    touch_metrics,
+)
+from evaluation.metrics.statistics import wilson_interval
+from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.trials.touch_trial import run_session
+from evaluation.studies.executor import run_tasks
+from evaluation.studies.growth import with_new_ground
+from ratslam.core.session import Session
+from ratslam.runs.open_source import open_observations
+from ratslam.runs.settings.run_config import RunConfig
+from robot.simulation.head.baseline import HALL_BASELINE
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.odometry import OdometryConfig
+
+FIRST_MAZE = 31100
+SUCCESS = 0.25
+TOLERANCE = 1.05
+"""A map is worse than odometry if its Energy Metric is above odometry's times this."""
+CHANGE = 0.3
+"""Share of a session before the change of mazes."""
+RECOVERY_LIMIT = 45
+"""Whisks within which a place should be recognised after a kidnap."""
+REVISIT_GAP, REVISIT_DISTANCE = 60, 0.05
+"""A revisit is a step within this distance (m) of the position more than this many steps before."""
+
+MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
+ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
+MAX_ANGLE = {"image": {"transform": "max_angle"}}
+KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
+EXPLORATION = {"path": {"explore": 1500}}
+NOISE = OdometryConfig()
+OPEN_LOOP = {"whisking": {"mode": "open"}}
+HALL = {"mechanics": {"baseline": HALL_BASELINE.model_dump()}}
+
+
+class TouchRow(NamedTuple):
+    """A row: label, settings `simulation`, `touch` and `keyframes` of its sessions, their number, and if they
+    enter no cell twice, their whisks."""
+
+    label: str
+    simulation: dict[str, Any] = {}  # noqa: RUF012
+    touch: dict[str, Any] = {}  # noqa: RUF012
+    keyframes: dict[str, Any] = {}  # noqa: RUF012
+    sessions: int = 12
+    new_ground: int = 0
+
+
+def _head(*radii: float) -> dict[str, Any]:
+    """The head with these base radii of its rings, m."""
+    lengths, heights = (0.05, 0.11, 0.16), (0.082, 0.12, 0.165)
+    parts = zip(lengths, radii, heights, strict=True)
+    return {"rings": [{"length": a, "radius": b, "height": c} for a, b, c in parts]}
+
+
+ROWS = {
+    "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN, sessions=40),
+    "clean": TouchRow("clean: 2 mm / 0.5 deg"),
+    "rough": TouchRow("rough: 10 mm / 3 deg / 10 %", ROUGH),
+    "rough, 3 % faults": TouchRow(
+        "rough, 3 % contacts missed, 3 % spurious", ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
+    ),
+    "open, max_angle": TouchRow("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
+    "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
+    "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
+    "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
+    "open arena": TouchRow(
+        "open arena, 8 % of the walls, free exploration",
+        MAIN | EXPLORATION | {"maze": {"share": 0.08}},
+        sessions=20,
+    ),
+    "tree": TouchRow(
+        "maze without loops, free exploration", MAIN | EXPLORATION | {"maze": {"kind": "tree"}}, sessions=20
+    ),
+    "noise x 2": TouchRow(
+        "odometry noise x 2",
+        MAIN | {"odometry": {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}},
+        sessions=20,
+    ),
+    "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
+    "exploration, 5000": TouchRow(
+        "free exploration, 5000 whisks", MAIN | {"path": {"explore": 5000}}, sessions=5
+    ),
+    "kidnaps, 5000": TouchRow(
+        "5000 whisks with 24 kidnaps",
+        MAIN | {"path": {"explore": 5000}, "kidnaps": {"count": 24, "ahead": 45.0}},
+        {},
+        {"may_be_carried": True},
+        sessions=5,
+    ),
+    "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
+    "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
+    "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
+    "3 dead": TouchRow("3 dead whiskers", {}, {"head": {"dead": [7, 10, 14]}}),
+    "15 mm/s": TouchRow("15 mm/s", {"motion": {"speed": 0.015}}),
+    "radii + 20 %": TouchRow("base radii + 20 %", {}, {"head": _head(0.054, 0.078, 0.096)}),
+    "radii - 20 %": TouchRow("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
+    "rest 90": TouchRow("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
+    "rest 60": TouchRow("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
+    "radial channel": TouchRow("with the radial channel", {}, {"image": {"radial": True}}),
+    "2 Hz": TouchRow("2 Hz whisking", {"whisking": {"rate": 2.0}}),
+    "RCP, max_angle": TouchRow("RCP, max_angle", {}, MAX_ANGLE),
+    "1 dead": TouchRow("1 dead whisker", {}, {"head": {"dead": [10]}}),
+    "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
+    "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
+    "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
+    "raw": TouchRow("main from raw samples", MAIN | {"raw": True}),
+    "drift": TouchRow("main from raw samples with drift, colour and creep", MAIN | HALL),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
+    "control: shuffled": TouchRow("control: shuffled images", MAIN),
+    "control: no image": TouchRow("control: no images", MAIN),
+    "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
+    "open, contact_angle": TouchRow("open loop, contact_angle", OPEN_LOOP),
+    "noise 5e-3": TouchRow("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
+    "soft servo, open, max": TouchRow(
+        "soft servo, open loop, max_angle", OPEN_LOOP | {"mechanics": {"servo": 0.3}}, MAX_ANGLE
+    ),
+    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, MAX_ANGLE),
+}
+DEFAULT_ROWS = tuple(ROWS)[:-4]
+"""The rows printed if none are chosen."""
+COMPARED = Compared(
+    "EM", "em", "em_live", "em_odometry",
+    worse=lambda error, odometry: error > TOLERANCE * odometry,
+    failed=lambda error, _: error >= SUCCESS,
+    counts={"false / closures": ("false_closures", "closures")},
+    medians={"revisits closed": "revisits_closed"},
+)  # fmt: skip
+"""Of two runs of the table."""
+COLUMNS = (
+    "condition", "EM (worst)", "live EM", "odometry", "failures [95 %]", "worse than odometry (worst ratio)",
+    "through experiences", "ARR", "ARCR strict (worst), chain-free", "revisits closed", "false / closures",
+)  # fmt: skip
+
+
+class TouchTask(NamedTuple):
+    """One session of a row: its maze number, which gives its seed too."""
+
+    row: str
+    maze: int
+    backend: str = "recall"
+
+    @property
+    def seed(self) -> int:
+        """Seed of the session: the last two digits of the maze."""
+        return self.maze % 100
+
+
+class SessionFigures(NamedTuple):
+    """The figures of one session.
+
+    Attributes:
+        metrics: of `touch_metrics`, but `em_experiences` with steps without an experience at their own pose,
+            and `arcr_chain_free` 0 without re-localisations. revisits_closed: share of the revisits with a
+            true closure; NaN without revisits. em_live: EM of the poses given at each step. em_pieces: EM
+            over pairs of steps in the same piece of the map. unjoined: share of the steps outside its largest
+            piece. across: closures between the parts before and after `CHANGE`.
+            recovery: whisks from each kidnap to the first true closure.
+    """
+
+    metrics: TouchMetrics
+    revisits_closed: float
+    em_live: float
+    em_pieces: float
+    unjoined: float
+    across: int
+    recovery: tuple[int, ...]
+
+
+def touch_table(
+    rows: Sequence[str],
+    first: int = FIRST_MAZE,
+    sessions: int | None = None,
+    workers: int = 0,
+    backend: str = "recall",
+    files: Files = Files(),  # noqa: B008
+) -> Iterator[str]:
+    """The lines of the table, each as soon as its sessions are done.
+
+    Args:
+        first: number of the first maze; each session has the next one. sessions: of each row; None: the row's
+            own number. files: of the sessions, `touch.csv`, and of those to compare them with below the
+            table.
+
+    Raises:
+        InputError: one of these files cannot be used.
+    """
+    counts = {row: sessions or ROWS[row].sessions for row in rows}
+    tasks = [TouchTask(row, first + k, backend) for row in rows for k in range(counts[row])]
+    log = SessionLog("touch", files, [(task.row, str(task.maze)) for task in tasks], backend)
+    results = zip(tasks, run_tasks(measure_session, tasks, workers=workers), strict=True)
+    notes: list[str] = []
+    yield markdown_header(COLUMNS)
+    for row in rows:
+        found = []
+        for task, figures in islice(results, counts[row]):
+            log.add(row, task.maze, session_record(figures))
+            found.append(figures)
+        yield markdown_row([ROWS[row].label, *_cells(found)])
+        notes += _notes(row, found)
+    yield from ["", *notes] if notes else []
+    yield from compare_runs(COMPARED, log, rows)
+
+
+def session_record(figures: SessionFigures) -> dict[str, Any]:
+    """The figures of a session by name; of `recovery` the number of kidnaps and the median."""
+    record = figures.metrics._asdict() | figures._asdict()
+    whisks = record.pop("recovery")
+    del record["metrics"]
+    return record | {"kidnaps": len(whisks), "recovery": np.median(whisks) if whisks else np.nan}
+
+
+def measure_session(task: TouchTask) -> SessionFigures:
+    """Runs and measures one session."""
+    return run_and_measure(task)[1]
+
+
+def run_and_measure(
+    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] | None = None
+) -> tuple[SessionResult, SessionFigures]:
+    """Runs one session, and measures it.
+
+    Args:
+        start: makes the session, see `run_session`.
+    """
+    with open_observations(task_config(task)) as (config, source):
+        kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
+        log = load_into_memory(source)
+    if task.row == "control: shuffled":
+        order = np.random.default_rng(task.seed).permutation(len(log.views))
+        log = replace(log, views=log.views[order].copy())
+    if task.row == "control: no image":
+        log = replace(log, views=np.zeros_like(log.views))
+    result = run_session(config, log, start)
+    truth = result.truth
+    true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
+    returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
+    metrics = touch_metrics(result, ExmConfig(base=None if returned else len(truth) // 4))
+    snapped = result.trajectory.copy()
+    snapped[result.place >= 0] = result.node[result.place[result.place >= 0]]
+    change = int(CHANGE * log.length)
+    across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
+    later, earlier = true_closures.T
+    recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
+    return result, SessionFigures(
+        metrics._replace(
+            em_experiences=energy_all_pairs(snapped, truth).total,
+            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
+        ),
+        revisits_closed=_share_of_revisits_closed(truth, true_closures),
+        em_live=energy_all_pairs(result.live, truth).total,
+        em_pieces=energy_within_pieces(result.trajectory, truth, result.piece).total,
+        unjoined=unjoined_share(result.piece),
+        across=int(across.sum()),
+        recovery=tuple(map(int, recovered)),
+    )
+
+
+def task_config(task: TouchTask) -> RunConfig:
+    """The configuration of a session."""
+    _, simulation, touch, keyframes, _, new_ground = ROWS[task.row]
+    maze = {"seed": task.maze} | simulation.get("maze", {})
+    simulation = simulation | {"seed": task.seed, "maze": maze}
+    parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
+    config = RunConfig.model_validate(parts)
+    return with_new_ground(config, new_ground) if new_ground else config
+
+
+def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
+    """Share of the revisits that a true closure has found."""
+    closed = np.zeros(len(truth), bool)
+    closed[true_closures[:, 0]] = True
+    revisits = [
+        k
+        for k in range(REVISIT_GAP + 1, len(truth))
+        if (np.hypot(*(truth[: k - REVISIT_GAP, :2] - truth[k, :2]).T) < REVISIT_DISTANCE).any()
+    ]
+    return float(closed[revisits].mean()) if revisits else np.nan
+
+
+def _cells(found: Sequence[SessionFigures]) -> list[str]:
+    values = {name: [getattr(one.metrics, name) for one in found] for name in TouchMetrics._fields}
+    values |= {name: [getattr(one, name) for one in found] for name in ("revisits_closed", "em_live")}
+
+    def median(name: str, digits: int = 3) -> str:
+        known = np.isfinite(values[name]).any()
+        return f"{np.nanmedian(values[name]):.{digits}f}" if known else "-"
+
+    em, strict = np.array(values["em"]), np.array(values["arcr"])
+    ratio = em / np.array(values["em_odometry"])
+    worst = np.nanmin(strict) if np.isfinite(strict).any() else np.nan
+    return [
+        f"{np.median(em):.3f} ({em.max():.2f})",
+        median("em_live"),
+        median("em_odometry", 2),
+        _rate(em >= SUCCESS),
+        f"{_rate(ratio > TOLERANCE)} ({ratio.max():.2f})",
+        median("em_experiences"),
+        median("arr"),
+        f"{median('arcr')} ({worst:.2f}), {median('arcr_chain_free')}" if np.isfinite(worst) else "-",
+        median("revisits_closed", 2),
+        f"{sum(values['false_closures'])} / {sum(values['closures'])}",
+    ]
+
+
+def _rate(happened: np.ndarray) -> str:
+    """How many of the sessions [n] bool, with the interval of the rate in percent."""
+    low, high = wilson_interval(int(happened.sum()), len(happened))
+    return f"{happened.sum()} of {len(happened)} [{100 * low:.0f}-{100 * high:.0f} %]"
+
+
+def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
+    """Lines below the table for some rows: closures across a change of mazes; recovery and the error within
+    pieces after kidnaps."""
+    notes = []
+    if row == "control: other maze":
+        across, closures = sum(one.across for one in found), sum(one.metrics.closures for one in found)
+        notes.append(f"{row}: {across} of {closures} closures join the parts before and after the change.")
+    recovery = np.array([whisks for figures in found for whisks in figures.recovery])
+    if len(recovery):
+        notes.append(
+            f"{row}: whisks to the first true closure, median {np.median(recovery):.0f}; "
+            f"within {RECOVERY_LIMIT}: {(recovery <= RECOVERY_LIMIT).mean():.0%}."
+        )
+        em, unjoined = np.array([(one.em_pieces, one.unjoined) for one in found]).T
+        notes.append(
+            f"{row}: EM within pieces of the map, median {np.nanmedian(em):.3f} ({np.nanmax(em):.2f}); "
+            f"share of steps outside the largest piece, median {np.median(unjoined):.0%} "
+            f"({unjoined.max():.0%})."
+        )
+    return notes

@@ -1,0 +1,199 @@
+"""A pyusb backend for an emulated device behind a socket: no kernel, no libusb."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from array import array
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, NoReturn, TypeVar
+
+from robot.drivers.head.emulated_cable_protocol import IN, PORT, Op, UsbConnection
+
+T = TypeVar("T")
+
+
+class Handle:
+    """An open device: one connection for transfers that wait for data, another for all others."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.inwards = UsbConnection(host, port)
+        try:
+            self.other = UsbConnection(host, port)
+        except OSError:
+            self.inwards.close()
+            raise
+
+    def close(self) -> None:
+        self.inwards.close()
+        self.other.close()
+
+
+class SocketBackend:
+    """A `usb.backend.IBackend` (by its methods) of a bus with at most one device: an emulator's."""
+
+    def __init__(self, host: str, port: int = PORT) -> None:
+        self.host, self.port = host, port
+
+    def enumerate_devices(self) -> Iterator[bytes]:
+        """Yields the descriptors of the device, which identify it, if it is plugged in."""
+        try:
+            line = UsbConnection(self.host, self.port)
+        except OSError:
+            return
+        try:
+            yield line.call(Op.DESCRIBE)
+        except OSError:
+            return
+        finally:
+            line.close()
+
+    def get_parent(self, dev: bytes) -> None:
+        """Returns None: the device has no parent."""
+
+    def get_device_descriptor(self, dev: bytes) -> SimpleNamespace:
+        names = (
+            "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 "
+            "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
+        )
+        whereabouts = {"bus": 1, "address": 1, "port_number": 1, "port_numbers": (1,), "speed": 3}
+        return SimpleNamespace(**_fields("<BBHBBBBHHHBBBB", names, dev), **whereabouts)
+
+    def get_configuration_descriptor(self, dev: bytes, config: int) -> SimpleNamespace:
+        _require_first(config)
+        names = (
+            "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue iConfiguration "
+            "bmAttributes bMaxPower"
+        )
+        return SimpleNamespace(**_fields("<BBHBBBBB", names, _descriptors(dev, 2)[0]), extra_descriptors=[])
+
+    def get_interface_descriptor(self, dev: bytes, intf: int, alt: int, config: int) -> SimpleNamespace:
+        _require_first(intf, alt, config)
+        names = (
+            "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass "
+            "bInterfaceSubClass bInterfaceProtocol iInterface"
+        )
+        return SimpleNamespace(**_fields("<9B", names, _descriptors(dev, 4)[0]), extra_descriptors=[])
+
+    def get_endpoint_descriptor(
+        self, dev: bytes, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        _require_first(intf, alt, config)
+        names = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
+        return SimpleNamespace(
+            **_fields("<BBBBHB", names, _descriptors(dev, 5)[ep]),
+            bRefresh=0,
+            bSynchAddress=0,
+            extra_descriptors=[],
+        )
+
+    def open_device(self, dev: bytes) -> Handle:
+        return _as_usb_error(lambda: Handle(self.host, self.port))
+
+    def close_device(self, dev_handle: Handle) -> None:
+        dev_handle.close()
+
+    def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
+        self._request(dev_handle, Op.CONTROL, 0x00, request=9, value=config_value)
+
+    def get_configuration(self, dev_handle: Handle) -> int:
+        return self._request(dev_handle, Op.CONTROL, 0x80, request=8, size=1)[0]
+
+    def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
+        self._request(dev_handle, Op.CONTROL, 0x01, request=11, value=altsetting, index=intf)
+
+    def claim_interface(self, dev_handle: Handle, intf: int) -> None:
+        self._request(dev_handle, Op.CLAIM)
+
+    def release_interface(self, dev_handle: Handle, intf: int) -> None:
+        self._request(dev_handle, Op.RELEASE)
+
+    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array, timeout: int) -> int:
+        packet = data.tobytes()
+        self._request(dev_handle, Op.BULK, ep, data=packet, timeout=timeout)
+        return len(packet)
+
+    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array, timeout: int) -> int:
+        got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
+        return _fill(buff, got)
+
+    def ctrl_transfer(
+        self,
+        dev_handle: Handle,
+        bmRequestType: int,
+        bRequest: int,
+        wValue: int,
+        wIndex: int,
+        data: array,
+        timeout: int,
+    ) -> int:
+        setup = {"request": bRequest, "value": wValue, "index": wIndex, "timeout": timeout}
+        if bmRequestType & IN:
+            got = self._request(dev_handle, Op.CONTROL, bmRequestType, size=_size(data), **setup)
+            return _fill(data, got)
+        self._request(dev_handle, Op.CONTROL, bmRequestType, data=data.tobytes(), **setup)
+        return _size(data)
+
+    def clear_halt(self, dev_handle: Handle, ep: int) -> None:
+        self._request(dev_handle, Op.CLEAR, ep)
+
+    def reset_device(self, dev_handle: Handle) -> None:
+        self._request(dev_handle, Op.RESET)
+
+    def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
+        return False
+
+    def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+        """Has no effect: there is no kernel driver."""
+
+    def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+        """Has no effect: there is no kernel driver."""
+
+    def intr_write(self, *transfer: Any) -> NoReturn:
+        raise NotImplementedError("interrupt transfers")
+
+    intr_read = iso_write = iso_read = intr_write
+
+    def _request(self, handle: Handle, op: Op, address: int = 0, **more: Any) -> bytes:
+        line = handle.inwards if op == Op.BULK and address & IN else handle.other
+        return _as_usb_error(lambda: line.call(op, address, **more))
+
+
+def _as_usb_error(action: Callable[[], T]) -> T:
+    """Runs an action; translates errors to those of libusb."""
+    import usb.core
+
+    try:
+        return action()
+    except OSError as error:
+        kind = usb.core.USBTimeoutError if error.errno == errno.ETIMEDOUT else usb.core.USBError
+        raise kind(error.strerror, None, error.errno) from None
+
+
+def _descriptors(dev: bytes, kind: int) -> list[bytes]:
+    """The descriptors of a kind; each starts with its length and kind."""
+    found, place = [], 0
+    while place < len(dev):
+        if dev[place + 1] == kind:
+            found.append(dev[place : place + dev[place]])
+        place += dev[place]
+    return found
+
+
+def _fields(layout: str, names: str, descriptor: bytes) -> dict[str, int]:
+    return dict(zip(names.split(), struct.unpack_from(layout, descriptor), strict=True))
+
+
+def _require_first(*index: int) -> None:
+    if any(index):
+        raise IndexError(f"descriptor {index}: the device has one of each")
+
+
+def _size(buffer: array) -> int:
+    return len(buffer) * buffer.itemsize
+
+
+def _fill(buffer: array, data: bytes) -> int:
+    memoryview(buffer).cast("B")[: len(data)] = data
+    return len(data)

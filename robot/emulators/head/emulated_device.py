@@ -1,0 +1,370 @@
+"""An emulated head at its USB interface: transfers, and frames over time.
+
+Times are arguments: no function waits or reads a clock.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from robot.drivers.head.usb_protocol import (
+    CHANNELS,
+    REQUEST_IN,
+    VERSION,
+    FrameFlag,
+    Request,
+    frame_values,
+    pack_frames,
+    to_counts,
+    unpack_command,
+)
+from robot.emulators.head import usb_descriptors
+from robot.emulators.head.emulator_config import BridgeEmulatorConfig
+from robot.emulators.head.sensor_array import Block, SensorArray, block_samples
+from tactile.base.random_streams import stream
+
+STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
+"""Supported standard requests, by bmRequestType and bRequest."""
+
+
+class EmulatedHead:
+    """A powered head.
+
+    Args:
+        whiskers: the simulated whiskers. now: host time at which the head's clock starts, s.
+
+    Attributes:
+        fifo: frames for the host. faults: active faults. whiskers: as given. streaming: whether
+        frames are made. received: number of commands by kind; "" counts ignored ones.
+    """
+
+    def __init__(self, config: BridgeEmulatorConfig, whiskers: SensorArray, now: float) -> None:
+        self.config, self.whiskers, self.began = config, whiskers, now
+        self.samples = block_samples(config.stream.rate)
+        self.fifo = Fifo(config.fifo)
+        self.faults = HeadFaults(whiskers.count, stream(config.seed, "faults"))
+        self.streaming = False
+        self.received: Counter[str] = Counter()
+        self._pace = 1 + config.drift_ppm * 1e-6  # clock rate
+        self._made = 0  # samples
+        self._first = round(config.age * config.stream.rate)
+
+    @property
+    def due(self) -> float:
+        """Time at which the next block is complete, s."""
+        return self._when(self._made + self.samples)
+
+    def advance(self, now: float) -> bool:
+        """Makes the next block if it is complete at `now`, s; returns whether it was."""
+        end = self.due
+        if now < end:
+            return False
+        if self.streaming or not self.whiskers.resting:
+            block = self.whiskers.block(self._when(self._made), end)
+            if self.streaming:
+                self._send(block, end)
+        else:
+            self.whiskers.skip_block()
+        self._made += self.samples
+        return True
+
+    def bulk_in(self, size: int, now: float) -> bytes:
+        """Reads at most `size` bytes of frames.
+
+        Raises:
+            OSError: EPIPE while the endpoint is halted.
+        """
+        return self.fifo.take(size) if self.faults.check_in(now) else b""
+
+    def bulk_out(self, packet: bytes, now: float) -> None:
+        """Executes a command packet; an invalid one is ignored and counted."""
+        command = unpack_command(packet)
+        if command is None:
+            self.received[""] += 1
+            return
+        self.received[command.kind.name] += 1
+        self.whiskers.receive(command, now)
+
+    def control(self, kind: int, request: int, value: int, size: int, now: float) -> bytes:
+        """The answer to a control request, at most `size` bytes.
+
+        Raises:
+            OSError: EPIPE for an unsupported request.
+        """
+        if (kind, request) == STRING and value >> 8 == 3:
+            answer = usb_descriptors.string(value & 0xFF)
+        elif (kind, request) == CONFIGURED:
+            answer = b"\1"
+        elif (kind, request) in (CONFIGURE, ALTERNATE):
+            answer = b""
+        elif kind & 0x60 == REQUEST_IN & 0x60 and request in set(Request):
+            answer = self._vendor(Request(request), now)
+        else:
+            answer = None
+        if answer is None:
+            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+        return answer[:size]
+
+    def do(self, request: dict[str, Any], now: float) -> dict[str, Any]:
+        """Starts a fault, or returns counts or state: {"do": name, ...}.
+
+        Raises:
+            ValueError, TypeError: unknown fault or invalid arguments.
+        """
+        arguments = dict(request)
+        name = str(arguments.pop("do", ""))
+        if name == "counts":
+            return self.counts()
+        if name == "state":
+            return self.state(now)
+        self.faults.do(name, now, arguments)
+        if name == "unplug":
+            self.halt()
+        return {"ok": True}
+
+    def halt(self) -> None:
+        """Retracts the whiskers, stops making frames and drops unread ones."""
+        self.streaming = False
+        self.whiskers.stop()
+        self.fifo.clear()
+
+    def counts(self) -> dict[str, int]:
+        """Frames: made = sent + queued + lost (not read) + dropped (by a stop) + skipped (by a fault)."""
+        fifo, skipped = self.fifo, self.faults.skipped
+        return {
+            "made": fifo.made + skipped,
+            "sent": fifo.sent,
+            "queued": len(fifo),
+            "lost": fifo.lost,
+            "dropped": fifo.dropped,
+            "skipped": skipped,
+        }
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Pose and activity, as JSON values."""
+        return {
+            "plugged": self.faults.plugged,
+            "streaming": self.streaming,
+            **self.whiskers.state(now),
+            "commands": dict(self.received),
+            "sequence": self._first + self._made,
+            "late": now - self.due + self.samples / (self.config.stream.rate * self._pace),
+        }
+
+    def _vendor(self, request: Request, now: float) -> bytes:
+        if request == Request.START:
+            self.fifo.clear()
+            self.streaming = True
+            self.whiskers.begin(self._when(self._made))
+        elif request == Request.STOP:
+            self.halt()
+        elif request == Request.CLOCK:
+            return self._clock(now).to_bytes(8, "little")
+        else:
+            identity = {
+                "name": "emulated head",
+                "version": f"{VERSION}",
+                "whiskers": self.whiskers.count,
+                "channels": CHANNELS,
+                "rate": self.config.stream.rate,
+            }
+            return json.dumps(identity).encode()
+        return b""
+
+    def _send(self, block: Block, now: float) -> None:
+        flags = np.where(block.begins, FrameFlag.CYCLE, 0) | (FrameFlag.RCP if block.fed_back else 0)
+        values = frame_values(block.angle, block.deflection)
+        values = self.faults.saturate_values(values, self.config.stream.full_scale, now)
+        some = slice(self.samples - self.faults.count_unskipped(self.samples), None)
+        sample = self._made + np.arange(self.samples)[some]
+        if len(sample) == 0:
+            return
+        flags = flags[some]
+        flags[0] |= FrameFlag.OVERRUN if self.fifo.overran else 0
+        number = self._first + sample
+        time = np.rint(number * (1e6 / self.config.stream.rate)).astype(np.int64) + self.faults.jump
+        raw = pack_frames(number, time, flags, values[some])
+        size = len(raw) // len(sample)
+        frames = [raw[k : k + size] for k in range(0, len(raw), size)]
+        self.fifo.push(self.faults.damage_frames(frames))
+
+    def _clock(self, now: float) -> int:
+        """Time since power-on by the head's clock, us."""
+        seconds = self.config.age + (now - self.began) * self._pace
+        return max(round(seconds * 1e6) + self.faults.jump, 0)
+
+    def _when(self, sample: int) -> float:
+        """Host time of a sample, s."""
+        return self.began + sample / (self.config.stream.rate * self._pace)
+
+
+HEADER = 20 - 4
+"""Length of a frame before its values, bytes."""
+
+
+class HeadFaults:
+    """Active faults; times are the host's monotonic clock, s.
+
+    Attributes:
+        plugged: whether the head is on the bus. plugs: number of times it was plugged in; earlier connections
+            are invalid. skipped: number of skipped frames. jump: offset of the head's clock, us.
+    """
+
+    def __init__(self, whiskers: int, random: np.random.Generator) -> None:
+        self.plugged, self.plugs = True, 1
+        self.skipped, self.jump = 0, 0
+        self._whiskers, self._random = whiskers, random
+        self._skip = self._corrupt = self._garbage = self._swap = 0
+        self._saturated: dict[int, float] = {}
+        self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
+        self.known: dict[str, Callable[..., None]] = {
+            "unplug": self._unplug,
+            "plug": self._plug,
+            "stall": self._stall,
+            "silence": self._silence,
+            "garbage": lambda now, bytes=64: self._count("_garbage", bytes),
+            "corrupt": lambda now, frames=1: self._count("_corrupt", frames),
+            "skip": lambda now, frames=1: self._count("_skip", frames),
+            "swap": lambda now, frames=1: self._count("_swap", frames),
+            "clock": lambda now, jump_us: self._jump(jump_us),
+            "saturate": self._saturate,
+            "die": lambda now: os._exit(1),
+        }
+        """Faults by name; each takes the time and its arguments."""
+
+    def do(self, name: str, now: float, arguments: dict[str, Any]) -> None:
+        """Starts a fault.
+
+        Raises:
+            ValueError, TypeError: unknown fault or invalid arguments.
+        """
+        if name not in self.known:
+            raise ValueError(f"{name!r}; known are {', '.join(self.known)}, counts, state")
+        self.known[name](now, **arguments)
+
+    def check_in(self, now: float) -> bool:
+        """Whether the frame endpoint returns data.
+
+        Raises:
+            OSError: EPIPE while the endpoint is halted.
+        """
+        if self._halted or now < self._halted_until:
+            self._halted = True
+            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+        return now >= self._silent_until
+
+    def clear_halt(self) -> None:
+        """Clears the halt; it returns while its cause lasts."""
+        self._halted = False
+
+    def saturate_values(self, values: np.ndarray, full_scale: float, now: float) -> np.ndarray:
+        """Values [T, W, 3], with the deflections of saturated whiskers at full scale (rad)."""
+        for whisker, until in list(self._saturated.items()):
+            if now < until:
+                values[:, whisker, 1:] = to_counts(np.array(full_scale))
+            else:
+                del self._saturated[whisker]
+        return values
+
+    def count_unskipped(self, count: int) -> int:
+        """Number of frames to send of the next `count`; the first ones are skipped."""
+        out = min(self._skip, count)
+        self._skip -= out
+        self.skipped += out
+        return count - out
+
+    def damage_frames(self, frames: list[bytes]) -> list[bytes]:
+        """The frames after pending faults (corrupt, garbage, swap); their number is unchanged."""
+        for k in range(min(self._corrupt, len(frames))):
+            place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))
+            frames[k] = frames[k][:place] + bytes([frames[k][place] ^ 0x55]) + frames[k][place + 1 :]
+            self._corrupt -= 1
+        if self._garbage and frames:
+            frames[0] = self._random.bytes(self._garbage) + frames[0]
+            self._garbage = 0
+        if self._swap and len(frames) > 1:
+            frames[-2:] = frames[:-3:-1]
+            self._swap -= 1
+        return frames
+
+    def _count(self, name: str, more: int) -> None:
+        setattr(self, name, getattr(self, name) + int(more))
+
+    def _unplug(self, now: float) -> None:
+        self.plugged = False
+
+    def _plug(self, now: float) -> None:
+        self.plugs += not self.plugged
+        self.plugged, self._halted, self._halted_until = True, False, -np.inf
+
+    def _stall(self, now: float, seconds: float = 0.0) -> None:
+        self._halted, self._halted_until = True, now + float(seconds)
+
+    def _silence(self, now: float, seconds: float = 1.0) -> None:
+        self._silent_until = now + float(seconds)
+
+    def _jump(self, jump_us: int) -> None:
+        self.jump += int(jump_us)
+
+    def _saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
+        if not 0 <= whisker < self._whiskers:
+            raise ValueError(f"whisker {whisker}; the head has 0 to {self._whiskers - 1}")
+        self._saturated[whisker] = now + float(seconds)
+
+
+class Fifo:
+    """A bounded queue; frames made while it is full are lost.
+
+    Attributes:
+        made, sent, lost, dropped: number of frames pushed, completely read, lost because the queue was full,
+            and dropped by `clear`; made = sent + lost + dropped + len(fifo).
+        overran: whether the newest frame was lost.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.made = self.sent = self.lost = self.dropped = 0
+        self.overran = False
+        self._frames: deque[bytes] = deque()
+        self._begun = b""  # the unread rest of a partly read frame
+
+    def __len__(self) -> int:
+        """Number of frames in the queue."""
+        return len(self._frames) + bool(self._begun)
+
+    @property
+    def room(self) -> int:
+        """Number of frames that still fit."""
+        return self.capacity - len(self)
+
+    def push(self, frames: Sequence[bytes]) -> None:
+        """Adds the first frames that fit."""
+        fits = frames[: self.room]
+        self._frames.extend(fits)
+        self.made += len(frames)
+        self.lost += len(frames) - len(fits)
+        self.overran = len(fits) < len(frames)
+
+    def take(self, size: int) -> bytes:
+        """Removes and returns at most `size` bytes."""
+        parts, left = [], size
+        while left and (self._begun or self._frames):
+            frame = self._begun or self._frames.popleft()
+            parts.append(frame[:left])
+            self._begun = frame[left:]
+            left -= len(parts[-1])
+            self.sent += not self._begun
+        return b"".join(parts)
+
+    def clear(self) -> None:
+        """Drops all frames."""
+        self.dropped += len(self)
+        self._frames.clear()
+        self._begun, self.overran = b"", False

@@ -1,0 +1,158 @@
+"""Route of the arm: a sequence of targets, each sent after arrival at the previous one."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from robot.drivers.outcome import Fault
+from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.drivers.ur10.safety import TargetRefused
+from robot.drivers.ur10.safety import check_target as allowed
+from robot.live.live_config import LiveConfig
+from robot.simulation.head.simulated_session import SimulationConfig
+from robot.world.head_trajectory import HeadPath
+from robot.world.scene import Scene, make_scene
+from tactile.base.errors import InputError
+from tactile.whiskers.head_geometry import Head
+
+
+class MovableArm(Protocol):
+    """The methods of `robot.drivers.ur10.arm.Arm` that a route calls."""
+
+    @property
+    def fault(self) -> Fault | None: ...
+    def move(self, tcp: np.ndarray, speed: float | None = None) -> object: ...
+    def arrived(self) -> bool: ...
+    def halt(self) -> None: ...
+
+
+class ArmRoute(Protocol):
+    """What the whisk loop asks of a route."""
+
+    def advance(self, arm: MovableArm) -> bool:
+        """Sends the arm on if necessary; returns whether it is at the end.
+
+        Raises:
+            robot.drivers.ur10.safety.TargetRefused: a target is rejected.
+        """
+        ...
+
+    def resend_last(self) -> None:
+        """Sends the last target again with the next `advance`, after a stop on the way to it."""
+        ...
+
+
+class Route:
+    """Targets [K, 6] in the arm's base frame, at a speed (m/s)."""
+
+    def __init__(self, targets: np.ndarray, speed: float) -> None:
+        self.targets, self.speed = targets, speed
+        self.sent = 0
+
+    @property
+    def length(self) -> int:
+        return len(self.targets)
+
+    def advance(self, arm: MovableArm) -> bool:
+        """Sends the next target if the arm has arrived; returns whether it is at the last one.
+
+        Raises:
+            robot.drivers.ur10.safety.TargetRefused: the target is rejected.
+        """
+        if self.sent and not arm.arrived():
+            return False
+        if self.sent == self.length:
+            return True
+        arm.move(self.targets[self.sent], self.speed)
+        self.sent += 1
+        return False
+
+    def resend_last(self) -> None:
+        """Sends the last target again with the next `advance`, after a stop on the way to it."""
+        self.sent = max(self.sent - 1, 0)
+
+
+def plan_path(config: LiveConfig, head: Head) -> HeadPath:
+    """Poses of the head in the map over time, for motion without interruptions; with goals only the first.
+
+    Raises:
+        InputError: the path cannot be planned or is empty.
+    """
+    goal = config.plan.goal
+    if goal is not None and goal.at is not None:
+        return HeadPath(np.zeros(1), np.array([[*goal.at[:2], np.radians(goal.at[2])]]))
+    path = whole_path(config, head)
+    return path if goal is None else HeadPath(np.zeros(1), path.pose[-1:])  # the arm starts at the end
+
+
+def whole_path(config: LiveConfig, head: Head) -> HeadPath:
+    """The path of the waypoints or of the plan, whatever the goals."""
+    return _waypoint_path(config) if config.waypoints else _planned_path(config, head)
+
+
+def _planned_path(config: LiveConfig, head: Head) -> HeadPath:
+    made = plan_scene(config.plan, head)
+    if len(made.jumps):
+        raise InputError("live.plan.kidnaps", "kidnaps", "none on an arm", "remove them from the plan")
+    keep = made.path.time <= made.duration
+    return HeadPath(made.path.time[keep], made.path.pose[keep])
+
+
+def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
+    """The maze of a plan and the path in it.
+
+    Raises:
+        InputError: the plan gives no valid maze or path.
+    """
+    return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
+
+
+def _waypoint_path(config: LiveConfig) -> HeadPath:
+    pose = np.array(config.waypoints)
+    pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
+    if len(pose) < 2 and config.plan.goal is None:
+        raise InputError("live.waypoints", "one", "at least two")
+    step = np.abs(np.diff(pose, axis=0))
+    motion = config.plan.motion
+    took = np.maximum(np.hypot(step[:, 0], step[:, 1]) / motion.speed, step[:, 2] / motion.turn_rate)
+    return HeadPath(np.concatenate([[0.0], np.cumsum(took)]), pose)
+
+
+def main_route(config: LiveConfig, path: HeadPath) -> Route:
+    """The route along a path, without its first pose, where the arm starts."""
+    return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
+
+
+def approach_route(config: LiveConfig, path: HeadPath) -> Route:
+    """The route from the present pose of the arm to above the first pose."""
+    return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
+
+
+def descent_route(config: LiveConfig, path: HeadPath) -> Route:
+    """The route from above the first pose down to it."""
+    return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
+
+
+def check_targets(config: LiveConfig, path: HeadPath) -> None:
+    """Checks every target before the arm moves.
+
+    Raises:
+        InputError: a target is rejected; the error gives its number and the reason.
+    """
+    routes = approach_route(config, path), descent_route(config, path), main_route(config, path)
+    targets = np.concatenate([route.targets for route in routes])
+    before = targets[0]
+    for target in targets:
+        try:
+            allowed(config.arm, target, before)
+        except TargetRefused as error:
+            where = "live.waypoints" if config.waypoints else "live.plan.path"
+            raise InputError(where, str(error), cure="move them, or `live.arm.placing`") from None
+        before = target
+
+
+def route_speed(config: LiveConfig) -> float:
+    """The lower of the plan's and the arm's speed, m/s."""
+    return min(config.plan.motion.speed, config.arm.speed)

@@ -1,0 +1,85 @@
+"""Configurations of emulators for a live session: an arm above its route's start, a head in its maze, a
+Create in its arena."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from robot.drivers.head.driver_config import Address
+from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
+from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
+from robot.live.arm_route import plan_path
+from robot.live.live_config import CreateLiveConfig, LiveConfig
+from robot.simulation.head.beam import StreamConfig
+from tactile.base.errors import InputError
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+
+
+def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
+    """A controller at the session's address, or another one; the arm starts above the first pose of the
+    route."""
+    start = plan_path(config, ur10_head(head)).pose[0]
+    start = tcp_from_pose(config.arm.placing, start, config.lift / 2)
+    return UrEmulatorConfig(
+        host=host or config.arm.host, hz=config.arm.hz, start=tuple(np.asarray(start).tolist())
+    )
+
+
+def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:
+    """A head in the maze of the session's plan, carried by its arm."""
+    where = Address.parse(config.head.address)
+    plan = config.plan
+    return HeadEmulatorConfig(
+        host=host or where.host or config.arm.host,
+        port=where.port,
+        head=head,
+        mechanics=plan.mechanics,
+        stream=plan.stream,
+        maze=plan.maze,
+        path=plan.path,
+        motion=plan.motion,
+        seed=plan.seed,
+        arm=config.arm.host,
+        arm_hz=config.arm.hz,
+        placing=config.arm.placing,
+    )
+
+
+def create_emulator_config(
+    create: CreateLiveConfig, address: str, open_to_network: bool = False
+) -> CreateEmulatorConfig:
+    """A Create in the arena of the session's plan, its serial port a link of the session's name.
+
+    Args:
+        address: of its whiskers, HOST or HOST:PORT. open_to_network: whether it need not be loopback.
+
+    Raises:
+        InputError: the address or the port is that of a real device.
+    """
+    where = Address.parse(address)
+    if where.host is None:
+        raise InputError("live.head.address", address, "HOST or HOST:PORT of the emulated whiskers")
+    if Path(create.port).is_absolute() and Path("/dev") in Path(create.port).parents:
+        cure = "--set live.create.port=create.tty"
+        raise InputError("live.create.port", create.port, "a name for the emulated port", cure)
+    plan, whiskers = create.plan, create.plan.whiskers
+    bridge = BridgeEmulatorConfig(
+        host=where.host,
+        port=where.port,
+        open_to_network=open_to_network,
+        stream=StreamConfig(rate=whiskers.rate),
+        seed=plan.seed,
+    )
+    world = CreateWorldConfig(
+        arena=plan.arena,
+        whiskers=whiskers,
+        wheels=plan.wheels,
+        body=plan.behaviour.body,
+        bridge=bridge,
+        strain_per_radian=create.strain_per_radian,
+    )
+    return CreateEmulatorConfig(wheel_base=create.wheel_base, seed=plan.seed, port=create.port, world=world)

@@ -1,0 +1,316 @@
+"""What a bag holds: topics, rates, gaps, frames, shapes and magnitudes, and what each topic can serve as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from robot.recordings.bags.bag import Bag, Topic
+from robot.recordings.bags.bag_touch import ARRAYS, JOINTS
+from robot.recordings.bags.images import IMAGES, RAW, grey_image
+from robot.recordings.bags.motions import POSES, TWISTS, frames_of, pose_in_plane, twist_in_plane
+from robot.recordings.bags.scans import (
+    CLOUD,
+    SCAN,
+    Extent,
+    cloud_points,
+    extent_of,
+    scan_limits,
+    wider_extent,
+)
+from robot.recordings.bags.stamps import leaps, nanoseconds
+from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
+from robot.recordings.input_judge import MotionTrack, typical_motion
+from robot.recordings.sanity_checks import SPOILT
+from robot.sources.odometry import from_poses, from_velocities
+from tactile.base.errors import InputError
+
+Role = Literal["odometry", "views", "touch", "truth"]
+
+
+class Times(NamedTuple):
+    """Times of N messages by one clock.
+
+    Attributes:
+        first, last: s. rate_hz: median; 0 with fewer than two different times. gap, gap_at: longest pause, s,
+            and the time at which it begins. zero, repeated, backwards: messages with a stamp of 0, with the
+            stamp of the message before, and with an earlier one. total: N. leaps: steps that leap where the
+            other clock does not. ahead: median time before the other clock, s.
+    """
+
+    first: float
+    last: float
+    rate_hz: float
+    gap: float
+    gap_at: float
+    zero: int
+    repeated: int
+    backwards: int
+    total: int = 0
+    leaps: int = 0
+    ahead: float = 0.0
+
+    @property
+    def in_order(self) -> bool:
+        """Whether the messages can be read by this clock; a few are left out."""
+        return max(self.zero, self.backwards) <= max(1, SPOILT * self.total)
+
+
+class ScanShape(NamedTuple):
+    """LaserScan.
+
+    Attributes:
+        beams: median number. extent: directions of all messages together; wider: if the first has fewer.
+        high: limit of the range, m. median: of the ranges within the limits, m, NaN if there are none.
+        nothing: share of beams without an object in range.
+    """
+
+    beams: int
+    extent: Extent
+    wider: bool
+    high: float
+    median: float
+    nothing: float
+
+
+class CloudShape(NamedTuple):
+    """PointCloud2. Attributes: points: of the first message. reach: median distance, m."""
+
+    points: int
+    reach: float
+
+
+class ImageShape(NamedTuple):
+    """Image, CompressedImage. Attributes: width, height: of the first message, pixels. encoding: or format.
+    grey: mean, 0 to 255."""
+
+    width: int
+    height: int
+    encoding: str
+    grey: float
+
+
+class ValueShape(NamedTuple):
+    """JointState, MultiArray. Attributes: sizes: of the layout's dimensions, else the number of values. low,
+    high: of all values (positions of joints)."""
+
+    sizes: tuple[int, ...]
+    low: float
+    high: float
+
+
+class MotionShape(NamedTuple):
+    """Poses, velocities: length in m and typical speed in m/s of each, NaN without these."""
+
+    pose_path: float
+    pose_speed: float
+    twist_path: float
+    twist_speed: float
+
+
+Shape = ScanShape | CloudShape | ImageShape | ValueShape | MotionShape
+
+
+class TopicDescription(NamedTuple):
+    """A topic.
+
+    Attributes:
+        kind: message type. total: number of messages. received: times of receipt. stamped: times in the
+            headers, None without headers. frame, child: frames of the first message, '' if it has none.
+        shape: what the messages hold, None for types that cannot be read. roles: what it can serve as.
+        fault: why its messages cannot be read, ''.
+    """
+
+    name: str
+    kind: str
+    total: int
+    received: Times
+    stamped: Times | None
+    frame: str
+    child: str
+    shape: Shape | None
+    roles: tuple[Role, ...]
+    fault: str
+
+
+class FrameLink(NamedTuple):
+    """A link between frames. Attributes: fixed: it is on /tf_static. total: number of transforms."""
+
+    parent: str
+    child: str
+    fixed: bool
+    total: int
+
+
+class BagDescription(NamedTuple):
+    """A bag. Attributes: topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is
+    left out."""
+
+    path: Path
+    topics: tuple[TopicDescription, ...]
+    links: tuple[FrameLink, ...]
+    notes: tuple[str, ...] = ()
+
+
+@np.errstate(all="ignore")  # numbers may be any
+def describe_bag(path: Path) -> BagDescription:
+    """Reads the whole bag; faults of a single topic are described, not raised.
+
+    Raises:
+        InputError: the bag is missing, damaged or empty.
+    """
+    told = list[str]()
+    with Bag(path, told.append) as bag:
+        topics = tuple(_describe_topic(bag, topic) for topic in bag.topics.values() if topic.total)
+        links = []
+        for name in (MOVING, STATIC):
+            try:
+                found = read_links(bag, name, "header")
+            except InputError:
+                continue  # the fault of the topic says why
+            links += [FrameLink(*pair, name == STATIC, len(link)) for pair, link in found.items()]
+    return BagDescription(path, topics, tuple(links), tuple(told))
+
+
+def roles_of(kind: str) -> tuple[Role, ...]:
+    """What messages of a type can serve as."""
+    if kind in POSES:
+        return ("odometry", "truth")
+    if kind in TWISTS:
+        return ("odometry",)
+    if kind in (SCAN, CLOUD, *IMAGES):
+        return ("views",)
+    return ("touch",) if kind in (JOINTS, *ARRAYS) else ()
+
+
+def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
+    received, stamps, fault, shape = list[int](), list[int](), "", None
+    frames, roles, contents = ("", ""), roles_of(topic.kind), list[Any]()
+    summary = SUMMARIES.get(topic.kind)
+    try:
+        if not roles:
+            received = list(bag.receipts(topic))
+        else:
+
+            def read(content: Any, place: str) -> None:
+                if summary is not None and (topic.kind not in FIRST or not contents):
+                    contents.append(summary[0](content, topic.kind, place))
+
+            for _, time, content, _ in bag.usable(topic, read):
+                received.append(time)
+                if hasattr(content, "header"):
+                    stamps.append(nanoseconds(content.header.stamp))
+                    frames = frames if any(frames) else frames_of(content)
+            if summary is not None:
+                shape = summary[1](bag, contents, stamps or received)
+    except InputError as error:
+        fault, roles = str(error), ()
+        received = received or list(bag.receipts(topic))
+    stamped = times_of(stamps, received) if len(stamps) == len(received) > 0 else None
+    return TopicDescription(*topic, times_of(received), stamped, *frames, shape, roles, fault)
+
+
+def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
+    """The times of N messages, ns, at least one; other: by the other clock."""
+    times = np.array(stamps, np.int64)
+    others = times if other is None else np.array(other, np.int64)
+    steps = np.diff(times)
+    ahead = steps[steps > 0]
+    longest = int(steps.argmax()) if len(steps) else 0
+    return Times(
+        first=int(times.min()) / 1e9,
+        last=int(times.max()) / 1e9,
+        rate_hz=1e9 / float(np.median(ahead)) if len(ahead) else 0.0,
+        gap=max(float(steps.max()) / 1e9, 0.0) if len(steps) else 0.0,
+        gap_at=int(times[longest]) / 1e9,
+        zero=int((times == 0).sum()),
+        repeated=int((steps == 0).sum()),
+        backwards=int((steps < 0).sum()),
+        total=len(times),
+        leaps=int(leaps(times, others).sum()),
+        ahead=float(np.median(times - others)) / 1e9,
+    )
+
+
+def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
+    own, (low, high) = extent_of(content, where), scan_limits(content)
+    ranges = np.asarray(content.ranges, float)
+    nothing = (ranges > high) | np.isposinf(ranges)
+    within = ranges[~nothing & (ranges >= low)]
+    median = float(np.median(within)) if len(within) else np.nan
+    return len(ranges), high, median, nothing.mean(), content.header.frame_id, own
+
+
+def _scan_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ScanShape:
+    """The shape of scans; directions are those in the frame of the first."""
+    beams, highs, medians, nothing, frames, extents = zip(*values, strict=True)
+    known = [median for median in medians if np.isfinite(median)]
+    median = float(np.median(known)) if known else np.nan
+    if len(set(frames)) > 1:
+        mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
+        turned = zip(frames, extents, strict=True)
+        extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
+    wider = wider_extent(extents)
+    extent = wider or extents[0]
+    return ScanShape(
+        int(np.median(beams)), extent, wider is not None, highs[0], median, float(np.mean(nothing))
+    )
+
+
+def _cloud_shape(bag: Bag, values: list[Any], stamps: list[int]) -> CloudShape:
+    points = values[0][np.isfinite(values[0]).all(axis=1)]
+    reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
+    return CloudShape(len(values[0]), reach)
+
+
+def _image_values(content: Any, kind: str, where: str) -> ImageShape:
+    grey = grey_image(content, kind, where)
+    encoding = content.encoding if kind == RAW else content.format
+    return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
+
+
+def _values(content: Any, kind: str, where: str) -> tuple[tuple[int, ...], np.ndarray]:
+    if kind == JOINTS:
+        return (len(content.name),), np.asarray(content.position, float)
+    sizes = tuple(int(dim.size) for dim in content.layout.dim)
+    return sizes or (len(content.data),), np.asarray(content.data, float)
+
+
+def _value_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ValueShape:
+    numbers = np.concatenate([value for _, value in values])
+    low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
+    return ValueShape(values[0][0], low, high)
+
+
+def _motion_values(content: Any, kind: str, where: str) -> np.ndarray:
+    """[6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none."""
+    pose = pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
+    return np.array([*pose, *(twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3)])
+
+
+def _motion_shape(bag: Bag, values: list[Any], stamps: list[int]) -> MotionShape:
+    rows, time, sizes = np.array(values), np.array(stamps, float) / 1e9, list[float]()
+    order = np.argsort(time, kind="stable")
+    rows, time = rows[order], time[order]
+    for motion in (from_poses(time, rows[:, :3]), from_velocities(time, *rows[:, 3:].T)):
+        known = np.isfinite(motion[:, 0]).any()
+        track = MotionTrack(time, np.ones(len(time), bool), motion)
+        path = float(np.nansum(np.hypot(motion[:, 0], motion[:, 1])))
+        sizes += [path, typical_motion(track).speed] if known else [np.nan, np.nan]
+    return MotionShape(*sizes)
+
+
+Summary = tuple[Callable[[Any, str, str], Any], Callable[[Bag, list[Any], list[int]], Shape]]
+SUMMARIES: dict[str, Summary] = {
+    SCAN: (_scan_values, _scan_shape),
+    CLOUD: (lambda content, kind, where: cloud_points(content, where), _cloud_shape),
+    **dict.fromkeys(IMAGES, (_image_values, lambda bag, values, stamps: values[0])),
+    **dict.fromkeys((JOINTS, *ARRAYS), (_values, _value_shape)),
+    **dict.fromkeys((*POSES, *TWISTS), (_motion_values, _motion_shape)),
+}
+"""What is kept of a message of each type, and what follows from that and the times, ns."""
+FIRST = (CLOUD, *IMAGES)
+"""Types of which only the first message is described."""

@@ -1,0 +1,214 @@
+"""Odometry and true poses of a bag."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot.recordings.bags.bag import Bag
+from robot.recordings.bags.motions import (
+    POSES,
+    TWISTS,
+    frames_of,
+    plane_errors,
+    pose_in_plane,
+    twist_in_plane,
+)
+from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
+from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
+from robot.recordings.bags.transforms import poses_between
+from robot.recordings.sanity_checks import nonfinite_errors
+from robot.sources.odometry import from_poses, from_velocities
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate, wrap
+
+AGREED = 1.2
+"""Length of the path of all frames over that of each of them, up to which their poses agree."""
+TURNED = 0.5
+"""Typical turn between poses of different frames, rad, from which they disagree."""
+
+
+class BagOdometry(NamedTuple):
+    """The odometry of a bag, N samples.
+
+    Attributes:
+        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
+        where: file and topic. body: frame of the robot, '' if the bag does not say. errors: found in it.
+        numbers: [N] message of each sample. held: whether these are velocities. poses: [N, 3] as recorded;
+        None if there are none. clock: the setting that takes the other clock, if that is better; else ''.
+    """
+
+    time: np.ndarray
+    motion: np.ndarray
+    where: str
+    body: str
+    errors: list[InputError]
+    numbers: np.ndarray
+    held: bool = False
+    poses: np.ndarray | None = None
+    clock: str = ""
+
+
+def read_odometry(bag: Bag, config: OdometryTopic, clock: Clock, report: Report) -> BagOdometry:
+    """The odometry.
+
+    Raises:
+        InputError: the topic does not exist or has no odometry.
+    """
+    twist = False
+    if config.tf is not None:
+        body = config.tf[1]
+        series = poses_between(bag, config.tf, clock, report, "odometry", config.plane)
+    else:
+        assert config.topic is not None
+        kind = bag.topic(config.topic, "recording.topics.odometry").kind
+        twist = kind in TWISTS and (config.use == "twist" or kind not in POSES)
+        series, body = _read_series(bag, config, "odometry", clock, report, twist)
+    errors = series.errors + nonfinite_errors(series.values, "odometry", series.place)
+    time, values, numbers = series.time, series.values, series.numbers
+    if len(time) < 2 and not errors:
+        errors.append(InputError(series.where, "one message with odometry", "at least two"))
+    if errors:
+        return BagOdometry(time, np.zeros((len(time), 4)), series.where, body, errors, numbers)
+    motion = from_velocities(time, *values.T) if twist else from_poses(time, values)
+    if config.every > 1:
+        chosen = slice(None, None, config.every)
+        path = integrate(motion[:, :3])[chosen]
+        time, numbers, values = time[chosen], numbers[chosen], values[chosen]
+        motion = from_poses(time, path)
+    given = None if twist else values
+    return BagOdometry(time, motion, series.where, body, [], numbers, twist, given, series.clock)
+
+
+def read_poses(bag: Bag, config: PoseTopic, clock: Clock, report: Report) -> Series:
+    """True poses [M, 3] (x m, y m, heading rad).
+
+    Raises:
+        InputError: the topic does not exist or has no poses.
+    """
+    if config.tf is not None:
+        series = poses_between(bag, config.tf, clock, report, "truth", config.plane)
+    else:
+        series, _ = _read_series(bag, config, "truth", clock, report, twist=False)
+    return series._replace(errors=series.errors + nonfinite_errors(series.values, "truth", series.place))
+
+
+def motion_at(moments: np.ndarray, time: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Odometry interpolated to other times.
+
+    Args:
+        moments: [M] s, increasing. time: [N] s of the odometry. motion: [N, 4].
+
+    Returns:
+        inside: [M] bool, moments within the odometry. motion: [I, 4] between these.
+    """
+    inside = (time[0] <= moments) & (moments <= time[-1])
+    if not inside.any():
+        return inside, np.zeros((0, 4))
+    path = integrate(motion[:, :3])
+    path[:, 2] = np.unwrap(path[:, 2])
+    at = [np.interp(moments[inside], time, column) for column in path.T]
+    return inside, from_poses(moments[inside], np.column_stack(at))
+
+
+def _read_series(
+    bag: Bag, config: PoseTopic, role: str, clock: Clock, report: Report, twist: bool
+) -> tuple[Series, str]:
+    """Poses or velocities [M, 3] of a topic, and the frame of the robot."""
+    assert config.topic is not None
+    topic = bag.topic(config.topic, f"recording.topics.{role}")
+    where = f"{bag.path}, {topic.name}"
+    if topic.kind not in POSES and not twist:
+        known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
+        raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
+    rows, kept, points, doubts = list[Any](), list[Any](), list[Any](), dict[str, list[str]]()
+    wanted = tuple(frame.lstrip("/") for frame in config.frames)
+
+    def read(content: Any, place: str) -> Any:
+        if wanted != frames_of(content)[: len(wanted)]:
+            return None
+        if twist:
+            value = twist_in_plane(TWISTS[topic.kind](content))
+            if not np.isfinite(value).all():
+                raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+            return value
+        position, turn = POSES[topic.kind](content)
+        value = pose_in_plane(position, turn, place, config.plane)
+        points.append((position.x, position.y, position.z))
+        for doubt in _doubts(content, turn):
+            doubts.setdefault(doubt, []).append(place)
+        return value
+
+    for number, time, content, value in bag.usable(topic, read):
+        if value is not None:
+            stamps = (stamp_of(content, time, each) for each in (clock, OTHER_CLOCK[clock]))
+            rows.append((number, *stamps, frames_of(content), time))
+            kept.append(value)
+    if not rows:
+        raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
+    numbers, times, others, pairs, received = ([row[k] for row in rows] for k in range(5))
+    values = np.array(kept).reshape(-1, 3)
+    poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
+    errors = _frame_errors(where, numbers, pairs, role, poses, received, bag, report)
+    for doubt, at in doubts.items() if not errors else ():
+        report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
+    if not (twist or errors):
+        errors = plane_errors(np.array(points), where, role, config.plane)
+    series = as_series(where, numbers, times, values, clock, report, others)
+    body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
+    return series._replace(errors=errors + series.errors), body
+
+
+def _frame_errors(
+    where: str,
+    numbers: list[int],
+    frames: list[Any],
+    role: str,
+    poses: np.ndarray,
+    received: list[int],
+    bag: Bag,
+    report: Report,
+) -> list[InputError]:
+    """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
+
+    Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
+    `received`: times of receipt, ns; the cure of a single change is the longer part beside it.
+    """
+    counts = Counter(frames)
+    if len(counts) < 2:
+        return []
+    usual = counts.most_common(1)[0][0]
+    parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
+    found = f"messages of several frames: {', '.join(parts)}"
+    names = np.array([list(counts).index(pair) for pair in frames])
+    changes, places = np.flatnonzero(np.diff(names)), poses[:, :2]
+    at = f"{where}, message {numbers[changes[0] + 1]}"
+    alone = [_length(places[names == k]) for k in range(len(counts))]
+    in_turn = len(changes) > len(counts)
+    turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
+    if turned < TURNED and _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+        report(f"{at}: {found}; their poses agree, look at the publisher")
+        return []
+    cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
+    if len(changes) == 1:
+        end = "to" if frames[0] == usual else "from"
+        middle = float(np.mean(received[changes[0] : changes[0] + 2]))
+        cure = f"--set recording.{end}={bag.since_start(middle):.3f}"
+    found += "; several nodes publish here, or it changes"
+    return [InputError(at, found, "one frame and child frame", cure)]
+
+
+def _length(places: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
+
+
+def _doubts(message: Any, turn: Any) -> Iterator[str]:
+    """What is doubtful about a pose that can be read, and its orientation."""
+    if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
+        yield "orientations are not unit quaternions (only their direction is used)"
+    covariance = np.asarray(getattr(getattr(message, "pose", None), "covariance", 0.0), float).ravel()
+    if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
+        yield "covariances are not numbers or negative: the publisher did not know the pose"

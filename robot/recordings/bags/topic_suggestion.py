@@ -1,0 +1,127 @@
+"""Settings that read a bag, from its description."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robot.recordings.bags.bag_description import (
+    BagDescription,
+    MotionShape,
+    ScanShape,
+    Times,
+    TopicDescription,
+    ValueShape,
+)
+from robot.recordings.bags.bag_touch import JOINTS
+from robot.recordings.bags.images import IMAGES
+from robot.recordings.bags.motions import ODOMETRY
+from robot.recordings.bags.scans import CLOUD, SCAN
+from robot.recordings.bags.transforms import BODIES
+
+TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
+"""Names of topics and frames with true poses."""
+WHEELS = re.compile(r"/?(|.+[/_.-])(odom|odom_combined)")
+"""Frames whose link to the robot in /tf is odometry, and the prefix of the robot."""
+LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
+SECTORS = 18  # of a view by default
+FASTER = 1.2  # times the odometry's rate: views beyond are the samples
+
+
+def suggested_topics(bag: BagDescription) -> dict[str, Any]:
+    """`recording.topics` that read the bag; {} if it has neither odometry nor images."""
+    truth = _first(bag, "truth", [topic for topic in bag.topics if TRUE.search(topic.name)])
+    odometry, wheels = _odometry(bag, truth)
+    views = _views(bag)
+    touch = None if views is not None else _touch(bag)
+    found: dict[str, Any] = {}
+    if odometry is not None:
+        found["odometry"] = odometry
+    elif views is None or views[0].kind not in IMAGES:
+        return {}
+    seen = views or touch
+    if seen is not None:
+        found["views" if views else "touch"] = seen[1]
+    if truth is not None:
+        found["truth"] = truth.name
+    used = [topic for topic in (wheels, seen and seen[0], truth) if topic is not None]
+    if not _headers_serve(used):
+        found["clock"] = "bag"
+    if (
+        seen is not None
+        and wheels is not None
+        and seen[0].received.rate_hz > FASTER * wheels.received.rate_hz
+    ):
+        found["samples"] = "views"
+    return found
+
+
+def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any, TopicDescription | None]:
+    """The setting, and the topic that it names."""
+    others = [topic for topic in bag.topics if topic != truth]
+    best = _first(bag, "odometry", [topic for topic in others if topic.kind == ODOMETRY])
+    best = best or _first(bag, "odometry", others)
+    if best is None:
+        robots = robots_of(bag)
+        return ({"tf": list(robots[0])} if robots else None), None
+    shape = best.shape
+    still = isinstance(shape, MotionShape) and not shape.pose_path > LEAST_PATH
+    if best.kind == ODOMETRY and isinstance(shape, MotionShape) and still and shape.twist_path > LEAST_PATH:
+        return {"topic": best.name, "use": "twist"}, best
+    return best.name, best
+
+
+def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
+    """The frames of the odometry and of the body of each robot in /tf; that with a view comes first."""
+    found = []
+    for link in bag.links:
+        named = None if link.fixed or link.total < 2 else WHEELS.fullmatch(link.parent)
+        if named and link.child in [named[1] + body for body in (*BODIES, "base")]:
+            found.append((named[1], (link.parent, link.child)))
+    views = _views(bag)
+    frame = "" if views is None else views[0].frame
+    return [pair for prefix, pair in sorted(found, key=lambda each: not frame.startswith(each[0]))]
+
+
+def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
+    for kinds in ((SCAN,), (CLOUD,), IMAGES):
+        topic = _first(bag, "views", [topic for topic in bag.topics if topic.kind in kinds])
+        if topic is not None:
+            shape = topic.shape
+            options: dict[str, Any] = {}
+            if isinstance(shape, ScanShape) and shape.beams < SECTORS:
+                options = {"rows": 1, "columns": shape.beams}
+            if isinstance(shape, ScanShape) and shape.wider:
+                options["span"] = [round(angle, 4) for angle in shape.extent.span]
+            return topic, {"topic": topic.name, **options} if options else topic.name
+    return None
+
+
+def _touch(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
+    topic = _first(bag, "touch", [topic for topic in bag.topics if topic.kind != JOINTS])
+    if topic is None or not isinstance(topic.shape, ValueShape):
+        return None
+    low, high = topic.shape.low, topic.shape.high
+    if (low >= 0 and high <= 1) or not low < high:
+        return topic, topic.name
+    return topic, {"topic": topic.name, "low": low, "high": high}
+
+
+def _first(bag: BagDescription, role: str, topics: Sequence[TopicDescription]) -> TopicDescription | None:
+    """The readable topic with most messages that can serve as this."""
+    able = [topic for topic in topics if role in topic.roles and topic.shape is not None]
+    return max(able, key=lambda topic: topic.total, default=None)
+
+
+def _headers_serve(topics: Sequence[TopicDescription]) -> bool:
+    """Whether the stamps in the headers are in order, do not leap where the bag does not, on one clock."""
+    stamped = [topic.stamped for topic in topics if topic.stamped is not None]
+    if not all(times.in_order and not times.leaps - times.backwards for times in stamped):
+        return False
+    clocks: list[Times] = [topic.stamped or topic.received for topic in topics]
+    return not clocks or bool(
+        np.max([times.first for times in clocks]) <= np.min([times.last for times in clocks])
+    )

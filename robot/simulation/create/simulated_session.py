@@ -1,0 +1,313 @@
+"""A simulated session of the whiskered Create as a source, bit-identical for the same settings.
+
+Every step of the state machine is one `Report`. Every part draws from its own random stream (arena,
+behaviour, wheels, strain), so that changing one part leaves the others unchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path as File
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeInt
+
+from robot.simulation.create.state_machine import (
+    BehaviourConfig,
+    CreateState,
+    MachineState,
+    WheelCommand,
+    drive,
+    motion_end,
+    next_state,
+    planned_rows,
+    wheel_command,
+)
+from robot.simulation.create.strain_sensors import (
+    WhiskersConfig,
+    base_strains,
+    bend_whiskers,
+    fixed_whiskers,
+    monitor_strain,
+    sample_strain,
+)
+from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
+from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
+from robot.sources.source import rate_of
+from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
+from robot.world.arena import Arena, arena_text, wall_segments
+from robot.world.polygons import segment_distance
+from robot.world.random_arena import ArenaConfig, make_arena
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import between
+from tactile.base.settings import Settings
+from tactile.base.types import Odometry, Report, StepEnd
+from tactile.wall_estimation.strain_templates import (
+    StrainTemplates,
+    TemplateTraining,
+    train_templates,
+    training_drive,
+)
+
+
+class CreateSimulationConfig(Settings):
+    """A simulated session of the Create. The defaults fill in what Fox et al. 2012 leave open."""
+
+    arena: ArenaConfig = ArenaConfig()
+    """Arena."""
+    behaviour: BehaviourConfig = BehaviourConfig()
+    """State machine."""
+    whiskers: WhiskersConfig = WhiskersConfig()
+    """Whiskers and strain sensors."""
+    wheels: WheelsConfig = WheelsConfig()
+    """Odometry errors."""
+    minutes: Annotated[float, Field(gt=0, le=1000)] = 6.0
+    """Duration, min."""
+    reports: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    """Number of steps, instead of a duration."""
+    seed: NonNegativeInt = 0
+    """Seed of all random streams."""
+
+    def resolved(self, folder: File) -> CreateSimulationConfig:
+        """A copy with relative paths taken from the folder, such as that of the configuration file."""
+        if self.arena.file is None:
+            return self
+        arena = self.arena.model_copy(update={"file": folder / self.arena.file})
+        return self.model_copy(update={"arena": arena})
+
+
+class CreateSimulation(SimulatedSource):
+    """A simulated session of the Create as a `Source`.
+
+    Attributes:
+        config: its settings. arena: its arena. steps: [N] motions of the robot.
+        time: [N] s, end of each step. truth: [N, 3] at these times. odometry: [N, 4].
+
+    Raises:
+        InputError: the configuration cannot be simulated; the error gives key and reason.
+    """
+
+    name = "create_simulation"
+    view_shape = (1, 4, 1)
+
+    def __init__(self, config: CreateSimulationConfig) -> None:
+        self.config = config
+        self.arena = make_arena(config.arena, config.seed)
+        walls, random = wall_segments(self.arena), stream(config.seed, "strain")
+        robot = CreateRobot(config.behaviour, config.whiskers, walls, random)
+        self.whiskers = len(robot.whiskers.base)
+        start = robot.at(self.arena.start)
+        self.steps = steps = list(_drive_steps(config, robot, start))
+        duration = np.array([step.duration for step in steps])
+        self.time = np.cumsum(duration)
+        pose = np.array([start.pose, *(step.pose for step in steps)])
+        self.truth = wrap_headings(pose[1:])
+        motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
+        kind = np.array([step.state.motion for step in steps])
+        self.odometry = simulate_wheel_odometry(config.wheels, motion, kind, stream(config.seed, "wheels"))
+        self.info = describe_create(config, self.arena)
+        document = {"create_simulation": self.info.provenance["create_simulation"], "arena": self.info.arena}
+        self.digest = digest_of_document(document)
+
+    @property
+    def rate_hz(self) -> float:
+        return rate_of(self.time)
+
+    def _readings(self) -> Iterator[Report]:
+        return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
+
+
+def describe_create(config: CreateSimulationConfig, arena: Arena) -> SourceInfo:
+    """Whiskers, arena and settings of a session; strain templates are trained from these."""
+    mounts = tuple((mount.x, mount.y, mount.direction_deg) for mount in config.whiskers.mounts)
+    return SourceInfo(
+        raw_whiskers=True,
+        planar_whiskers=PlanarWhiskersInfo(mounts=mounts, length=config.whiskers.length),
+        arena=arena_text(arena),
+        provenance={"create_simulation": config.model_dump(mode="json", exclude={"arena": {"file"}})},
+    )
+
+
+def _drive_steps(
+    config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep
+) -> Iterator[CreateStep]:
+    random = stream(config.seed, "behaviour")
+    step, doing, time, count = start, MachineState(CreateState.FWD1), 0.0, 0
+    while (count < config.reports) if config.reports else (time < 60 * config.minutes):
+        before = step
+        step = robot.step(before, doing.state, wheel_command(config.behaviour, doing))
+        time, count = time + step.duration, count + 1
+        turned = float(step.pose[2] - before.pose[2])
+        doing = next_state(config.behaviour, doing, step.moment, turned, random)
+        yield step
+
+
+HALF_WALL = 10.0
+"""Half the length of a wall that the robot cannot drive around, m."""
+APPROACH = 0.015
+"""Largest distance of the wall at the start, m."""
+RECORD_TIME = 2.0
+"""Duration of the recorded strain, s (Fox et al. 2012, II-G)."""
+
+
+def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.random.Generator) -> Report:
+    """The report of a drive into one flat wall, for strain templates.
+
+    The robot drives to the first contact as in FWD1, then for `RECORD_TIME` as in FWD2, regardless of strain.
+    The report is of this second motion; its first sample is taken at contact.
+
+    Args:
+        angle: direction of the wall in base_link, rad, counter-clockwise from ahead: pi / 2 is perpendicular
+            to the motion, with a smaller angle the wall is on the right, with a larger one on the left.
+
+    Raises:
+        InputError: the whiskers report no contact.
+    """
+    towards = np.array([np.sin(angle), -np.cos(angle)])
+    if towards[0] < 0.05:
+        raise ValueError(f"the robot does not drive into a wall at {angle:g} rad")
+    whiskers, behaviour = config.whiskers, config.behaviour
+    room = float((fixed_whiskers(whiskers).tip @ towards).max())
+    room += APPROACH * random.uniform(0.5, 1.0) * towards[0]
+    along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
+    wall = np.concatenate([room * towards - along, room * towards + along])[None]
+    robot = CreateRobot(behaviour, whiskers, wall, random)
+    step = robot.at(np.zeros(3))
+    while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
+        step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
+    if step.moment != StepEnd.HIT1:
+        found = (
+            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees"
+        )
+        expected = "a lower strain, or whiskers that reach beyond the body"
+        raise InputError("create_simulation.behaviour.contact", found, expected)
+    patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
+    command = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
+    push = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
+    return make_report(config, push, Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME))
+
+
+def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:
+    """A step as a reading."""
+    return Report(
+        odometry=odometry,
+        motion=int(step.state.motion),
+        moment=int(step.moment),
+        alive=fixed_whiskers(config.whiskers).alive,
+        contact=step.contact.copy(),
+        time=np.arange(len(step.strain)) / config.whiskers.rate,
+        strain=step.strain.copy(),
+    )
+
+
+def train_strain_templates(
+    config: CreateSimulationConfig, training: TemplateTraining | None = None
+) -> StrainTemplates:
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
+
+    Raises:
+        InputError: the training has another sample rate than the whiskers.
+    """
+    training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
+    random = stream(config.seed, "templates")
+    return train_templates(
+        (
+            training_drive(angle, repeat, drive_into_wall(config, angle, random))
+            for angle in training.angles.tolist()
+            for repeat in range(training.repeats)
+        ),
+        training,
+    )
+
+
+MIN_DURATION = 1e-6
+"""Shortest duration of a motion, s."""
+
+
+class CreateStep(NamedTuple):
+    """One motion of the robot.
+
+    Attributes:
+        state: of the state machine. moment: kind of end. duration: s. pose: [3] at its end (m, m, rad),
+            heading not wrapped. side: [W] bending side at its end. contact: [W] bool at its end.
+        strain: [T, W, 2] during FWD2, otherwise without samples.
+    """
+
+    state: CreateState
+    moment: StepEnd
+    duration: float
+    pose: np.ndarray
+    side: np.ndarray
+    contact: np.ndarray
+    strain: np.ndarray
+
+
+class CreateRobot:
+    """The Create among walls [S, 4] (x1, y1, x2, y2, m).
+
+    Attributes:
+        whiskers: its whiskers.
+    """
+
+    def __init__(
+        self,
+        behaviour: BehaviourConfig,
+        whiskers: WhiskersConfig,
+        walls: np.ndarray,
+        random: np.random.Generator,
+    ) -> None:
+        self.behaviour, self.sensors, self.walls = behaviour, whiskers, walls
+        self.whiskers = fixed_whiskers(whiskers)
+        self._random = random
+
+    def at(self, pose: np.ndarray) -> CreateStep:
+        """The state before the first motion from a pose."""
+        free = np.zeros(len(self.whiskers.base), int)
+        none = np.zeros((0, len(free), 2))
+        return CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
+
+    def step(self, last: CreateStep, state: CreateState, command: WheelCommand) -> CreateStep:
+        """Execute a motion until its planned or early end."""
+        config = self.behaviour
+        count = planned_rows(config, command)
+        time = np.minimum(np.arange(1, count + 1) * config.period, max(command.duration, MIN_DURATION))
+        near = self._near(last.pose, command)
+        poses = drive(command, last.pose, time)
+        bent = bend_whiskers(self.whiskers, poses, near, last.side)
+        strain = base_strains(self.sensors, self.whiskers, bent)
+        known = monitor_strain(self.sensors, strain, self.whiskers.alive, config.period, self._random)
+        end = motion_end(config, state, known, self._bumps(last.pose, poses, near), last.contact)
+        duration = float(time[end.row])
+        return CreateStep(
+            state,
+            end.moment,
+            duration,
+            poses[end.row],
+            bent.side[end.row],
+            np.abs(known[end.row, :, 0]) > config.contact,
+            self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
+        )
+
+    def _near(self, pose: np.ndarray, command: WheelCommand) -> np.ndarray:
+        """Walls within reach of whiskers or body during a motion."""
+        room = max(self.whiskers.reach, self.behaviour.body) + abs(command.speed) * command.duration
+        return self.walls[segment_distance(self.walls, pose[:2]) < room]
+
+    def _bumps(self, start: np.ndarray, poses: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """[T] bool, whether the body touches a wall and approaches it."""
+        if not len(near):
+            return np.zeros(len(poses), bool)
+        room = segment_distance(near, np.vstack([start, poses])[:, :2]).min(axis=1)
+        return (room[1:] < self.behaviour.body) & (np.diff(room) < 0)
+
+    def _sampled_strain(
+        self, last: CreateStep, near: np.ndarray, command: WheelCommand, duration: float
+    ) -> np.ndarray:
+        time = np.arange(round(duration * self.sensors.rate)) / self.sensors.rate
+        if not len(time):
+            return np.zeros((0, len(self.whiskers.base), 2))
+        bent = bend_whiskers(self.whiskers, drive(command, last.pose, time), near, last.side)
+        strain = base_strains(self.sensors, self.whiskers, bent)
+        return sample_strain(self.sensors, strain, self.whiskers.alive, self._random)

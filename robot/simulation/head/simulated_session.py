@@ -1,0 +1,329 @@
+"""A simulated session of the whisker head as a source, bit-identical for the same settings.
+
+Every part draws from its own random stream (maze.loop, maze.walls, maze.heights, path, motion, sensor,
+colour, drift, odometry), so that changing one part leaves the others unchanged.
+
+The dynamic fidelity: drives with inertia, whiskers with two bending modes, elastic walls.
+
+Each whisker is a linear system of six states, its angle and the two loads of `Beam` with their rates, driven
+by the command (linear between samples) and the force of the wall (constant between samples), and is
+integrated exactly by a matrix exponential. The wall is a stiff spring whose force is taken at the end of the
+sample (implicit, stable at any stiffness):
+    force = spring x (depth without force) / (1 + spring x give).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path as File
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeInt
+from scipy.linalg import expm
+
+from robot.simulation.head.baseline import has_baseline, make_baseline
+from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
+from robot.simulation.head.quasistatic import simulate_quasistatic
+from robot.simulation.head.whisk_stream import WallSweep, simulate_cycles, simulate_free_cycles
+from robot.sources.odometry import OdometryConfig, simulate_odometry
+from robot.sources.simulated import (
+    NO_ODOMETRY,
+    SimulatedSource,
+    check_steps,
+    digest_of_document,
+    wrap_headings,
+)
+from robot.sources.source_info import SimulationInfo, SourceInfo
+from robot.world.head_trajectory import MotionConfig, poses_at
+from robot.world.maze import POSE_CELL_SIZE, maze_text
+from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, make_scene, maze_info, other_surroundings
+from robot.world.walls import Surroundings
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.settings import Settings
+from tactile.base.types import Cycle, Whisk
+from tactile.features.calibration import Calibration, CalibrationConfig, calibrate
+from tactile.features.contact_threshold import stiffness
+from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whiskers.whisking import (
+    MID_PROTRACTION,
+    WhiskingConfig,
+    check_amplitude,
+    initial_drive,
+    whisk_command,
+)
+
+WALL_STIFFNESS = 300.0
+"""Ratio of wall stiffness to whisker stiffness."""
+
+
+def simulate_dynamic(
+    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
+    head, config, mechanics, whisking = setup
+    model = make_beam(config.beam.shaft)
+    step, push = _systems(setup, model)  # [W, 6, 8], [W, 6, 3]
+    # Displacement of the contact point per unit of each of the first three states.
+    arm = np.concatenate([sweep.reach[None], model.at(sweep.reach)])  # [3, T, N, W]
+    give = np.einsum("itnw,wij,jtnw->tnw", arm, push[:, :3], arm, optimize=True)
+    spring = WALL_STIFFNESS * model.unit
+    force_per = 1 / (1 / spring + give)
+    reading_noise = sweep.noise[..., 2].swapaxes(0, 1)
+    slide, hard = sweep.drift / config.rate, stiffness(config.beam.shaft, sweep.reach)
+    angle, side, moment = (np.zeros(sweep.wall.shape) for _ in range(3))
+
+    size = sweep.wall.shape[1:]
+    state = np.zeros((size[1], 8, size[0]))  # for each whisker: six states, command, rate of the command
+    drive, reading, aim = initial_drive(*size), np.zeros(size), np.zeros(size)
+    touching, slipped = np.zeros(size, bool), np.zeros(size, bool)
+    late, x, before = np.zeros(size), np.zeros(size), np.zeros(size)
+    for k, time in enumerate(sweep.time):
+        last, (aim, drive) = aim, whisk_command(whisking, drive, time, reading, threshold, head.shape)
+        state[:, 6], state[:, 7] = last.T, (aim - last).T
+        state[:, :6] = step @ state
+        # A wall that reaches a whisker from the side makes contact at the whisker's present angle.
+        late = np.where(touching, late, np.maximum(before - sweep.wall[k], 0.0))
+        wall = sweep.wall[k] + late
+        place = arm[:, k]
+        along = state[:, :3].T  # [N, 3, W], axes from the end
+        depth = place[0] * (along[:, 0] - wall) + place[1] * along[:, 1] + place[2] * along[:, 2]
+        touching = (depth > 0) & ~slipped
+        force = np.where(touching, depth * force_per[k], 0.0)
+        state[:, :6] -= push @ (place * force).transpose(2, 0, 1)
+        slipped |= touching & (along[:, 0] - wall > mechanics.slip)
+        before = along[:, 0] + (place[1] * along[:, 1] + place[2] * along[:, 2]) / place[0]
+        y = -(model.moment[0] * along[:, 1] + model.moment[1] * along[:, 2]) / model.unit
+        limit = config.beam.friction * force * place[0] / (hard[k] * model.unit)
+        x = np.minimum(np.maximum(x + slide[k], -limit), limit)
+        angle[k], side[k], moment[k] = along[:, 0], hard[k] * x, y
+        reading = y + reading_noise[k]
+    return angle, side, moment
+
+
+def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
+    """State transition [W, 6, 8] of one sample, and effect [W, 6, 3] of forces along the first three states.
+
+    Units are the length, rigidity and mass of each whisker; rates are per time unit of its beam, the rate of
+    the command is per sample.
+    """
+    head, config, mechanics, _ = setup
+    servo = mechanics.servo * model.unit
+    lengths, which = np.unique(head.length, return_inverse=True)
+    steps, pushes = [], []
+    for length in lengths:
+        unit = beam_time_unit(config.beam, float(length))
+        sample = 1 / (config.rate * unit)
+        rotor = servo / (2 * np.pi * config.servo.frequency * unit) ** 2
+        mass = np.zeros((3, 3))
+        mass[0, 0] = rotor + model.inertia
+        mass[0, 1:] = mass[1:, 0] = model.coupled
+        mass[1:, 1:] = model.mass
+        drag = 2 * config.servo.damping * np.sqrt(servo * mass[0, 0])
+        spring, damper = np.zeros((3, 3)), np.zeros((3, 3))
+        spring[0, 0], damper[0, 0] = servo, drag
+        spring[1:, 1:] = model.stiffness
+        damper[1:, 1:] = 2 * config.beam.damping / model.modes[0] * model.stiffness
+        inverse = np.linalg.inv(mass)
+        flow = np.zeros((11, 11))  # six states, command, its rate, three forces
+        flow[:3, 3:6] = sample * np.eye(3)
+        flow[3:6, :3], flow[3:6, 3:6] = -sample * inverse @ spring, -sample * inverse @ damper
+        flow[3:6, 6], flow[3:6, 7] = sample * inverse[:, 0] * servo, inverse[:, 0] * drag
+        flow[6, 7] = 1.0
+        flow[3:6, 8:] = sample * inverse
+        carried = expm(flow)
+        steps.append(carried[:6, :8])
+        pushes.append(carried[:6, 8:])
+    return np.array(steps)[which], np.array(pushes)[which]
+
+
+RAW_TIERS = {"quasistatic": simulate_quasistatic, "dynamic": simulate_dynamic}
+"""Mechanics models that give raw samples."""
+
+
+class SimulationConfig(Settings):
+    """A simulated session of the whisker head. The defaults fill in what Salman & Pearson 2016 leave open."""
+
+    maze: MazeConfig = MazeConfig()
+    """Maze."""
+    path: PathConfig = PathConfig()
+    """Route of the head."""
+    motion: MotionConfig = MotionConfig()
+    """Speed and variation of its motion."""
+    kidnaps: KidnapConfig = KidnapConfig()
+    """Kidnaps."""
+    odometry: OdometryConfig = OdometryConfig()
+    """Odometry errors."""
+    whisking: WhiskingConfig = WhiskingConfig()
+    """Drive of the whiskers."""
+    mechanics: MechanicsConfig = MechanicsConfig()
+    """Drives, whiskers and sensors."""
+    stream: StreamConfig = StreamConfig()
+    """Further mechanics of the raw fidelities."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """Free whisking before the session, for the raw fidelities."""
+    later_maze: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Fraction of the session after which the maze is replaced by another one: a control in which no later
+    place can be recognised."""
+    seed: NonNegativeInt = 0
+    """Seed of all random streams."""
+    fidelity: Literal["auto", "kinematic", "quasistatic", "dynamic"] = "auto"
+    """Model of the mechanics; `auto`: the cheapest one that gives the requested data."""
+    raw: bool = False
+    """Whether to give raw whisker samples, 2000 per second."""
+
+    def resolved(self, folder: File) -> SimulationConfig:
+        """A copy with relative paths taken from the folder, such as that of the configuration file."""
+        if self.maze.file is None:
+            return self
+        maze = self.maze.model_copy(update={"file": folder / self.maze.file})
+        return self.model_copy(update={"maze": maze})
+
+
+class ChosenTier(NamedTuple):
+    """A fidelity and the reason for it."""
+
+    name: Literal["kinematic", "quasistatic", "dynamic"]
+    why: str
+
+
+def choose_tier(config: SimulationConfig) -> ChosenTier:
+    """The fidelity in the configuration, or for `auto` the cheapest one that gives the requested data.
+
+    Raises:
+        InputError: raw samples, or a baseline that acts on them, are requested, but the configured fidelity
+            has none.
+    """
+    on = has_baseline(config.mechanics.baseline)
+    if config.fidelity == "kinematic" and (config.raw or on):
+        found = "kinematic, which has no raw samples" + (" for mechanics.baseline to act on" if on else "")
+        raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
+    if config.fidelity != "auto":
+        return ChosenTier(config.fidelity, "set by simulation.fidelity")
+    if on:
+        return ChosenTier("quasistatic", "mechanics.baseline acts on raw samples")
+    if config.raw:
+        return ChosenTier("quasistatic", "raw samples are wanted, without bending modes and overshoot")
+    return ChosenTier("kinematic", "only contact features are wanted")
+
+
+class HeadSimulation(SimulatedSource):
+    """A simulated session as a `Source`.
+
+    Attributes:
+        config, head_config: its settings. tier: the fidelity and its reason.
+        scene: maze, path and walls. calibration: of the head, None in the kinematic fidelity.
+        time: [N] s. start: [N] s, start of each whisk cycle.
+        truth: [N, 3]. odometry: [N, 4]. kidnapped: [N] bool, whether a kidnap precedes the row.
+        features: contact features [N, W], None in the raw fidelities.
+
+    Raises:
+        InputError: the configuration cannot be simulated; the error gives key and reason.
+    """
+
+    name = "simulation"
+
+    def __init__(self, config: SimulationConfig, head_config: HeadConfig | None = None) -> None:
+        head_config = head_config or HeadConfig()
+        self.config, self.head_config, self.tier = config, head_config, choose_tier(config)
+        self.head = head = ur10_head(head_config)
+        whisking, seed = config.whisking, config.seed
+        check_amplitude(whisking, head)
+        self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
+        check_steps("simulation", min(self.scene.duration, self.scene.path.duration) * whisking.rate)
+        count = int(min(self.scene.duration, self.scene.path.duration) * whisking.rate)
+        if count < 1:
+            raise InputError("simulation.path", f"{self.scene.duration:.3g} s", "at least one whisk")
+        self.start = np.arange(count) / whisking.rate
+        self.time = self.start + MID_PROTRACTION / whisking.rate
+        pose = poses_at(self.scene.path, self.time)
+        self.truth = wrap_headings(pose)
+        self.kidnapped = np.zeros(count, bool)
+        rows = np.searchsorted(self.time, self.scene.jumps)
+        self.kidnapped[rows[rows < count]] = True
+        random = stream(seed, "odometry")
+        self.odometry = simulate_odometry(config.odometry, self.time, pose, random, self.kidnapped)
+        self._parts = self._surroundings()
+        mechanics = config.mechanics
+        self._baseline = make_baseline(
+            mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
+        )
+        self.calibration = None if self.tier.name == "kinematic" else self._calibrate()
+        self.features = self._kinematic() if self.calibration is None else None
+
+        plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
+        drawing = maze_text(self.scene.maze) if config.maze.file else ""
+        settings = {"head": head_config.model_dump(mode="json"), "simulation": plain}
+        self.digest = digest_of_document({**settings, "maze": drawing})
+        self.info = SourceInfo(
+            raw_whiskers=True,
+            cell_size=POSE_CELL_SIZE,
+            head=head_config,
+            calibration=self.calibration,
+            maze=maze_info(self.scene.maze, config.maze, config.seed),
+            simulation=SimulationInfo(
+                sha256=self.digest, seed=config.seed, tier=self.tier.name, why=self.tier.why
+            ),
+            provenance={"simulation": plain},
+        )
+
+    @property
+    def _setup(self) -> HeadSetup:
+        return HeadSetup(self.head, self.config.stream, self.config.mechanics, self.config.whisking)
+
+    @property
+    def rate_hz(self) -> float:
+        return self.config.whisking.rate
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        return (*self.head.shape, 1)
+
+    @property
+    def whiskers(self) -> int:
+        return len(self.head.length)
+
+    def _surroundings(self) -> list[tuple[Surroundings, slice]]:
+        """Walls, and the cycles to which they apply."""
+        later = self.config.later_maze
+        if later is None:
+            return [(self.scene.surroundings, slice(None))]
+        change = int(later * self.length)
+        other = other_surroundings(self.scene, self.config.maze, self.head, self.config.seed)
+        return [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
+
+    def _kinematic(self) -> WhiskColumns:
+        parts = []
+        for surroundings, rows in self._parts:
+            random = stream(self.config.seed, "sensor")  # noise of the whole session, independent of the maze
+            columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
+            parts.append([column[rows] for column in columns])
+        return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _calibrate(self) -> Calibration:
+        """Calibration from free whisking before the session."""
+        config = self.config
+        count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
+        random = stream(config.seed, "calibration")
+        model = RAW_TIERS[self.tier.name]
+        record = simulate_free_cycles(model, self._setup, count, random, self._baseline)
+        return calibrate(config.calibration, record, where="simulation")
+
+    def _readings(self) -> Iterator[Whisk | Cycle]:
+        if self.features is None:
+            return self._cycles()
+        return (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
+
+    def _cycles(self) -> Iterator[Cycle]:
+        """Raw samples of each cycle, without odometry."""
+        assert self.calibration is not None
+        random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
+        model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]
+        for surroundings, rows in self._parts:
+            path, start = self.scene.path, self.start[rows]
+            yield from simulate_cycles(
+                model, self._setup, surroundings, path, start, random, threshold, baseline
+            )
