@@ -185,7 +185,7 @@ def _threshold(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from robot.simulation.create.template_training import drive_held_out, render_drives, train_to_file
+    from evaluation.papers.fox2012.template_training import drive_held_out, render_drives, train_to_file
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
@@ -390,7 +390,7 @@ def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.metrics.resources import one_core
+    from evaluation.studies.resources import one_core
 
     with one_core():
         from evaluation.papers.tables.speed import SIZES, speed_table
@@ -399,7 +399,7 @@ def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.metrics.resources import one_core
+    from evaluation.studies.resources import one_core
 
     with one_core():
         from evaluation.papers.tables.cycles import cycle_table, profile_table
@@ -411,7 +411,7 @@ def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.metrics.resources import one_core
+    from evaluation.studies.resources import one_core
 
     with one_core():
         from evaluation.papers.tables.batches import batch_table

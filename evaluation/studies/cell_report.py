@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import rankdata
 
-from evaluation.plots.cell_study_plot import MapRow, draw_rate_maps, draw_scores
 from evaluation.studies.cell_study import PARAMETERS, CellStudy
+from evaluation.studies.cell_study_plot import MapRow, draw_rate_maps, draw_scores
 from evaluation.studies.set_scores import SetScores
 from evaluation.studies.study_report import format_number, render_table
 from tactile.base.atomic_write import write_atomically, write_text_atomically

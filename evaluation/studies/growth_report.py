@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.plots.growth_plot import GrowthCurve, draw_growth
 from evaluation.studies.executor import Executor
 from evaluation.studies.growth import GrowthStudy, GrowthTask
+from evaluation.studies.growth_plot import GrowthCurve, draw_growth
 from evaluation.studies.growth_session import GrowthRow, measure_growth
 from evaluation.studies.study_report import (
     describe_machines,

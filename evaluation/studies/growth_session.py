@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.resources import peak_memory, reset_peak_memory, watch_load
-from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE
 from evaluation.metrics.trajectory import ate
 from evaluation.studies.growth import Ground, GrowthTask
 from evaluation.studies.machine import Machine, compilations, machine
+from evaluation.studies.perturbation import repeat_course
+from evaluation.studies.resources import peak_memory, reset_peak_memory, watch_load
+from evaluation.studies.session_metrics import FALSE_CLOSURE_DISTANCE
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
 from ratslam.runs.open_source import open_observations, read_observations
 from robot.sources.in_memory import load_into_memory
-from robot.sources.perturbation import repeat_course
 from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
 from tactile.base.types import Observation

@@ -14,7 +14,7 @@ from time import perf_counter
 
 from numba.core import event as events
 
-from evaluation.metrics.resources import processor_name
+from evaluation.studies.resources import processor_name
 from tactile.base.settings import Settings
 
 PACKAGES = ("ratslam", "tactile", "robot", "evaluation")

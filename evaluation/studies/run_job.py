@@ -17,13 +17,14 @@ from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.occupancy_score import score_grid
-from evaluation.metrics.resources import peak_memory, reset_peak_memory, watch_load
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import anchored_errors, recognition_error
 from evaluation.metrics.scorecard import score_run
 from evaluation.studies.machine import Stopwatch, machine
 from evaluation.studies.metrics import quantity
+from evaluation.studies.perturbation import perturb
 from evaluation.studies.records import RunRecord, record_of
+from evaluation.studies.resources import peak_memory, reset_peak_memory, watch_load
 from evaluation.studies.study import Job
 from evaluation.studies.tiers import compare_with_tier
 from ratslam.core.session import CHUNK, Session
@@ -32,7 +33,6 @@ from ratslam.runs.build_session import build_session
 from ratslam.runs.online_error import OnlineErrorLog
 from ratslam.runs.open_source import open_observations, read_observations
 from robot.sources.in_memory import InMemorySource, load_into_memory
-from robot.sources.perturbation import perturb
 from robot.sources.source import Source
 from robot.world.arena import read_arena
 from tactile.base.errors import InputError

@@ -13,9 +13,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evaluation.plots.pareto_plot import ParetoPoint, draw_pareto
 from evaluation.studies.machine import Machine
 from evaluation.studies.metrics import COLUMNS, METRICS
+from evaluation.studies.pareto_plot import ParetoPoint, draw_pareto
 from evaluation.studies.records import RunRecord
 from evaluation.studies.schema import StudyPlan
 from evaluation.studies.study_summary import Row, Spread, default_error, mark_optimal, plain, summarise

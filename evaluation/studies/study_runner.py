@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from evaluation.metrics.resources import one_core
 from evaluation.studies.executor import Executor
 from evaluation.studies.records import RunLog, RunRecord, record_of
+from evaluation.studies.resources import one_core
 from evaluation.studies.run_job import run_job, run_job_alone
 from evaluation.studies.study import Job
 

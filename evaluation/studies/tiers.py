@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
-from evaluation.metrics.view_separation import image_difference
 from evaluation.studies.metrics import quantity
 from evaluation.studies.study import with_settings
+from evaluation.studies.view_separation import image_difference
 from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.simulated_session import HeadSimulation

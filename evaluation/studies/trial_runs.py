@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from evaluation.metrics.resources import one_core
 from evaluation.studies.recommendation import FEWEST, Recommendation
 from evaluation.studies.records import RunRecord
+from evaluation.studies.resources import one_core
 from evaluation.studies.run_job import run_job
 from evaluation.studies.scene_statistics import short_session
 from evaluation.studies.schema import StudyPlan

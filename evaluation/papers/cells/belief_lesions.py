@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.panel_grid import head_panel, panel_grid
 from evaluation.papers.cells.timing import time_call
@@ -30,6 +29,7 @@ from evaluation.papers.trials.recording_trial import closure_claims, run_recordi
 from evaluation.papers.trials.touch_trial import collect_session, new_session
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
+from evaluation.studies.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from ratslam.core.backend import Backend
 from ratslam.core.session import Session
 from ratslam.methods.recall import RecallBackend

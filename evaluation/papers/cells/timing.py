@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.resources import one_core, processor_name, watch_load
+from evaluation.studies.resources import one_core, processor_name, watch_load
 
 
 class Taken(NamedTuple):

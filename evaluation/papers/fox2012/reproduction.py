@@ -24,7 +24,6 @@ import numpy as np
 from evaluation.metrics.grid_error import CONVENTIONS, DISTINCT_CONVENTIONS, MAIN_CONVENTION, Convention
 from evaluation.metrics.occupancy_grid import OccupancyGrid, mean_grid
 from evaluation.metrics.occupancy_score import GridScore, pool_grids, render_grid_scores, score_grid
-from evaluation.metrics.revisits import CLOSED_GAP, path_metrics
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error
 from evaluation.papers.fox2012.protocols import (
@@ -36,6 +35,7 @@ from evaluation.papers.fox2012.protocols import (
     Protocol,
     session_config,
 )
+from evaluation.papers.fox2012.revisits import CLOSED_GAP, path_metrics
 from evaluation.papers.trials.arena_trial import (
     ArenaSession,
     FilterResult,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
+from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
 from evaluation.papers.maps.localising import Judged, judge
 from evaluation.papers.maps.pictures import Panel, draw_panels
 from evaluation.papers.maps.row import Line, Localised, MapRow, MapTask, count, median, spread

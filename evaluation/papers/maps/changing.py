@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import true_places
+from evaluation.papers.maps.localisation_metrics import true_places
 from evaluation.papers.maps.localising import Judged, judge
 from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
 from evaluation.papers.maps.row import Line, MapRow, MapTask, count, spread

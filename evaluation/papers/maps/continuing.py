@@ -15,7 +15,7 @@ from evaluation.papers.maps.row import Line, MapRow, MapTask, count, spread
 from evaluation.papers.maps.scenarios import REENTERED, carried_sessions, kidnapped, open_world
 from evaluation.papers.maps.sessions import Recorded, record
 from evaluation.papers.tables.comparison import Record
-from robot.sources.view_controls import apply_control
+from evaluation.papers.trials.view_controls import apply_control
 
 ENERGY = 0.15
 """Goal of the Energy Metric within pieces, m^2 + rad^2."""

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import RIGHT, localisation_errors, true_places
+from evaluation.papers.maps.localisation_metrics import RIGHT, localisation_errors, true_places
 from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
 from evaluation.papers.maps.row import Line, MapRow, MapTask, count, median, spread
 from evaluation.papers.maps.scenarios import open_world, ten_circuits
 from evaluation.papers.maps.sessions import Recipe
 from evaluation.papers.maps.stored_maps import StoredMap
+from evaluation.papers.maps.virtual_arm import VirtualArm
 from evaluation.papers.tables.comparison import Record
 from ratslam.places.localiser import Localiser
 from ratslam.runs.goal_planner import GoalPlanner, contact_map, felt_points
@@ -32,7 +33,6 @@ from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute
 from robot.live.live_config import LiveConfig
-from robot.live.virtual_arm import VirtualArm
 from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
 from robot.world.scene import Scene, make_scene, maze_seed
 from robot.world.walls import Surroundings, Walls
@@ -59,7 +59,7 @@ class Drive(NamedTuple):
     Attributes:
         state, reason: its end. whisks: their number. replans: new ways.
         error: true distance from the goal at the end, m, by the nearest step of the map
-            (`evaluation.metrics.localisation_metrics`). reckoned: true distance, m, from where the noisy
+            (`evaluation.papers.maps.localisation_metrics`). reckoned: true distance, m, from where the noisy
             odometry puts the robot, summed from the start of the first drive on. by_arm: distance from the
             goal, m, at which exact motion from the end of the map to the goal's pose in the map would have
             ended. length: of the true path, m. shortest: way over driven cells, m. clearance: least distance

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import (
+from evaluation.metrics.trajectory import align
+from evaluation.papers.maps.localisation_metrics import (
     BUILDING,
     aligned_errors,
     exceeds,
@@ -18,7 +19,6 @@ from evaluation.metrics.localisation_metrics import (
     localisation_errors,
     nearest_steps,
 )
-from evaluation.metrics.trajectory import align
 from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
 from evaluation.papers.maps.row import Line, MapRow, MapTask
 from evaluation.papers.maps.sessions import Recipe, Recorded, record

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import (
+from evaluation.metrics.trajectory import align
+from evaluation.papers.maps.localisation_metrics import (
     RIGHT,
     SAME_HEADING,
     WRONG,
@@ -16,7 +17,6 @@ from evaluation.metrics.localisation_metrics import (
     known_steps,
     localisation_errors,
 )
-from evaluation.metrics.trajectory import align
 from evaluation.papers.maps.stored_maps import MapArrays
 from tactile.base.se2 import compose
 

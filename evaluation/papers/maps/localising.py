@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import (
+from evaluation.metrics.trajectory import align
+from evaluation.papers.maps.localisation_metrics import (
     RIGHT,
     WRONG,
     MapSteps,
@@ -17,7 +18,6 @@ from evaluation.metrics.localisation_metrics import (
     is_within,
     localisation_errors,
 )
-from evaluation.metrics.trajectory import align
 from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
 from evaluation.papers.maps.row import Line, Localised, MapRow, MapTask, count, median, spread
 from evaluation.papers.maps.scenarios import (
@@ -30,7 +30,7 @@ from evaluation.papers.maps.scenarios import (
 )
 from evaluation.papers.maps.sessions import Recorded, record
 from evaluation.papers.tables.comparison import Record
-from robot.sources.view_controls import apply_control
+from evaluation.papers.trials.view_controls import apply_control
 from tactile.base.se2 import compose, integrate
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from robot.sources.view_controls import Control
+from evaluation.papers.trials.view_controls import Control
 
 COMMON = ("simulation.path.circuits=CCCAAACACA", "simulation.odometry.noise=gated")
 """Settings of all sessions unless a condition overrides them: the paper's circuits (III-C), and noise

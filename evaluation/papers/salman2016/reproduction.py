@@ -11,23 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.direction_metrics import (
+from evaluation.metrics.energy_metric import energy, energy_all_pairs, successive_pairs
+from evaluation.metrics.exm import experience_metric
+from evaluation.metrics.statistics import bootstrap
+from evaluation.metrics.trajectory import align
+from evaluation.papers.salman2016 import paper_figures
+from evaluation.papers.salman2016.direction_metrics import (
     DIRECTION_METRICS,
     clockwise_steps,
     direction_metrics,
     lap_of_step,
 )
-from evaluation.metrics.energy_metric import energy, energy_all_pairs, successive_pairs
-from evaluation.metrics.exm import experience_metric
-from evaluation.metrics.session_metrics import (
-    SessionResult,
-    TouchMetrics,
-    experience_metric_if_defined,
-    lap_ends,
-    touch_metrics,
-)
-from evaluation.metrics.statistics import bootstrap
-from evaluation.metrics.trajectory import align
+from evaluation.papers.salman2016.paper_figures import DrivenPath, MeasuredQuantity, experience_history
 from evaluation.papers.salman2016.protocols import (
     BY_MAZE,
     COMMON,
@@ -43,12 +38,18 @@ from evaluation.papers.salman2016.protocols import (
 from evaluation.papers.trials.reproduction import Paper, ResultRow, column, count_sets, run_with_progress
 from evaluation.papers.trials.threshold_sweep import sweep_thresholds
 from evaluation.papers.trials.touch_trial import collect_session, run_session
-from evaluation.plots import paper_figures, style
-from evaluation.plots.paper_figures import DrivenPath, MeasuredQuantity, experience_history
+from evaluation.papers.trials.view_controls import Control, apply_control
+from evaluation.plots import style
+from evaluation.studies.session_metrics import (
+    SessionResult,
+    TouchMetrics,
+    experience_metric_if_defined,
+    lap_ends,
+    touch_metrics,
+)
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import override, parse, validate
 from robot.sources.in_memory import truncate_log
-from robot.sources.view_controls import Control, apply_control
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 

@@ -1,6 +1,6 @@
 """The table of real buildings: whether the map is better than odometry where nobody tuned it.
 
-Rows are recordings as they are with miscalibrated copies of them (`robot.sources.perturbation`), and a
+Rows are recordings as they are with miscalibrated copies of them (`evaluation.studies.perturbation`), and a
 recording with given place ids of which a third is lost, wrong or new; depth views of a Create are mapped at
 several cell sizes and sector widths. ATE is the RMS position error after a rigid alignment, m: of the final
 map, of the live pose (as estimated at the time) and of odometry. A run is worse than odometry if its ATE
@@ -25,8 +25,8 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row, sel
 from evaluation.papers.tables.recordings import Recording, metres, real_recordings
 from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from evaluation.studies.executor import run_tasks
+from evaluation.studies.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
 
 FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
 """Of a closure's steps: true distance, m, and error of the claimed heading difference, rad."""

@@ -27,12 +27,12 @@ from evaluation.papers.tables.touch_table import MAIN, ROWS
 from evaluation.papers.trials.recording_trial import run_recording
 from evaluation.papers.trials.spoilt_maps import spoilt_maps
 from evaluation.studies.executor import run_tasks
+from evaluation.studies.perturbation import miscalibrate
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.odometry import OdometryConfig
-from robot.sources.perturbation import miscalibrate
 
 FIRST_MAZE = 31000
 RIDGE = 2.0

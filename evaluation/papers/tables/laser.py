@@ -2,7 +2,7 @@
 
 ATE is the RMS position error of the final map after a rigid alignment, in metres. A closure is false if its
 two steps are more than `FALSE_CLOSURE_CELLS` pose cells apart in truth. Perturbed copies have another start,
-noise and dropped frames (`robot.sources.perturbation`).
+noise and dropped frames (`evaluation.studies.perturbation`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import GOLDEN, Recording, metres
 from evaluation.papers.trials.recording_trial import run_recording
 from evaluation.studies.executor import run_tasks
+from evaluation.studies.perturbation import perturb
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.perturbation import perturb
 
 FALSE_CLOSURE_CELLS = 2.5
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
+from evaluation.studies.perturbation import Perturbation
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
 from ratslam.runs.open_source import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import load_into_memory
-from robot.sources.perturbation import Perturbation
 from robot.touch_source import observation_of
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate, wrap

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from evaluation.metrics.session_metrics import SessionResult
+from evaluation.studies.session_metrics import SessionResult
 from ratslam.core.backend import Backend
 from ratslam.core.precision import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at

@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.distance import cdist
 
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.whiskers.outline import Tangents, fit_circle, local_tangents, plane_covariance
+from evaluation.papers.whiskers.sliding_contact import SlidingContact, find_contact, track_contact
 from robot.recordings.whiskers.stage import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
-from tactile.wall_estimation.outline import Tangents, fit_circle, local_tangents, plane_covariance
 from tactile.wall_estimation.signal_map import SignalMap, fit_signal_map, predict_signal
-from tactile.wall_estimation.sliding_contact import SlidingContact, find_contact, track_contact
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.metrics.localisation_metrics import (
+from evaluation.papers.maps.localisation_metrics import (
     BUILDING,
     RIGHT,
     WRONG,

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from evaluation.plots.paper_figures import (
+from evaluation.papers.salman2016.paper_figures import (
     DrivenPath,
     ExperienceHistory,
     MeasuredQuantity,

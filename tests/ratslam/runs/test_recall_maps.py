@@ -17,7 +17,7 @@ from ratslam.core.session import Session, Step
 from ratslam.mapping.loop_closures import Verdict
 from robot.recordings.npz_trace import read_trace
 from robot.sources.in_memory import InMemorySource
-from robot.sources.perturbation import perturb
+from evaluation.studies.perturbation import perturb
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
 from tests.helpers import scenes

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.studies import perturbation
+from evaluation.studies.perturbation import perturb, repeat_course
 from robot.recordings.npz_trace import read_trace
-from robot.sources import perturbation
-from robot.sources.perturbation import perturb, repeat_course
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.papers.trials.view_controls import apply_control
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
-from robot.sources.view_controls import apply_control
 from robot.touch_source import open_touch_source
 from tactile.frontend import TouchConfig
 

@@ -8,9 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.papers.whiskers.outline import Circle, fit_circle, local_tangents, plane_covariance
+from evaluation.papers.whiskers.sliding_contact import (
+    ContactTrack,
+    SlidingContact,
+    find_contact,
+    track_contact,
+)
 from robot.recordings.whiskers.stage import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
-from tactile.wall_estimation.outline import Circle, fit_circle, local_tangents, plane_covariance
 from tactile.wall_estimation.signal_map import (
     SignalMap,
     fit_signal_map,
@@ -18,7 +24,6 @@ from tactile.wall_estimation.signal_map import (
     signal_slope,
     signal_variance,
 )
-from tactile.wall_estimation.sliding_contact import ContactTrack, SlidingContact, find_contact, track_contact
 
 SLICES = Path(__file__).parents[2] / "data" / "real_touch" / "stanford"
 BASE = np.array([0.01, -0.02, 0.005])

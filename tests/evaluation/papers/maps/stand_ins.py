@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.metrics.localisation_metrics import nearest_steps
+from evaluation.papers.maps.localisation_metrics import nearest_steps
 from evaluation.papers.maps.row import Localised, Methods
 from evaluation.papers.maps.sessions import Recorded
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap

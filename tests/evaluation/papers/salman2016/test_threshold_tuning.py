@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from evaluation.metrics.view_separation import ViewDifferences
 from evaluation.papers.salman2016.threshold_tuning import (
     THRESHOLDS,
     ThresholdScore,
@@ -21,6 +20,7 @@ from evaluation.papers.salman2016.threshold_tuning import (
     tune_threshold,
     view_differences,
 )
+from evaluation.studies.view_separation import ViewDifferences
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main

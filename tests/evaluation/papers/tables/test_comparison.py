@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from evaluation.metrics.session_metrics import TouchMetrics
 from evaluation.papers.tables import buildings, comparison, touch
 from evaluation.papers.tables.comparison import (
     Files,
@@ -29,6 +28,7 @@ from evaluation.papers.tables.comparison import (
 )
 from evaluation.papers.tables.recordings import Recording
 from evaluation.studies import machine
+from evaluation.studies.session_metrics import TouchMetrics
 from ratslam.cli import main
 from tactile.base.errors import InputError
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.metrics.session_metrics import TouchMetrics
 from evaluation.papers.tables import batches, buildings, cycles, grid, laser, recordings, touch
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from evaluation.studies.session_metrics import TouchMetrics
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.papers.whiskers.outline import Tangents
 from evaluation.papers.whiskers.tangent import (
     RADIUS,
     CylinderResult,
@@ -21,7 +22,6 @@ from evaluation.papers.whiskers.tangent import (
     table,
 )
 from tactile.base.errors import InputError
-from tactile.wall_estimation.outline import Tangents
 
 CENTRE = np.array([4e-3, -6e-3])
 

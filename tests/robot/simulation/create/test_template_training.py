@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.papers.fox2012.template_training import (
+    DURATIONS,
+    ESTIMATORS,
+    HeldOutDrive,
+    drive_held_out,
+    render_drives,
+)
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.create.simulated_session import (
     CreateSimulation,
     CreateSimulationConfig,
     train_strain_templates,
-)
-from robot.simulation.create.template_training import (
-    DURATIONS,
-    ESTIMATORS,
-    HeldOutDrive,
-    drive_held_out,
-    render_drives,
 )
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.metrics.experience_log import creation_rows
-from evaluation.metrics.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, lap_ends
+from evaluation.studies.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, lap_ends
 
 BESIDE = 0.02
 """Steps of the two directions this near in truth count as the same spot, m."""
