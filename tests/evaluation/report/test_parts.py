@@ -104,7 +104,7 @@ def test_files_are_explained(tmp_path: Path) -> None:
 
 
 def test_the_readme_and_the_page_explain_the_same_files() -> None:
-    text = (ROOT / "ratslam" / "pipeline" / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / "ratslam" / "runs" / "README.md").read_text(encoding="utf-8")
     table = text[text.index("## The run directory") :].split("\n## ")[0]
     named = {name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in row.split(", ")}
     assert {name.strip("`") for name in named} == set(FILES)

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic import levels, pose_cells, window
+from ratslam.classic import excitation_inhibition as window
+from ratslam.classic import levels, pose_cells
 from ratslam.classic.level_step import StepInput, step_at
 from ratslam.classic.levels import to_full_torus, window_levels
 from ratslam.classic.pose_cell_config import NetworkConfig, rings, units

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic import pose_cells, window
+from ratslam.classic import excitation_inhibition as window
+from ratslam.classic import pose_cells
 from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.level_step import StepInput, step_at
 from ratslam.classic.levels import from_full_torus, to_full_torus, window_levels

@@ -111,11 +111,6 @@ def test_without_truth_and_views_the_wheels_are_unknown(folder: Path, capsys) ->
     assert not rig.exists()
 
 
-def test_the_old_command_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train-templates", "x"]) == 2
-    assert "ratslam reproduce templates" in capsys.readouterr().err
-
-
 def test_settings_are_those_that_differ() -> None:
     rig = Rig(
         (

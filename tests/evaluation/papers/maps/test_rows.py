@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.maps import halves, merging
+from evaluation.papers.maps import halves
+from evaluation.papers.maps import merged_mazes as merging
 from evaluation.papers.maps.reproduction import ROWS, reproduce_maps
 from evaluation.papers.maps.row import MapTask, Methods
 from evaluation.papers.maps.scenarios import (

@@ -123,11 +123,6 @@ def test_parts_of_the_grid_are_run_tasks_and_put_together(monkeypatch):
     assert "<- the winner" in render_tuning(found)
 
 
-def test_the_former_command_names_the_new_one(capsys):
-    assert main(["tune", "tiny.yaml"]) == 2
-    assert "`ratslam reproduce threshold`" in capsys.readouterr().err
-
-
 def test_invalid_configurations_are_refused(tmp_path, capsys):
     config = tmp_path / "labels.yaml"
     config.write_text("recording: {file: missing.npz}\n")

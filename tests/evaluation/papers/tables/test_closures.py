@@ -6,7 +6,8 @@ import json
 
 import numpy as np
 
-from evaluation.papers.tables import closures, touch
+from evaluation.papers.tables import closures
+from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.closures import JudgedSession, closures_table, fit_weights
 from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, log_odds, shipped_weights
 

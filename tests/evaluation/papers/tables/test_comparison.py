@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from evaluation.papers.tables import buildings, comparison, touch
+from evaluation.papers.tables import buildings, comparison
+from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.comparison import (
     Files,
     Record,

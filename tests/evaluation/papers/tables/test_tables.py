@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.tables import batches, buildings, cycles, grid, laser, recordings, touch
+from evaluation.papers.tables import batches, buildings, cycles, laser, recordings
+from evaluation.papers.tables import grid_table as grid
+from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
 from evaluation.studies.session_metrics import TouchMetrics

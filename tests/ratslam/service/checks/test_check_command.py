@@ -10,7 +10,9 @@ from ratslam.cli import main
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.service.checks import backend_checks as backend
-from ratslam.service.checks import metric, source, touch
+from ratslam.service.checks import metric_checks as metric
+from ratslam.service.checks import source_checks as source
+from ratslam.service.checks import touch_checks as touch
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
