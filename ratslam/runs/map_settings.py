@@ -57,13 +57,15 @@ def _error(where: str, different: dict[str, list[Any]], cure: str) -> InputError
 
 
 def _settings(config: RunConfig) -> dict[str, Any]:
-    """What a method's state and map depend on, by dotted names as in a configuration."""
+    """What a method's state and map depend on, by dotted names as in a configuration; not whether keyframes
+    are merged, which a session may begin or leave off at any time."""
     builtin = config.backend in BACKENDS.builtin
     kind = BACKENDS.get(config.backend, "backend").config_class
     names = list(kind.model_fields) if builtin else ["backend_settings"]
     plain = config.model_dump(mode="json", include={*names})
     precision = {"session.precision": config.session.precision}
-    return flat_settings({name: plain[name] for name in names}) | precision
+    settings = flat_settings({name: plain[name] for name in names}) | precision
+    return {name: value for name, value in settings.items() if name != "keyframes.merge_stood"}
 
 
 def _text(value: Any) -> str:
