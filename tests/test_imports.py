@@ -55,7 +55,7 @@ VIOLATIONS = {
         ("evaluation.papers.tables.touch_table", "evaluation.papers.maps"),
         ("evaluation.papers.planted", "ratslam.core.estimates"),
     ],
-    "core, methods and backends do not know robot and evaluation": [
+    "the engine does not know robot and evaluation": [
         ("ratslam.core.session", "robot"),
         ("ratslam.methods.classic", "evaluation"),
     ],

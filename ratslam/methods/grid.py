@@ -16,8 +16,7 @@ from jax import lax
 
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
-from ratslam.grid import blob_kernels as kernels
-from ratslam.grid import likelihoods, particle_maps, particles
+from ratslam.grid import blob_kernels, likelihoods, particle_maps, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
@@ -241,9 +240,9 @@ class GridBackend(Backend):
         windows = particle_maps.windows_around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(features.free, len(FREE_POINTS)).astype(self.dtype)
         place = particle_maps.to_window(self._in_cells(pose, jnp.asarray(self.free)), windows)
-        footprint = kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
+        footprint = blob_kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
-            body = kernels.disc(
+            body = blob_kernels.disc(
                 particle_maps.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
             )
             footprint -= jnp.where(features.valid, config.body, 0.0) * body
@@ -269,7 +268,7 @@ class GridBackend(Backend):
             self._in_cells(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
         amount = config.blob * features.new.astype(self.dtype)
-        footprint = kernels.gaussian_blobs(
+        footprint = blob_kernels.gaussian_blobs(
             particle_maps.to_window(ends, windows), amount, self.blob_sd, windows.size
         )
         maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
@@ -280,9 +279,11 @@ class GridBackend(Backend):
         place = particle_maps.to_window(place, windows)[:, 0]
         direction = pose[:, 2] + features.direction
         if config.wall == "edge":
-            shape = kernels.wall_sector(place, direction, config.along / cell, config.sector, windows.size)
+            shape = blob_kernels.wall_sector(
+                place, direction, config.along / cell, config.sector, windows.size
+            )
         else:
-            shape = kernels.wall_edge(
+            shape = blob_kernels.wall_edge(
                 place, direction, config.along / cell, config.across / cell, windows.size
             )
         shape = jnp.where(features.wall, shape, 0.0)

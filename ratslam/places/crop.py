@@ -83,7 +83,7 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
         arrays |= {prefix + name: value for name, value in part.arrays().items()}
     # The hypotheses of the selection begin at the first keyframe, so that the map stays where it was.
     arrays["selection/hypotheses/poses/0"] = graph.pose.rows[None, :1].copy()
-    arrays |= _acceptance(own, number, sequences)
+    arrays |= _acceptance(own, sequences)
     map.restore(arrays)
     merged = MergedRows(row[taken], *views, np.maximum(number[before], 0), np.zeros((len(before), 3)))
     return CroppedRows(merged, inside[before], *since, elsewhere)
@@ -136,16 +136,9 @@ def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, 
     graph.taken.replace(np.arange(len(taken)))
 
 
-def _acceptance(own: Arrays, number: np.ndarray, sequences: np.ndarray) -> Arrays:
-    """The arrays of the rule of acceptance, where it has some: its control, and what it compared."""
-    arrays: Arrays = {}
-    control = with_prefix(own, "acceptance/control/")
-    if control:
-        log = ClosureLog()
-        log.restore(control)
-        log.take(number)
-        arrays |= {f"acceptance/control/{name}": value for name, value in log.arrays().items()}
+def _acceptance(own: Arrays, sequences: np.ndarray) -> Arrays:
+    """The array of the rule of acceptance, where it has one: what it compared with odometry."""
     compared = own.get("acceptance/log_ratio")
-    if compared is not None:
-        arrays["acceptance/log_ratio"] = compared[sequences[sequences < len(compared)]]
-    return arrays
+    if compared is None:
+        return {}
+    return {"acceptance/log_ratio": compared[sequences[sequences < len(compared)]]}
