@@ -13,8 +13,8 @@ from evaluation.artifacts.grid_npz import read_grid, write_grid_truth
 from evaluation.artifacts.nav2 import write_nav2
 from evaluation.artifacts.run_reader import write_walls
 from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
-from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
+from evaluation.metrics.occupancy_score import score_grid
 from ratslam.runs.run_directory import RunDirectory
 from robot.sources.source_info import SourceInfo
 from robot.world.arena import Arena, is_enclosed, is_occupied, read_arena, wall_segments

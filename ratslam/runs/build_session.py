@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ratslam.methods.method_registry import Sensors, build
-from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.precision import prepare_precision
 from ratslam.core.session import Session
 from ratslam.mapping.config import FULL, Ablation
+from ratslam.methods.method_registry import Sensors, build
 from ratslam.runs.cell_plan import plan_recording, probe_of
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Source
 from robot.touch_source import planar_whiskers_of
 

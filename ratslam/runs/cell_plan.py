@@ -8,9 +8,9 @@ import numpy as np
 
 from ratslam.classic.cell_probe import choose_cells
 from ratslam.classic.cells_config import CellSumsConfig
-from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.backend import Backend, PoseCellProbe
 from ratslam.core.session import Probe
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.simulated import SimulatedSource
 from robot.sources.source import Source

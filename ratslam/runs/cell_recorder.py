@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
-from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.backend import Backend
 from ratslam.core.session import CHUNK, Step
 from ratslam.runs.cell_plan import RecordingPlan, SumsPlan, plan_recording
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Sample, Source
 
 ROWS = "cells.rows"

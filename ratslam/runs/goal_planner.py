@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ratslam.core.backend import Map
+from ratslam.mapping.appearance import WhiskerAppearance
+from ratslam.mapping.map import KeyframeMap
 from ratslam.places.contact_alignment import RememberedContacts, placed_points
 from ratslam.places.route import (
     NoWay,
@@ -17,9 +20,6 @@ from ratslam.places.route import (
     position,
     travel_graph,
 )
-from ratslam.core.backend import Map
-from ratslam.mapping.appearance import WhiskerAppearance
-from ratslam.mapping.map import KeyframeMap
 from ratslam.recall.whisker_likelihood import level_heights
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, PlannedWay

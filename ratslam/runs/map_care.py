@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.places.crop import crop_map
-from ratslam.places.difference import MapContent, difference, keyframe_content
-from ratslam.methods.recall import RecallBackend
-from ratslam.runs.settings.changed_settings import flat_settings
-from ratslam.runs.settings.strict_yaml import dump
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import Obstacle
+from ratslam.methods.recall import RecallBackend
+from ratslam.places.crop import crop_map
+from ratslam.places.difference import MapContent, difference, keyframe_content
 from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
 from ratslam.runs.map_results import holds_results, rewrite_results
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.runs.sensor import disagreement
+from ratslam.runs.settings.changed_settings import flat_settings
+from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
 from tactile.base.new_file import make_new_file, require_writable

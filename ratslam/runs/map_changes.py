@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from evaluation.artifacts.change_table import NAME, ChangeRow, write_changes
+from ratslam.core.backend import Map
 from ratslam.places.change import Change
 from ratslam.places.localiser import Localiser
 from ratslam.places.session_changes import Touch, session_changes
-from ratslam.core.backend import Map
 from ratslam.runs.run_directory import RunDirectory
 from tactile.frontend import TouchConfig
 from tactile.whiskers.head_geometry import ur10_head

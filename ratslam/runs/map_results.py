@@ -21,9 +21,9 @@ from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum, write_tum
 from evaluation.plots.run_plots import plot_writers
 from evaluation.plots.session_plot import draw_sessions
-from ratslam.runs.settings.run_config import ScoreConfig
 from ratslam.core.backend import Map
 from ratslam.runs.report import NAME as REPORT
+from ratslam.runs.settings.run_config import ScoreConfig
 from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.plots.way_plot import draw_way
+from ratslam.core.backend import Map
 from ratslam.places.route import (
     Mode,
     Travel,
@@ -16,7 +17,6 @@ from ratslam.places.route import (
     nearest_experience,
     travel_graph,
 )
-from ratslam.core.backend import Map
 from ratslam.runs.goal_planner import HEADING_RADIUS, experience_at, felt_walls
 from ratslam.runs.saved_map import SavedMap
 from robot.live.goal_config import GoalConfig

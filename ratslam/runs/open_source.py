@@ -13,8 +13,8 @@ from robot.recordings.formats import open_recording
 from robot.simulation.create.simulated_session import CreateSimulation
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.simulation.rat.simulated_session import RatSimulation
-from robot.sources.source_registry import SOURCES
 from robot.sources.source import Sample, Source
+from robot.sources.source_registry import SOURCES
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings

@@ -20,12 +20,10 @@ from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import read_tum
-from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
-from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.settings.strict_yaml import dump
+from ratslam.core.estimates import Action
 from ratslam.core.growable_array import GrowableArray
 from ratslam.core.session import CHUNK, Session, Step
-from ratslam.core.estimates import Action
+from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.runs.artifacts import (
     WhiskerView,
     save_closure_views,
@@ -44,6 +42,8 @@ from ratslam.runs.progress import MapReport, MapSchedule, Observer, RunDescripti
 from ratslam.runs.run_directory import RunDirectory
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.runs.sensor import check_same_sensor, sensor_of
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import dump
 from robot.recordings.input_judge import judge_motion
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of

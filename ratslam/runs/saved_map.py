@@ -13,16 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.methods.method_registry import BACKENDS, LOCALISING
-from ratslam.runs.settings.other_files import MAP, kind_of
-from ratslam.runs.settings.renamed_keys import with_moved_settings
-from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
-from ratslam.runs.settings.strict_yaml import dump, parse, validate
 from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
+from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.build_session import build_session
-from ratslam.runs.estimate import START, PoseEstimate, estimate_arrays, read_estimate
-from ratslam.runs.folder_change import unfinished_change
 from ratslam.runs.checkpoint_file import (
     EXPECTED,
     FORMAT,
@@ -32,9 +26,15 @@ from ratslam.runs.checkpoint_file import (
     text_of,
     write_arrays,
 )
+from ratslam.runs.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.runs.folder_change import unfinished_change
 from ratslam.runs.map_settings import check_same_settings
-from ratslam.runs.sensor import Sensor, sensor_of
 from ratslam.runs.open_source import open_observations
+from ratslam.runs.sensor import Sensor, sensor_of
+from ratslam.runs.settings.other_files import MAP, kind_of
+from ratslam.runs.settings.renamed_keys import with_moved_settings
+from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
+from ratslam.runs.settings.strict_yaml import dump, parse, validate
 from robot.sources.description import SourceDescription, describe
 from robot.sources.source import Source
 from robot.touch_source import TouchSource, open_touch_source

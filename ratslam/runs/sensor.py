@@ -6,9 +6,9 @@ import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ratslam.runs.map_settings import assignments
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.map_settings import assignments
 from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.source import Source
 from tactile.base.errors import InputError

@@ -10,16 +10,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ratslam.methods.method_registry import BACKENDS
-from ratslam.runs.settings.completion import complete
-from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.backend import Map
 from ratslam.core.kernel_cache import keep_kernels
+from ratslam.methods.method_registry import BACKENDS
 from ratslam.runs.build_session import build_session
 from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
 from ratslam.runs.localise import localising
-from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.runs.open_source import ConfigLike, open_source, resolve_config
+from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.description import SourceDescription
 from robot.sources.source import Sample, Source
 from robot.sources.source_info import SourceInfo

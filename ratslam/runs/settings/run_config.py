@@ -12,8 +12,8 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.metric_registry import METRICS
-from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.classic.cells_config import CellsConfig
+from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.runs.settings.includes import merge_includes
 from ratslam.runs.settings.packaged import PresetName, find_config
 from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
@@ -26,9 +26,9 @@ from robot.simulation.head.simulated_session import SimulationConfig
 from robot.simulation.rat.simulated_session import RatSimulationConfig
 from robot.sources.source_registry import SOURCES
 from robot.touch_source import TOUCH
-from tactile.base.settings import Settings
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.plugins import PluginConfig, Registry, read_settings
+from tactile.base.settings import Settings
 from tactile.frontend import TouchConfig
 
 
@@ -103,8 +103,8 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
     backend_settings: dict[str, Any] = Field(default_factory=dict)
     """Settings of a registered method."""
     presets: tuple[PresetName, ...] | None = None
-    """Presets for the settings that are left open (`ratslam.runs.settings.packaged`), the first before the others;
-    null: those that suit the source. The file in the run directory names those that were used."""
+    """Presets for the settings that are left open (`ratslam.runs.settings.packaged`), the first before the
+    others; null: those that suit the source. The file in the run directory names those that were used."""
     session: SessionConfig = SessionConfig()
     """Precision, seed and memory."""
     score: ScoreConfig = ScoreConfig()

@@ -11,8 +11,8 @@ import pytest
 
 from evaluation.metrics.map_pieces import energy_within_pieces
 from ratslam.core.session import Session, Step
-from ratslam.mapping.keyframe_graph import APART
 from ratslam.mapping.io import read_json
+from ratslam.mapping.keyframe_graph import APART
 from tactile.base.types import Observation
 from tests.helpers.g2o import read_g2o
 from tests.ratslam.runs.touch_walks import (

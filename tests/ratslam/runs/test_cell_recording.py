@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 import ratslam
-from ratslam.methods.method_registry import Sensors
 from ratslam.classic.cell_probe import active_cells
 from ratslam.classic.levels import to_full_torus
-from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.examples import dead_reckoning
+from ratslam.methods.method_registry import Sensors
 from ratslam.runs.build_session import build_session
 from ratslam.runs.cell_plan import plan_recording
 from ratslam.runs.cell_recorder import ROWS
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
+from ratslam.runs.settings.run_config import LoopConfig
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from ratslam.classic.cell_probe import choose_cells
-from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.core.session import Session, Step
 from ratslam.runs.build_session import build_session
+from ratslam.runs.settings.run_config import LoopConfig
 from robot.sources.in_memory import InMemorySource
 
 STEPS, RATE = 96, 50.0

@@ -14,14 +14,14 @@ import pytest
 
 import ratslam
 import ratslam.runs.runner
-from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
-from ratslam.runs.continuation import resume_session
 from ratslam.runs.checkpoint_file import digest_of
+from ratslam.runs.continuation import resume_session
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map
+from ratslam.runs.settings.run_config import LoopConfig
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
@@ -113,9 +113,7 @@ def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: p
     """Of readers and of the judge of motion, those of the map first, each once."""
     told = iter((["a gap"], ["a gap", "a jump"]))
     found: list[tuple[np.ndarray, np.ndarray, str]] = []
-    monkeypatch.setattr(
-        ratslam.runs.runner, "judge_motion", lambda *args: found.append(args) or next(told)
-    )
+    monkeypatch.setattr(ratslam.runs.runner, "judge_motion", lambda *args: found.append(args) or next(told))
     for name, source, resume, wanted in (
         ("a", first(), None, ["cut off", "a gap"]),
         ("b", second(), tmp_path / "a", ["cut off", "a gap", "late", "a jump"]),

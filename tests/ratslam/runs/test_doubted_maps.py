@@ -11,8 +11,8 @@ from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics import run_metrics
 from evaluation.metrics.scorecard import render_health, render_warnings, score_run
 from evaluation.metrics.trajectory import ate
-from ratslam.core.backend import NO_CLOSURE
 from evaluation.papers.trials.spoilt_maps import Recipe, solved_anew, spoil
+from ratslam.core.backend import NO_CLOSURE
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_health import DOUBTED, worse_than_odometry
 from tactile.base.se2 import compose, integrate, inverse

@@ -9,12 +9,12 @@ import networkx
 import numpy as np
 import pytest
 
+from evaluation.papers.maps.virtual_arm import VirtualArm
 from ratslam.runs.goal_planner import GoalPlanner, felt_points
-from robot.live.live_config import LiveConfig
 from robot.live.goal_config import GoalConfig
 from robot.live.goal_drive import DriveState, GoalDrive
 from robot.live.goal_route import GoalRoute
-from evaluation.papers.maps.virtual_arm import VirtualArm
+from robot.live.live_config import LiveConfig
 from robot.world.head_trajectory import MotionConfig
 from robot.world.maze import Maze, between_cells, cell_centre, random_maze, wall_boxes
 from robot.world.walls import Surroundings

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ratslam.places.localiser import Localisation, Localiser
-from ratslam.methods.localise import LocaliseBackend
 from ratslam.core.session import Session, Step
+from ratslam.methods.localise import LocaliseBackend
+from ratslam.places.localiser import Localisation, Localiser
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Observation
 from tests.ratslam.runs.touch_walks import Walk, empty_session, follow, shuffled, simulate_walk, unseen

@@ -10,10 +10,10 @@ import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from ratslam.cli import main
-from ratslam.runs.settings.completion import complete
 from ratslam.runs import merge as merging
 from ratslam.runs.merge import merge_maps
 from ratslam.runs.saved_map import describe_readings, read_map, write_map
+from ratslam.runs.settings.completion import complete
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tactile.base.errors import InputError

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import ratslam
-from ratslam.places.crop import keyframes_of_steps
 from ratslam.cli import main
+from ratslam.places.crop import keyframes_of_steps
 from ratslam.runs import merge as merging
 from ratslam.runs.map_care import crop_saved, undo_sequence
 from ratslam.runs.map_settings import differing_settings

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from evaluation.metrics.metric import Quantity
+from ratslam.examples import taxel_array
+from ratslam.runs.open_source import open_source
+from ratslam.runs.run import run
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from ratslam.examples import taxel_array
-from ratslam.runs.run import run
-from ratslam.runs.open_source import open_source
 from robot.sources.source_registry import SOURCES
 from robot.touch_source import TOUCH
 from tests.helpers import tactile_arrays

@@ -9,10 +9,10 @@ import pytest
 
 import ratslam
 from ratslam.cli import main
-from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
 from ratslam.runs.open_source import open_observations, open_source, read_observations
+from ratslam.runs.settings.run_config import RunConfig, load_config
 
 SHORT = ("rat_simulation.seconds=4", "session.reserve=64")
 PHASES = ("rat_darkness", "rat_cue_rotation", "rat_cue_conflict", "rat_kidnap", "rat_stretch")

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
-from ratslam.methods.config import RecallBackendConfig
-from ratslam.methods.recall import RecallBackend
+from evaluation.studies.perturbation import perturb
 from ratslam.core.backend import Map
 from ratslam.core.session import Session, Step
 from ratslam.mapping.loop_closures import Verdict
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
 from robot.recordings.npz_trace import read_trace
 from robot.sources.in_memory import InMemorySource
-from evaluation.studies.perturbation import perturb
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation
 from tests.helpers import scenes

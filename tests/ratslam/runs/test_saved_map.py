@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import ratslam
-from ratslam.runs.settings.strict_yaml import dump, dump_data, parse
 from ratslam.core.session import Session
 from ratslam.runs.checkpoint_file import FORMAT, FORMATS, digest_of
 from ratslam.runs.saved_map import SavedMap, read_map, write_map
 from ratslam.runs.sensor import check_same_sensor
+from ratslam.runs.settings.strict_yaml import dump, dump_data, parse
 from tactile.base.errors import InputError
 
 CONFIG = """

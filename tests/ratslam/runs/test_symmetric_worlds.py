@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ratslam.methods.config import RecallBackendConfig
-from ratslam.methods.recall import RecallBackend
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
 from robot.sources.in_memory import InMemorySource
 from tests.helpers import scenes
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ratslam.mapping.loop_closures import Verdict
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.mapping.loop_closures import Verdict
 from robot.simulation.head.simulated_session import HeadSimulation
 from tactile.base.types import Observation
 from tests.ratslam.runs.touch_walks import (

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from ratslam.runs.settings.completion import complete
-from ratslam.runs.settings.run_config import RunConfig
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.runs.build_session import build_session
 from ratslam.runs.open_source import read_observations
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
 from tactile.base.se2 import integrate

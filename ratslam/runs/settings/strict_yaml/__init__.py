@@ -16,10 +16,10 @@ from pydantic import BaseModel, ValidationError
 from ratslam.runs.settings.other_files import refuse_other_files
 from ratslam.runs.settings.strict_yaml.document import Document, KeyPath, Place, describe, join_keys
 from ratslam.runs.settings.strict_yaml.dumper import Dumper
-from ratslam.runs.settings.strict_yaml.yaml_reader import Reader
 from ratslam.runs.settings.strict_yaml.validation_errors import input_errors
-from tactile.base.settings import Settings
+from ratslam.runs.settings.strict_yaml.yaml_reader import Reader
 from tactile.base.errors import InputError, InputErrors
+from tactile.base.settings import Settings
 
 Model = TypeVar("Model", bound=Settings)
 

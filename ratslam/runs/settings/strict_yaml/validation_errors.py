@@ -12,8 +12,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ratslam.runs.settings.strict_yaml.document import Document, KeyPath, describe, join_keys, join_words
-from tactile.base.settings import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 _MAX_ERRORS = 50
 _WORDS = {

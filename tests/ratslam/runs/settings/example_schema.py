@@ -9,8 +9,8 @@ import pytest
 from pydantic import Field, model_validator
 
 from ratslam.runs.settings.strict_yaml import override, parse, validate
-from tactile.base.settings import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 
 class PoseCells(Settings):

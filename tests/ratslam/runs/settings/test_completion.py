@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from ratslam.runs.open_source import open_source
 from ratslam.runs.settings.completion import EXTENT_FACTOR, EXTENT_MARGIN, complete
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump, parse, validate
-from ratslam.runs.open_source import open_source
 from robot.sources.source import Source
 from tactile.base.errors import InputError
 

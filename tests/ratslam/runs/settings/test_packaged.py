@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.studies.study import read_study
 from ratslam.cli import main
 from ratslam.runs.settings.packaged import find_config, packaged_configs
 from ratslam.runs.settings.run_config import load_config
 from ratslam.runs.settings.strict_yaml import load
-from evaluation.studies.study import read_study
 from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[4]

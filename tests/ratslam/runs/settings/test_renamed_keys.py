@@ -14,8 +14,8 @@ from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.renamed_keys import MOVED, RENAMED
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import override, parse, validate
-from tactile.base.settings import Settings
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
 
 WRITTEN = Path(__file__).parents[3] / "data" / "maps" / "ratslam-map-1.npz"
 """A map file, whose configuration was written when the settings of `MOVED` had their old names."""

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from ratslam.runs.settings.strict_yaml import parse, schema, validate
-from tests.ratslam.runs.settings.example_schema import VALID, Config, PoseCells, Recording, Simulation, refusal
+from tests.ratslam.runs.settings.example_schema import (
+    VALID,
+    Config,
+    PoseCells,
+    Recording,
+    Simulation,
+    refusal,
+)
 
 
 def test_reads_every_part() -> None:
