@@ -9,20 +9,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from evaluation.metrics.metric import Finding, Metric
     from evaluation.metrics.metric_registry import METRICS, MetricEntry
-    from ratslam.core.backend import Backend, Map
+    from ratslam.core.backend import Backend, Map, PathMap
     from ratslam.core.estimates import Action, Estimate
-    from ratslam.core.path_map import PathMap
     from ratslam.core.session import Session
     from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
+    from ratslam.runs.build_session import open_source
     from ratslam.runs.estimate import Health, PoseEstimate
-    from ratslam.runs.open_source import open_source
     from ratslam.runs.result import Result, run
     from ratslam.runs.settings.run_config import RunConfig, load_config
     from ratslam.runs.slam import Slam
-    from robot.sources.description import SourceDescription
-    from robot.sources.source import Sample, Source
-    from robot.sources.source_info import SourceInfo
-    from robot.sources.source_registry import SOURCES, SourceEntry
+    from robot.sources.source import SOURCES, Sample, Source, SourceDescription, SourceEntry, SourceInfo
     from robot.touch_source import TOUCH, TouchEntry
     from tactile.base.errors import InputError
     from tactile.base.settings import Settings
@@ -45,25 +41,25 @@ _MODULES = {
     "MetricEntry": "evaluation.metrics.metric_registry",
     "Observation": "tactile.base.types",
     "Odometry": "tactile.base.types",
-    "PathMap": "ratslam.core.path_map",
+    "PathMap": "ratslam.core.backend",
     "PoseEstimate": "ratslam.runs.estimate",
     "Result": "ratslam.runs.result",
     "RunConfig": "ratslam.runs.settings.run_config",
-    "SOURCES": "robot.sources.source_registry",
+    "SOURCES": "robot.sources.source",
     "Sample": "robot.sources.source",
     "Sensors": "ratslam.methods.method_registry",
     "Session": "ratslam.core.session",
     "Settings": "tactile.base.settings",
     "Slam": "ratslam.runs.slam",
     "Source": "robot.sources.source",
-    "SourceDescription": "robot.sources.description",
-    "SourceEntry": "robot.sources.source_registry",
-    "SourceInfo": "robot.sources.source_info",
+    "SourceDescription": "robot.sources.source",
+    "SourceEntry": "robot.sources.source",
+    "SourceInfo": "robot.sources.source",
     "TOUCH": "robot.touch_source",
     "TouchEntry": "robot.touch_source",
     "load_config": "ratslam.runs.settings.run_config",
     "observation": "tactile.base.types",
-    "open_source": "ratslam.runs.open_source",
+    "open_source": "ratslam.runs.build_session",
     "run": "ratslam.runs.result",
 }
 __all__ = [

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from robot.simulation.create.simulated_session import CreateSimulationConfig, train_strain_templates
-from robot.sources.source import ClosedSource, Sample, Source
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import ClosedSource, Sample, Source, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.plugins import Registry, read_settings
 from tactile.base.settings import Settings
@@ -17,8 +16,7 @@ from tactile.base.types import Observation
 from tactile.frontend import Frontend, TouchConfig
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig
 from tactile.wall_estimation.strain_templates import StrainTemplates
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.planar_whiskers import PlanarWhiskers, project_to_plane
+from tactile.whisker_geometry import HeadConfig, PlanarWhiskers, project_to_plane, ur10_head
 
 MAZE_WALL_HEIGHT = 0.05
 """Wall height of micromouse mazes, m."""

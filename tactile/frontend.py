@@ -8,18 +8,18 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Observation, Report, Whisk
-from tactile.features.calibration import Calibration
-from tactile.features.contact_threshold import ContactConfig, detect_contacts
-from tactile.features.rest_baseline import (
+from tactile.calibration import (
+    Calibration,
     RestBaseline,
     RestBaselineConfig,
     bent_whiskers,
     follow_baseline,
     start_baseline,
 )
-from tactile.features.whisker_image import ImageConfig, view_shape, whisk_observation
+from tactile.contact_threshold import ContactConfig, detect_contacts
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisker_image import ImageConfig, view_shape, whisk_observation
 
 
 class TouchConfig(Settings):

@@ -28,7 +28,7 @@ os.environ["XDG_CACHE_HOME"] = os.environ["RATSLAM_TEST_CACHE"]
 import jax
 from hypothesis import HealthCheck, settings
 
-from ratslam.core.xla_flags import add_xla_flags
+from ratslam.core.compilation import add_xla_flags
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -21,8 +21,8 @@ ROOMS = sorted(
 )
 LONGEST_FILE, LONGEST_FUNCTION, LONGEST_ROOT_README = 600, 80, 1200
 MOST = {
-    "rooms": 33, "folders": 64, "files": 645, "product lines": 89_100, "code lines": 59_600,
-    "public names": 2_780, "all names": 4_085, "records": 554, "short and called once": 428,
+    "rooms": 33, "folders": 50, "files": 480, "product lines": 87_600, "code lines": 58_450,
+    "public names": 2_778, "all names": 4_082, "records": 554, "short and called once": 426,
     "twin names": 0, "module circles": 0, "room circles": 0, "upward arrows": 0,
 }  # fmt: skip
 """Largest number of each figure of `tests.house_figures`; lowered with every step towards its goals."""

@@ -36,19 +36,19 @@ VIOLATIONS = {
     "rooms of tactile": [("tactile.base.types", "tactile.frontend"), ("tactile.planted", "tactile.base")],
     "rooms of robot": [
         ("robot.drivers.outcome", "robot.emulators"),
-        ("robot.recordings.schemas", "robot.live"),
+        ("robot.recordings.cdr", "robot.live"),
         ("robot.simulation.head.simulated_session", "robot.touch_source"),
     ],
     "rooms of evaluation": [
         ("evaluation.metrics.trajectory", "evaluation.plots.style"),
-        ("evaluation.studies.study", "evaluation.papers.trials"),
+        ("evaluation.studies.study", "evaluation.papers.trial_sessions"),
     ],
     "rooms of ratslam": [
         ("ratslam.core.session", "ratslam.methods.recall"),
         ("ratslam.classic.pose_cells", "ratslam.grid.config"),
         ("ratslam.recall.filter", "ratslam.mapping"),
-        ("ratslam.runs.run", "ratslam.service.checks"),
-        ("ratslam.service.checks.backend_checks", "ratslam.live"),
+        ("ratslam.runs.run", "ratslam.service.source_checks"),
+        ("ratslam.service.backend_checks", "ratslam.live"),
         ("ratslam.planted", "ratslam.core.estimates"),
     ],
     "rooms of evaluation.papers": [

@@ -1,4 +1,9 @@
-"""Reads a run directory, also the incomplete one of an interrupted run."""
+"""Reads a run directory, also the incomplete one of an interrupted run.
+
+pieces.csv: the piece of the map in which each step is; only of a map of several pieces.
+
+merge.json: the report of a merged folder, which holds a map of several sessions and is no run.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +14,64 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.merged_map import refuse_merged
-from evaluation.artifacts.pieces_table import NAME, read_pieces
 from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
-from tactile.base.bounded import read_json, read_text
 from tactile.base.errors import InputError
-from tactile.base.npz import read_npz
+from tactile.base.files import read_json, read_npz, read_text
+
+COLUMNS = ("t", "piece")
+NAME = "pieces.csv"
+
+
+def write_pieces(path: Path, time: np.ndarray, piece: np.ndarray) -> None:
+    """Writes the piece [N] of steps at times [N], s."""
+    lines = [f"{t!r},{one}" for t, one in zip(time.tolist(), piece.tolist(), strict=True)]
+    Path(path).write_text("\n".join([",".join(COLUMNS), *lines]) + "\n", encoding="utf-8")
+
+
+def read_pieces(path: Path, steps: int) -> np.ndarray:
+    """The piece [steps] of each step, 0 without the file.
+
+    Raises:
+        InputError: a line is malformed, or there are fewer than `steps`.
+    """
+    if not path.exists():
+        return np.zeros(steps, int)
+    piece = read_text_table(path, dict.fromkeys(COLUMNS, ())).values[:, 1]
+    if len(piece) < steps:
+        raise InputError(str(path), f"{len(piece)} lines", f"{steps}, one for each step")
+    if not ((piece >= 0) & (piece < 2**31) & (piece == np.round(piece))).all():
+        raise InputError(str(path), "a piece that is no number of one", "whole numbers from 0")
+    return piece[:steps].astype(int)
+
+
+MERGED_MAP_NAME = "merge.json"
+
+
+def is_merged(folder: Path) -> bool:
+    """Whether a folder holds a merged map."""
+    return (folder / MERGED_MAP_NAME).exists()
+
+
+def refuse_merged(folder: Path) -> None:
+    """Raises `InputError` if a folder holds a merged map, which has no steps of a run."""
+    if is_merged(folder):
+        cure = f"{folder}/map.png shows it, {NAME} says what joined it, and `map info` what is in it"
+        raise InputError(str(folder), "a merged map, which has no steps", "the directory of a run", cure)
+
+
+def read_session_steps(folder: Path) -> list[int]:
+    """Number of steps of each session of a merged folder, in the order of its map.
+
+    Raises:
+        InputError: merge.json is missing or malformed.
+    """
+    expected = f"the {NAME} of a merged map"
+    return read_json(
+        folder / MERGED_MAP_NAME, expected, lambda content: [int(count) for count in content["steps"]]
+    )
 
 
 def check_run_directory(path: Path) -> None:

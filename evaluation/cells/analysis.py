@@ -15,9 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from evaluation.cells.border import border_score
-from evaluation.cells.coherence import coherence
-from evaluation.cells.fields import FieldSettings, bin_area, count_by_cell, find_fields, largest_by_cell
+from evaluation.cells.fields import (
+    FieldSettings,
+    bin_area,
+    border_score,
+    count_by_cell,
+    find_fields,
+    largest_by_cell,
+)
 from evaluation.cells.head_direction import (
     mean_vector_length,
     peak_rate,
@@ -26,10 +31,17 @@ from evaluation.cells.head_direction import (
     rayleigh_z,
 )
 from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
-from evaluation.cells.rate_map import MapSettings, arena_edges, bin_activity, rate_maps, tuning_curves
+from evaluation.cells.rate_map import (
+    MapSettings,
+    arena_edges,
+    bin_activity,
+    coherence,
+    rate_maps,
+    tuning_curves,
+)
 from evaluation.cells.recording import BinnedSums, CellRecording
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
+from tactile.base.files import write_atomically
 from tactile.base.settings import Settings
 
 

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactile.base.atomic_write import write_atomically
-from tactile.base.npz import read_npz
+from tactile.base.files import read_npz, write_atomically
 
 NAME = "cells.npz"
 """The file in a run directory."""

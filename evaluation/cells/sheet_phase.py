@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.packet_drift import torus_sides, truth_in_sheet
+from evaluation.cells.decoding import torus_sides, truth_in_sheet
 from evaluation.cells.rate_map import (
     check_lengths,
     circle_bin,

@@ -3,27 +3,256 @@
 Other than equation 6, the metrics use only cells that a whisker can observe: free space and the surfaces that
 bound it. The inside of objects and the space behind walls cannot be touched; including them would
 reward guessing. Chamfer distances measure occupied cells that the map shows there.
+
+Equation 6 of Fox et al. 2012: the mean of |map - truth| over cells, under all of its conventions.
+
+The paper does not specify the truth outside the arena or the cells of the mean, and it smooths the truth; its
+values depend on all three. So the error is computed under every convention and compared with constant maps,
+some of which have smaller errors.
+
+Metrics of an occupancy map on the cells that whiskers can observe: free space and reachable surfaces.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, product
+from typing import Literal
 
 import numpy as np
 
-from evaluation.metrics.grid_error import (
-    CONVENTIONS,
-    DISTINCT_CONVENTIONS,
-    Convention,
-    GridError,
-    grid_error,
-    pool_errors,
+from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
+from evaluation.metrics.occupancy_grid import (
+    PRIOR_OCCUPANCY,
+    GridTruth,
+    OccupancyGrid,
+    TouchableSurface,
+    cell_centres,
+    check_grid,
+    touchable_surface,
+    truth_occupancy,
 )
-from evaluation.metrics.grid_metrics import GRID_METRICS, grid_findings
-from evaluation.metrics.metric import Quantity
-from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid, touchable_surface
+from evaluation.metrics.statistics import auc
 from tactile.base.settings import Settings
+
+CellMask = Literal["grid", "arena"]
+"""Cells of the mean: all, or those of the arena and its wall."""
+SMOOTH_SD = 2.5
+"""Standard deviation of the 5 x 5 Gaussian that smooths the truth, cells (the unit is not in the paper)."""
+
+_TAPS = 2  # cells to either side
+_MASKS: tuple[CellMask, ...] = ("grid", "arena")
+
+
+class Convention(Settings):
+    """One reading of equation 6."""
+
+    outside: float = PRIOR_OCCUPANCY
+    """Truth outside the arena and its wall."""
+    mask: CellMask = "grid"
+    """Cells of the mean."""
+    smooth: bool = False
+    """Whether the truth is smoothed; then a perfect map has an error, and a blurred one a smaller error."""
+
+    @property
+    def words(self) -> tuple[str, str, str]:
+        """The three settings in words; `any` where the truth outside does not matter."""
+        anywhere = self.mask == "arena" and not self.smooth
+        outside = "any" if anywhere else f"{self.outside:g}"
+        return outside, self.mask, "smoothed" if self.smooth else "raw"
+
+    @property
+    def column(self) -> str:
+        """The name of a column with the error, e.g. `eq6_grid_raw_0.3`."""
+        return f"eq6_{self.mask}_{'smooth' if self.smooth else 'raw'}_{self.outside:g}"
+
+
+CONVENTIONS = tuple(
+    Convention(outside=outside, mask=mask, smooth=smooth)
+    for smooth, mask, outside in product((False, True), _MASKS, (PRIOR_OCCUPANCY, 0.0, 1.0))
+)
+"""All conventions. Within the arena without smoothing, `outside` makes no difference."""
+DISTINCT_CONVENTIONS = tuple(
+    each for each in CONVENTIONS if each.words[0] != "any" or each == Convention(mask="arena")
+)
+"""The conventions whose errors can differ."""
+MAIN_CONVENTION = Convention()
+"""Unknown outside, all cells, not smoothed: false evidence outside counts, and a perfect map scores 0. The
+same convention with smoothing is closest to the paper's text."""
+
+
+class GridError(Settings):
+    """Equation 6 under one convention, of the map and of maps without exploration."""
+
+    convention: Convention
+    """The convention."""
+    error: float
+    """Mean of |map - truth|; for several trials the mean of their errors."""
+    spread: float | None = None
+    """Its standard deviation over trials; None for one."""
+    prior: float
+    """Error of 0.3 in all cells."""
+    best: float
+    """Error of the best constant, the median of the truth."""
+    coin: float
+    """Expected error of a map of Bernoulli(0.5) cells: 0.5 for any truth (the paper prints 0.47)."""
+    skill: float | None
+    """1 - error / best; None if the best constant has no error."""
+
+
+def grid_error(
+    grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface, convention: Convention
+) -> GridError:
+    """The error of one map. `surface` is `occupancy_grid.touchable_surface(grid, truth)`."""
+    true = truth_occupancy(truth, surface.wall, convention.outside)
+    true = smooth_truth(true) if convention.smooth else true
+    cells = truth.inside | surface.wall if convention.mask == "arena" else np.ones_like(truth.inside)
+    if not cells.any():
+        raise ValueError("truth without arena cells; expected at least one")
+    true, ours = true[cells], grid.probability[cells]
+    error, best = _mean(np.abs(ours - true)), _mean(np.abs(np.median(true) - true))
+    return GridError(
+        convention=convention,
+        error=error,
+        prior=_mean(np.abs(PRIOR_OCCUPANCY - true)),
+        best=best,
+        coin=_mean(0.5 * np.abs(true) + 0.5 * np.abs(1 - true)),
+        skill=_skill(error, best),
+    )
+
+
+def pool_errors(errors: Sequence[GridError]) -> GridError:
+    """The mean of the errors of several trials, under the same convention."""
+    if len({error.convention for error in errors}) != 1:
+        raise ValueError("no errors, or errors under different conventions; expected one convention")
+    every = [error.error for error in errors]
+    error, best = _mean(every), _mean([each.best for each in errors])
+    return GridError(
+        convention=errors[0].convention,
+        error=error,
+        spread=float(np.std(every, ddof=1)) if len(every) > 1 else None,
+        prior=_mean([each.prior for each in errors]),
+        best=best,
+        coin=_mean([each.coin for each in errors]),
+        skill=_skill(error, best),
+    )
+
+
+def smooth_truth(values: np.ndarray) -> np.ndarray:
+    """Applies the 5 x 5 Gaussian of `SMOOTH_SD` to [H, W], with edge cells repeated outwards."""
+    from scipy.ndimage import correlate1d
+
+    taps = np.exp(-(np.arange(-_TAPS, _TAPS + 1) ** 2) / (2 * SMOOTH_SD**2))
+    for axis in (0, 1):
+        values = correlate1d(values, taps / taps.sum(), axis=axis, mode="nearest")
+    return values
+
+
+def _mean(values: Sequence[float] | np.ndarray) -> float:
+    return float(np.mean(values))
+
+
+def _skill(error: float, best: float) -> float | None:
+    return 1 - error / best if best > 0 else None
+
+
+OCCUPIED_ABOVE = 0.5
+"""Cells above this probability count as occupied (Chamfer)."""
+CLAMP = 1e-3
+"""Probabilities are clipped to this distance from 0 and 1 before the logarithm."""
+
+_ROUNDING = 6  # decimals; closer probabilities tie
+
+
+def grid_findings(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:
+    """The findings of `GRID_METRICS` by name."""
+    return _cells(grid, surface) | _chamfer(grid, truth, surface)
+
+
+def _metric(name: str, label: str, unit: str, direction: Direction) -> Metric:
+    return Metric(name, label, unit, direction, "Map", lambda findings: findings[name])
+
+
+GRID_METRICS: tuple[Metric, ...] = (
+    _metric("map_brier", "Brier score", "", "low"),
+    _metric("map_brier_skill", "Brier skill", "", "high"),
+    _metric("map_brier_skill_free", "  with free space alone", "", "high"),
+    _metric("map_log_loss", "log loss", "nat", "low"),
+    _metric("map_log_loss_constant", "  of the best constant", "nat", None),
+    _metric("map_auc", "wall AUC", "", "high"),
+    _metric("map_auc_free", "  with free space alone", "", "high"),
+    _metric("map_chamfer_map", "Chamfer, occupied cells to walls", "m", "low"),
+    _metric("map_chamfer_walls", "Chamfer, walls to occupied cells", "m", "low"),
+)
+"""In the order of the table."""
+
+
+def _cells(grid: OccupancyGrid, surface: TouchableSurface) -> dict[str, Finding]:
+    """Scores of the separation of walls from free space.
+
+    Much of a map's skill comes from the free space along the robot's path, for which no whisker is needed. So
+    each score is also given for the map clipped at its prior, which leaves free space only (`_free`).
+    """
+    cells = surface.free | surface.wall
+    wall, ours = surface.wall[cells], grid.probability[cells]
+    if wall.all() or not wall.any():
+        reason = f"the truth has no {'wall' if surface.free.any() else 'free space'}"
+        names = [metric.name for metric in GRID_METRICS if "chamfer" not in metric.name]
+        return dict.fromkeys(names, Finding(np.nan, note=reason))
+    driven, rate, clipped = (
+        np.minimum(ours, PRIOR_OCCUPANCY),
+        float(wall.mean()),
+        "the map clipped at its prior",
+    )
+    blind, loss = rate * (1 - rate), _log_loss(np.full(len(wall), rate), wall)
+    return {
+        "map_brier": Finding(_brier(ours, wall), note=f"best constant, {rate:.3g}: {blind:.4g}"),
+        "map_brier_skill": Finding(1 - _brier(ours, wall) / blind, note="against the best constant"),
+        "map_brier_skill_free": Finding(1 - _brier(driven, wall) / blind, note=clipped),
+        "map_log_loss": Finding(_log_loss(ours, wall), note=f"clamped at {CLAMP:g}"),
+        "map_log_loss_constant": Finding(loss, note=f"{rate:.3g} everywhere"),
+        "map_auc": Finding(_auc(ours, wall), note=f"{wall.sum()} wall and {(~wall).sum()} free cells"),
+        "map_auc_free": Finding(_auc(driven, wall), note=clipped),
+    }
+
+
+def _brier(ours: np.ndarray, wall: np.ndarray) -> float:
+    return float(np.mean((ours - wall) ** 2))
+
+
+def _log_loss(ours: np.ndarray, wall: np.ndarray) -> float:
+    """Mean negative logarithm of the probability of the true state, nat."""
+    clipped = np.clip(ours, CLAMP, 1 - CLAMP)
+    return float(-np.mean(np.log(np.where(wall, clipped, 1 - clipped))))
+
+
+def _auc(ours: np.ndarray, wall: np.ndarray) -> float:
+    """Share of (wall cell, free cell) pairs in which the wall cell is more probable; ties count half."""
+    rounded = np.round(ours, _ROUNDING)
+    return auc(rounded[~wall], rounded[wall])
+
+
+def _chamfer(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:
+    """Mean distances between the centres of cells mapped as occupied and the true surfaces, both ways.
+
+    One way alone can be minimised by a single correct cell or by marking all cells. Cells inside objects,
+    below their surface, are ignored. A perfect map scores half a cell one way and slightly more the other.
+    """
+    from scipy.spatial import cKDTree
+
+    deep = truth.inside & truth.occupied & ~surface.wall
+    drawn = (grid.probability > OCCUPIED_ABOVE) & ~deep
+    if len(surface.points) and drawn.any():
+        cells = cell_centres(grid)[drawn]
+        to_walls, to_cells = cKDTree(surface.points).query(cells)[0], cKDTree(cells).query(surface.points)[0]
+        note = f"{len(cells)} cells above {OCCUPIED_ABOVE:g}"
+        return {
+            "map_chamfer_map": Finding(float(to_walls.mean()), note=note),
+            "map_chamfer_walls": Finding(float(to_cells.mean()), note=f"{len(surface.points)} points"),
+        }
+    reason = f"no cell above {OCCUPIED_ABOVE:g}" if len(surface.points) else "the truth has no wall"
+    return dict.fromkeys(("map_chamfer_map", "map_chamfer_walls"), Finding(np.nan, note=reason))
+
 
 PAPER_ERRORS = {"blob": 0.40, "geometric": 0.39, "template": 0.37}
 """Equation 6 by mapper, as printed (Fox et al. 2012, III, without its convention)."""
@@ -37,7 +266,7 @@ class GridScore(Settings):
     trials: int = 1
     """Number of maps; every value is their mean."""
     errors: tuple[GridError, ...]
-    """Equation 6, in the order of `evaluation.metrics.grid_error.CONVENTIONS`."""
+    """Equation 6, in the order of `evaluation.metrics.occupancy_score.CONVENTIONS`."""
     quantities: dict[str, Quantity]
     """In the order of the table; an undefined value is None with a reason."""
 

@@ -30,8 +30,8 @@ class RunArrays(NamedTuple):
         doubt: probability, by the map itself, that its error is worse than odometry's; NaN if there is none.
         unjudged: why there is none. warnings: about the input, a sentence each.
         online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
-        piece: [N] the piece of the map in which each step is, see `evaluation.metrics.map_pieces`; empty: all
-            steps are in one.
+        piece: [N] the piece of the map in which each step is, see `evaluation.metrics.run_metrics`; empty:
+            all steps are in one.
         node_piece: [M] the piece of each experience, which may have no steps; empty: that of its first visit.
         state: [N] of a session localised in a map: found, searching, ... ; empty for others.
     """

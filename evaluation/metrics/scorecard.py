@@ -9,8 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import Relations
-from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig
-from evaluation.metrics.experience_log import ExperienceLog
+from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig, ExperienceLog
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays, check_run
 from evaluation.metrics.run_metrics import (

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from evaluation.papers.cells.reproduction import NAMES as CELL_ROWS
-from evaluation.papers.maps.map_rows import ROWS as MAP_ROWS
+from evaluation.papers.maps.reproduction import ROWS as MAP_ROWS
 from evaluation.papers.whiskers.reproduction import NAMES as REAL_ROWS
 from ratslam.cli.common import (
     INTERRUPTED,
@@ -25,7 +25,7 @@ from ratslam.cli.common import (
 )
 from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_new_file
+from tactile.base.files import require_new_file
 
 SALMAN2016 = {
     "fig2": "odometry drift over three clockwise laps",
@@ -154,7 +154,7 @@ def _figure(arguments: argparse.Namespace) -> int:
         from evaluation.papers.fox2012.reproduction import PAPER
     else:
         from evaluation.papers.salman2016.reproduction import PAPER
-    from evaluation.papers.trials.reproduction import reproduce
+    from evaluation.papers.paper_sets import reproduce
 
     name, folder = arguments.name, arguments.output
     text, interrupted = reproduce(
@@ -215,8 +215,8 @@ def _real(arguments: argparse.Namespace) -> int:
 
 def _maps(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.maps.product import PRODUCT
     from evaluation.papers.maps.reproduction import reproduce_maps
+    from evaluation.papers.maps.row import PRODUCT
     from evaluation.papers.tables.markdown import select_rows
 
     names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
@@ -363,7 +363,7 @@ def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.laser import ROWS, laser_table
+    from evaluation.papers.tables.buildings import ROWS, laser_table
     from evaluation.papers.tables.markdown import select_rows
 
     return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
@@ -390,7 +390,7 @@ def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.resources import one_core
+    from evaluation.studies.machine import one_core
 
     with one_core():
         from evaluation.papers.tables.speed import SIZES, speed_table
@@ -399,7 +399,7 @@ def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.resources import one_core
+    from evaluation.studies.machine import one_core
 
     with one_core():
         from evaluation.papers.tables.cycles import cycle_table, profile_table
@@ -411,9 +411,9 @@ def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.resources import one_core
+    from evaluation.studies.machine import one_core
 
     with one_core():
-        from evaluation.papers.tables.batches import batch_table
+        from evaluation.papers.tables.speed import batch_table
 
         yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)

@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from evaluation.metrics.occupancy_score import GridScore
+from evaluation.metrics.occupancy_score import MAIN_CONVENTION, GridScore
 from evaluation.plots import style
 from evaluation.plots.style import GREEN, INK, LABEL_GREY, VERMILLION, WIDTH, YELLOW
 

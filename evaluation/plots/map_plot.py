@@ -1,13 +1,22 @@
-"""Plot of the map of a run with truth, odometry and walls."""
+"""Plot of the map of a run with truth, odometry and walls.
+
+Plot of the places at which a localised session does not agree with its map.
+
+Plot of a map that was merged of several sessions.
+
+Plot of a way over the experiences of a map.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.map_pieces import arrange_pieces
+from evaluation.artifacts.closure_table import ChangeRow
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
@@ -236,3 +245,138 @@ def _paint_start(axes: style.Axes, layers: Layers) -> None:
     truth = layers.truth
     start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
     axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
+
+
+_MARGIN = 0.06  # m around all
+_KINDS = {
+    "new": (VERMILLION, "something new"),
+    "gone": (GREEN, "something gone"),
+    "different": (PURPLE, "different"),
+}
+
+
+def draw_changes(
+    name: str, run: RunArrays, changes: Sequence[ChangeRow], walls: np.ndarray = NO_WALLS
+) -> style.Figure:
+    """Draws the path of a session in its map, and the changes.
+
+    Args:
+        name: of the run. run: its poses in the frame of the map; drawn where they were found. changes: the
+            surest first. walls: [B, 5] west, south, east, north, height, m, as the session found them; drawn
+            with truth, in whose frame they are.
+    """
+    rows = truth_rows(run)[run.found[truth_rows(run)]]
+    known = run.truth is not None and len(rows) > 0
+    to_map = align(run.truth[rows], run.final[rows]) if known and run.truth is not None else IN_PLACE
+    path = np.where(run.found[:, None], run.final[:, :2], np.nan)
+    ground = run.nodes[run.node_piece == run.main]
+    places = np.array([[change.x, change.y] for change in changes]).reshape(-1, 2)
+    shown = walls if known else NO_WALLS
+    seen = path if run.found.any() or len(ground) else np.zeros((1, 2))
+    low, high = bounds(seen, ground[:, :2], places, wall_corners(shown, to_map))
+    box = np.stack([low - _MARGIN, high + _MARGIN])
+    figure, axes = style.map_figure(box, name, _headline(run, changes), style.MAP)
+    if len(shown):
+        draw_walls(axes, shown, to_map)
+    if len(ground):
+        axes.plot(*ground[:, :2].T, ".", color=GREY, ms=4, mew=0, zorder=2, label="experience of the map")
+    name = "path where found" if run.found.any() else "_"
+    axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label=name)
+    _mark(axes, changes, places, np.ptp(box, axis=0).max())
+    style.add_legend(figure, axes)
+    return figure
+
+
+def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, size: float) -> None:
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Circle
+
+    labelled = set()
+    for number, (change, place) in enumerate(zip(changes, places, strict=True), start=1):
+        color, what = _KINDS[change.kind]
+        label = None if what in labelled else what
+        labelled.add(what)
+        radius = max(change.extent / 2, 0.02 * size)
+        ring = {"facecolor": (*to_rgb(color), 0.18), "edgecolor": color, "lw": 2.0, "zorder": 6}
+        axes.add_patch(Circle((place[0], place[1]), radius, label=label, **ring))
+        at = (place[0] + 1.1 * radius, place[1] + 1.1 * radius)
+        axes.text(*at, str(number), color=color, fontsize=11, fontweight="bold", zorder=7)
+
+
+def _headline(run: RunArrays, changes: Sequence[ChangeRow]) -> str:
+    if not changes:
+        known = run.found.sum()
+        where = f"in the {known:,} of {len(run.time):,} steps that were found"
+        return (
+            f"the session agrees with the map {where}" if known else "not found in the map: nothing compared"
+        )
+    places = "place has" if len(changes) == 1 else "places have"
+    surest = changes[0]
+    return f"{len(changes)} {places} changed  ·  surest: {surest.evidence:.0f} nat in {surest.passes} passes"
+
+
+def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequence[int]) -> style.Figure:
+    """Draws the paths of the sessions of a merged map, each in a colour of its own; pieces that nothing joins
+    beside each other.
+
+    Args:
+        path: [T, 3] poses of all steps in the map, m, m, rad. piece: [T] the piece of each. steps: number of
+            steps of each session, in the order of `path`.
+    """
+    shown = _beside_each_other(path, piece)
+    pieces, largest = len(np.unique(piece)), int(np.bincount(piece).argmax())
+    joined = "joined" if pieces == 1 else f"{pieces} pieces"
+    line = f"{len(steps)} sessions, {len(path)} steps  ·  {joined}"
+    of = style.MAP if pieces == 1 else f"piece {largest + 1}, the largest"
+    figure, axes = style.map_figure(style.frame(shown), title, line, of)
+    ends = np.cumsum(steps).tolist()
+    for number, (count, end) in enumerate(zip(steps, ends, strict=True)):
+        own = slice(end - count, end)
+        parted = np.flatnonzero(np.diff(piece[own])) + 1  # no line from one piece to the next
+        drawn = np.insert(shown[own], parted, np.nan, axis=0)
+        colour = PIECES[min(number, NAMED)]
+        axes.plot(
+            *drawn.T, color=colour, lw=0.9, alpha=0.8, zorder=3, label=f"map {number + 1}, {count} steps"
+        )
+        label = "start" if number == 0 else "_"
+        axes.plot(*shown[end - count], "o", ms=8, mfc="none", mec=GREEN, mew=1.6, zorder=4, label=label)
+    style.add_legend(figure, axes)
+    return figure
+
+
+def _beside_each_other(path: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """[T, 2] positions with the pieces where pictures show them."""
+    none, count = np.zeros(0, int), len(path)
+    run = RunArrays(
+        time=np.arange(float(count)), truth=None, online=path, final=path, odometry=path,
+        experience=np.full(count, -1), created=none, nodes=np.zeros((0, 3)), links=np.zeros((0, 2), int),
+        piece=piece,
+    )  # fmt: skip
+    return arrange_pieces(run).final[:, :2]
+
+
+def draw_way(
+    title: str, line: str, nodes: np.ndarray, links: np.ndarray, way: np.ndarray, felt: np.ndarray
+) -> style.Figure:
+    """Draws experiences, their links, contacts felt beside them and the way.
+
+    Args:
+        line: subtitle. nodes: [N, 2] experiences, m. links: [L, 2] their indices. way: [K, 3] poses of the
+            way, K >= 1 (m, m, rad). felt: [n, 2] contacts in the map, m; may be empty.
+    """
+    from matplotlib.collections import LineCollection
+
+    box = style.frame(np.concatenate([nodes, felt, way[:, :2]]))
+    figure, axes = style.map_figure(box, title, line, style.MAP)
+    if len(felt):
+        axes.plot(*felt.T, ".", color=GREY, ms=2.2, mew=0, zorder=1, label="contact felt")
+    if len(links):
+        axes.add_collection(
+            LineCollection(list(nodes[links]), colors=BLUE, lw=0.7, alpha=0.55, zorder=2, label="link")
+        )
+    axes.plot(*nodes.T, "o", color=BLUE, ms=2.4, mew=0, zorder=3, label="experience")
+    axes.plot(*way[:, :2].T, color=VERMILLION, lw=3.2, solid_capstyle="round", zorder=4, label="way")
+    axes.plot(*way[0, :2], "o", ms=9, mfc="white", mec=GREEN, mew=2.2, ls="none", zorder=5, label="start")
+    axes.plot(*way[-1, :2], "*", ms=15, color=INK, mec="white", mew=0.8, ls="none", zorder=5, label="goal")
+    style.add_legend(figure, axes, columns=6)
+    return figure

@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts import change_table
+from evaluation.artifacts import closure_table
 from evaluation.artifacts.closure_table import read_closures
-from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
+from evaluation.artifacts.grid_files import read_grid, read_grid_truth
+from evaluation.artifacts.recorded_views import read_whisker_views
 from evaluation.artifacts.run_reader import read_run, read_scorecard, read_walls
-from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.cells import recording
-from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_score import GridScore
 from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.plots.cell_plot import draw_recorded_cells
-from evaluation.plots.change_plot import draw_changes
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
-from evaluation.plots.map_plot import align_layers, draw_map
+from evaluation.plots.map_plot import align_layers, draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
-from tactile.base.bounded import read_json
+from tactile.base.files import read_json
 from tactile.base.se2 import between
 
 if TYPE_CHECKING:
@@ -47,8 +46,8 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         images = read_whisker_views(directory / "views.npz")
         plots["whiskers"] = lambda: draw_whiskers(run, card, images, walls)
         plots["experiences"] = lambda: draw_experience_history(run, card)
-    if (directory / change_table.NAME).exists():
-        changes = change_table.read_changes(directory / change_table.NAME)
+    if (directory / closure_table.NAME).exists():
+        changes = closure_table.read_changes(directory / closure_table.NAME)
         plots["changes"] = lambda: draw_changes(card.name, run, changes, walls)
     if (directory / "grid.npz").exists():
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))

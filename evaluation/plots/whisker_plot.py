@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.artifacts.whisker_views import WhiskerViews
+from evaluation.artifacts.recorded_views import WhiskerViews
 from evaluation.metrics.exm import base_end
 from evaluation.metrics.run_arrays import RunArrays, truth_rows
 from evaluation.metrics.scorecard import Scorecard

@@ -16,8 +16,7 @@ from evaluation.metrics.run_arrays import truth_rows
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import position_errors
 from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
-from evaluation.report.closure_records import WORDS
-from evaluation.report.run_report import RunReport
+from evaluation.report.run_report import WORDS, RunReport
 from tactile.base.se2 import compose, inverse
 
 _DASHES = ("solid", "dash", "dot", "dashdot")

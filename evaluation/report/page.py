@@ -16,11 +16,10 @@ import yaml
 from evaluation.artifacts.manifest import RUNNING
 from evaluation.metrics.scorecard import position_error, scorecard_lines
 from evaluation.report.charts import GRID_SCALES, PALETTE, error_chart, overlay_chart, run_charts
-from evaluation.report.closure_records import closure_records, view_records
-from evaluation.report.run_report import RunReport, describe_status
+from evaluation.report.run_report import RunReport, closure_records, describe_status, view_records
 from evaluation.report.verdict import describe_score
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
+from tactile.base.files import write_atomically
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _CAPTIONS = {

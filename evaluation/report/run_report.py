@@ -1,17 +1,21 @@
-"""A run as the report shows it, read from its directory."""
+"""A run as the report shows it, read from its directory.
+
+The loop closures of a run as the page needs them: columns of plain numbers, and views of 8 bits.
+"""
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evaluation.artifacts.closure_table import ClosureTable, read_closure_table
-from evaluation.artifacts.closure_views import ClosureViews, read_closure_views
-from evaluation.artifacts.grid_npz import read_grid, read_grid_truth
+from evaluation.artifacts.grid_files import read_grid, read_grid_truth
 from evaluation.artifacts.manifest import RUNNING, Manifest, read_manifest
+from evaluation.artifacts.recorded_views import ClosureViews, read_closure_views
 from evaluation.artifacts.run_reader import (
     check_run_directory,
     read_column,
@@ -19,17 +23,17 @@ from evaluation.artifacts.run_reader import (
     read_scorecard,
     read_walls,
 )
-from evaluation.metrics.map_pieces import arrange_pieces
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.occupancy_score import GridScore
 from evaluation.metrics.run_arrays import UNFINISHED, RunArrays
+from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers, align_layers
 from evaluation.report.run_files import RunFile, list_run_files
 from evaluation.report.verdict import Verdict, judge_map
-from tactile.base.bounded import read_json, read_plain_yaml, read_text
 from tactile.base.errors import InputError
+from tactile.base.files import read_json, read_plain_yaml, read_text
 from tactile.base.se2 import between
 
 SOURCES = {
@@ -208,3 +212,92 @@ def _belief(steps: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
 def _columns(file: Path, *names: str) -> list[np.ndarray]:
     """Columns of a file; empty ones without it."""
     return [read_column(file, name) if file.exists() else np.zeros(0) for name in names]
+
+
+VIEW_BYTES = 2_000_000
+"""Most bytes of views in a page, before their encoding adds a third; larger views lose resolution."""
+LABELS = {
+    "shift": "turn between the views, columns",
+    "posterior": "posterior",
+    "log_ratio": "log-likelihood ratio to a new place",
+    "sequence": "sequence",
+    "distance": "squared Mahalanobis distance",
+    "weight": "robust weight",
+    "log_odds": "log odds of the sequence",
+}
+"""What the columns of evidence are; others are named as in the file."""
+_LEFT_OUT = ("keyframe", "match")  # they say the same as the steps
+WORDS = {"accepted": "accepted", "open": "not accepted", "undone": "undone"}
+"""Verdicts as the page names them; others are named as in the file."""
+
+
+def closure_records(table: ClosureTable, run: RunArrays) -> dict[str, Any]:
+    """The closures in columns: the steps that each joins, their times (s from the first step), how far they
+    are apart in truth (m; None where unknown), verdict and evidence."""
+    inside = (table.steps >= 0) & (table.steps < len(run.time))
+    rows = np.where(inside, table.steps, 0)
+    time = np.where(inside, run.time[rows] - run.time[0], np.nan)
+    apart = np.full(len(rows), np.nan)
+    if run.truth is not None and len(rows):
+        ends = np.where(inside[..., None], run.truth[rows][..., :2], np.nan)
+        apart = np.hypot(*(ends[:, 0] - ends[:, 1]).T)
+    evidence = {name: column for name, column in table.evidence.items() if name not in _LEFT_OUT}
+    return {
+        "steps": table.steps.tolist(),
+        "times": [plain_numbers(row) for row in time],
+        "apart": plain_numbers(apart),
+        "verdicts": [WORDS.get(verdict, verdict) for verdict in table.verdicts],
+        "evidence": [
+            {"name": name, "label": LABELS.get(name, name), "values": plain_numbers(column)}
+            for name, column in evidence.items()
+        ],
+    }
+
+
+def view_records(views: ClosureViews | None) -> dict[str, Any] | None:
+    """The views as one string of bytes; those of too many bytes are reduced, see `VIEW_BYTES`."""
+    if views is None:
+        return None
+    image, shape = views.view, views.view.shape[1:]
+    while image.size > VIEW_BYTES and max(image.shape[1:]) > 1:
+        image = halve(image)
+    gain = display_gain(image)
+    image = np.minimum(np.ceil(image * gain), 255).astype(np.uint8)
+    return {
+        "steps": views.step.tolist(),
+        "gain": gain,
+        "rows": image.shape[1],
+        "columns": image.shape[2],
+        "shape": list(shape),
+        "pixels": b64encode(np.ascontiguousarray(image).tobytes()).decode(),
+    }
+
+
+def display_gain(image: np.ndarray) -> float:
+    """The factor, at least 1, that makes the brightest hundredth of the non-zero pixels [n, R, C] white.
+
+    Views of a room that is small beside the range of the sensor would be black otherwise.
+    """
+    seen = image[image > 0]
+    return max(255 / float(np.quantile(seen, 0.99)), 1.0) if seen.size else 1.0
+
+
+def halve(image: np.ndarray) -> np.ndarray:
+    """Images [n, R, C] at half the resolution along their longer side: means of two neighbours; the last
+    pixel of an odd side has no neighbour and stays."""
+    axis = 1 + int(image.shape[2] >= image.shape[1])
+    starts = np.arange(0, image.shape[axis], 2)
+    count = np.minimum(2, image.shape[axis] - starts)
+    total = np.add.reduceat(image.astype(np.uint16), starts, axis)
+    return (total // np.expand_dims(count, (0, 3 - axis))).astype(np.uint8)
+
+
+def plain_numbers(values: np.ndarray) -> list[float | str | None]:
+    """Values [n] of 5 digits for JSON; NaN as None, infinity as "inf"."""
+    return [_plain(value) for value in np.asarray(values, float).tolist()]
+
+
+def _plain(value: float) -> float | str | None:
+    if np.isnan(value):
+        return None
+    return float(f"{value:.5g}") if np.isfinite(value) else f"{value}"

@@ -1,14 +1,28 @@
-"""The verdict on a map in words: whether to believe it, and how it compares with the truth."""
+"""The verdict on a map in words: whether to believe it, and how it compares with the truth.
+
+The five lines that open the score of a run: what was done, error, closures, warnings, health.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from evaluation.artifacts.closure_table import count_closures
+from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED
-from evaluation.metrics.run_metrics import DOUBTED
-from evaluation.metrics.scorecard import Scorecard, is_worse, position_error
+from evaluation.metrics.run_metrics import DOUBTED, path_length
+from evaluation.metrics.scorecard import (
+    Scorecard,
+    is_worse,
+    position_error,
+    render_error,
+    render_health,
+    render_warnings,
+)
 
 CAUTION = 1 - DOUBTED
 """Probability of being worse than odometry above which a map is to be taken with care."""
@@ -78,3 +92,26 @@ def _factor(error: float, odometry: float) -> str:
     if max(more, 1 / more) < 1.05:
         return ", the same"
     return f", {more:.2g} times as much" if more > 1 else f": the map is {1 / more:.2g} times as far off"
+
+
+def summarise(directory: Path, card: Scorecard, method: str) -> str:
+    """The lines on a run directory; one more for each further warning about the input.
+
+    Args:
+        method: name of the backend.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
+    run, source, closures = read_run(directory), read_manifest(directory).source, count_closures(directory)
+    extent = f"{run.time[-1] - run.time[0]:.3g} s, {path_length(run.odometry):.3g} m by odometry"
+    accepted = f"{closures.accepted} of {closures.proposed} proposed were accepted" if closures else "none"
+    return "\n".join(
+        [
+            f"{directory}: {len(run.time)} steps of {source} by {method}, {extent}",
+            render_error(card),
+            f"closures: {accepted}",
+            *(render_warnings(card) or ["warnings: none"]),
+            render_health(card),
+        ]
+    )

@@ -1,9 +1,18 @@
-"""A study of many networks: parameter sets over stated ranges, in chunks whose scores are kept on disk."""
+"""A study of many networks: parameter sets over stated ranges, in chunks whose scores are kept on disk.
+
+The scores of networks over a course: drift, decoding error, rate maps.
+
+Plots of a study of many networks: a score over the parameters, and rate maps of chosen sets.
+
+Table and pictures of a study of many networks.
+"""
 
 from __future__ import annotations
 
+import csv
 import hashlib
-from collections.abc import Callable, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -11,21 +20,127 @@ from typing import Annotated, NamedTuple
 import jax
 import numpy as np
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
-from scipy.stats import qmc
+from scipy.stats import qmc, rankdata
 
+from evaluation.plots import style
+from evaluation.plots.cell_plot import draw_rate_map
+from evaluation.plots.style import BLUE, LABEL_GREY, WIDTH
 from evaluation.studies.executor import Executor
-from evaluation.studies.set_scores import SetScores, score_sets
 from evaluation.studies.study_course import CELLS, StudyCourse, read_course
-from ratslam.classic.batch import Network
-from ratslam.classic.cell_batch import CellSets
-from ratslam.core.precision import Precision, prepare_precision
+from evaluation.studies.study_report import format_number, render_table
+from ratslam.classic.batch import SEGMENT, CellSets, CellTrack, Network, walk
+from ratslam.classic.config import rings, units
+from ratslam.classic.pose_cells import Outcome
+from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.runs.settings.run_config import load_config
 from ratslam.runs.settings.strict_yaml import Document, override, validate
-from ratslam.runs.settings.strict_yaml.document import Place
-from tactile.base.atomic_write import flush_to_disk, write_atomically
+from ratslam.runs.settings.yaml_document import Place
 from tactile.base.errors import os_errors_of
+from tactile.base.files import flush_to_disk, write_atomically, write_text_atomically
 from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
+
+
+class SetScores(NamedTuple):
+    """The scores of B networks.
+
+    Drift is the packet, followed round the torus, minus the pose that it would have without drift. The
+    decoding error is the same on the torus, the shortest way.
+
+    Attributes:
+        drift, drift_heading: [B] rms over the course, m and rad. drift_end, drift_heading_end: [B] after the
+            last step, m and rad. decoding, decoding_heading: [B] mean over the course, m and rad. reseeded:
+            [B] share of steps at which activity had died out. larger: [B] share of steps that needed more
+            than the smallest window. maps: [B, C, H, W] float32 mean activity of the chosen cells in each
+            place bin, NaN where the robot never was.
+    """
+
+    drift: np.ndarray
+    drift_heading: np.ndarray
+    drift_end: np.ndarray
+    drift_heading_end: np.ndarray
+    decoding: np.ndarray
+    decoding_heading: np.ndarray
+    reseeded: np.ndarray
+    larger: np.ndarray
+    maps: np.ndarray
+
+
+class _Sums:
+    """What is summed over the segments of a course, for B networks, in float64."""
+
+    def __init__(self, study: StudyCourse, count: int) -> None:
+        self._study = study
+        self._ring, self._unit = rings(study.config, np.dtype(float)), units(study.config, np.dtype(float))
+        self._bins = (len(study.y_edges) - 1) * (len(study.x_edges) - 1)
+        self._before = np.tile(self._ring // 2, (count, 1))  # wrapped packets
+        self._packet = self._before.copy()  # the same, followed round the torus
+        self._last = np.zeros((count, 2))
+        self._squares, self._errors = np.zeros((count, 2)), np.zeros((count, 2))
+        self._reseeded, self._larger = np.zeros(count), np.zeros(count)
+        self._maps = np.zeros((count, len(study.chosen) * self._bins))
+
+    def add(self, first: int, track: CellTrack) -> None:
+        """Adds a segment [B, S] that begins at step `first`."""
+        pose, activity, outcome, level = track
+        count, length = outcome.shape
+        rows = slice(first, first + length)
+        wrapped = np.concatenate([self._before[:, None], pose], axis=1)
+        gone = self._shortest(np.diff(wrapped, axis=1))
+        packet = self._packet[:, None] + np.cumsum(gone, axis=1)
+        self._before, self._packet = wrapped[:, -1], packet[:, -1]
+        error = packet - self._study.expected[None, rows]
+        drift = self._lengths(error)
+        self._last = drift[:, -1]
+        self._squares += (drift**2).sum(axis=1)
+        self._errors += self._lengths(self._shortest(error)).sum(axis=1)
+        self._reseeded += (outcome == Outcome.RESEEDED).sum(axis=1)
+        self._larger += (level > 0).sum(axis=1)
+        cells = activity.shape[2]
+        at = np.arange(cells) * self._bins + self._study.bin[rows, None]
+        at = at[None] + np.arange(count)[:, None, None] * (cells * self._bins)
+        weight = activity * self._study.seconds[None, rows, None]
+        self._maps += np.bincount(at.ravel(), weight.ravel(), self._maps.size).reshape(self._maps.shape)
+
+    def scores(self) -> SetScores:
+        """The scores of all steps added."""
+        study, steps = self._study, len(self._study.expected)
+        seconds = np.bincount(study.bin, study.seconds, self._bins)
+        maps = self._maps.reshape(len(self._maps), -1, self._bins)
+        mean = np.divide(maps, seconds, out=np.full_like(maps, np.nan), where=seconds > 0)
+        place = len(study.y_edges) - 1, len(study.x_edges) - 1
+        rms, mean_error = np.sqrt(self._squares / steps), self._errors / steps
+        return SetScores(
+            rms[:, 0], rms[:, 1], self._last[:, 0], self._last[:, 1], mean_error[:, 0], mean_error[:, 1],
+            self._reseeded / steps, self._larger / steps,
+            mean.astype(np.float32).reshape(*maps.shape[:2], *place),
+        )  # fmt: skip
+
+    def _shortest(self, difference: np.ndarray) -> np.ndarray:
+        return difference - self._ring * np.round(difference / self._ring)
+
+    def _lengths(self, error: np.ndarray) -> np.ndarray:
+        """[..., 2] m and rad of differences [..., 3] in cells."""
+        x, y, heading = np.moveaxis(error * self._unit, -1, 0)
+        return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
+
+
+def score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> SetScores:
+    """Simulates B networks over the course in the given precision and scores them.
+
+    Memory does not depend on the length of the course, apart from the course itself.
+    """
+    course = study.course._replace(
+        **{
+            name: np.asarray(getattr(study.course, name), dtype)
+            for name in ("motion", "noise", "turned", "energy")
+        }
+    )
+    sums = _Sums(study, len(sets.speed_noise))
+    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
+        sums.add(k * SEGMENT, track)
+    return sums.scores()
+
 
 FOLDER = "sets"
 """Name of the folder of a study's chunks."""
@@ -192,3 +307,195 @@ def _write(path: Path, scores: SetScores) -> None:
 def _read(path: Path) -> SetScores:
     with np.load(path) as found:
         return SetScores(**found)
+
+
+_PANEL, _GAP_ACROSS, _GAP_UP = 1.9, 0.62, 0.75  # inches: height of a panel, between panels
+_COLUMNS = 3
+_MAP_GAP = 0.12  # inches between rate maps
+
+
+class MapRow(NamedTuple):
+    """The rate maps of one network. name: of the row. maps: [C, H, W] mean activity, NaN where never."""
+
+    name: str
+    maps: np.ndarray
+
+
+def draw_scores(
+    title: str, line: str, parameters: Mapping[str, np.ndarray], score: np.ndarray, label: str
+) -> style.Figure:
+    """Draws a score [B] against each parameter [B], a point for each network.
+
+    Args:
+        parameters: by label with unit. score: on a logarithmic axis if positive. label: with unit.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    size = float(np.clip(40 / np.sqrt(len(score)), 4, 10))
+    rows = -(-len(parameters) // _COLUMNS)
+    height = style.TOP + rows * (_PANEL + _GAP_UP)
+    figure = style.new_figure(height, title, line)
+    width = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP_ACROSS) / _COLUMNS
+    for k, (name, values) in enumerate(parameters.items()):
+        row, column = divmod(k, _COLUMNS)
+        left = style.LEFT + column * (width + _GAP_ACROSS)
+        bottom = height - style.TOP - _PANEL - row * (_PANEL + _GAP_UP)
+        axes = style.add_axes(figure, left, bottom, width, _PANEL)
+        axes.plot(values, score, ".", color=BLUE, ms=size, mew=0, alpha=0.6)
+        axes.grid(color=style.LINE_GREY, lw=0.7)
+        if score.min() > 0:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
+            axes.yaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+            axes.set_ylim(0.5 * score.min(), 2 * score.max())
+        axes.locator_params(axis="x", nbins=4)
+        axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+        style.name_axes(axes, name, label if column == 0 else "")
+    return figure
+
+
+def draw_rate_maps(
+    title: str, line: str, rows: Sequence[MapRow], x_edges: np.ndarray, y_edges: np.ndarray
+) -> style.Figure:
+    """Draws the rate maps of networks, a row for each and a column for each cell; each map has a colour scale
+    of its own, from 0 to the value above it.
+
+    Args:
+        x_edges, y_edges: [W + 1], [H + 1] edges of the place bins, m.
+    """
+    columns = max(len(row.maps) for row in rows)
+    side = (WIDTH - style.LEFT - style.RIGHT - (columns - 1) * _MAP_GAP) / columns
+    step = side + 0.5
+    height = style.TOP + len(rows) * step + 0.1
+    figure = style.new_figure(height, title, line)
+    for k, row in enumerate(rows):
+        bottom = height - style.TOP - side - 0.18 - k * step
+        for column, rates in enumerate(row.maps):
+            axes = style.add_axes(figure, style.LEFT + column * (side + _MAP_GAP), bottom, side, side)
+            draw_rate_map(axes, rates, x_edges, y_edges)
+            axes.set_title(f"{np.nanmax(rates):.2g}", fontsize=7, color=LABEL_GREY, pad=2)
+        figure.text(
+            0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, row.name, rotation=90, fontsize=9,
+            ha="center", va="center", color=style.INK,
+        )  # fmt: skip
+    return figure
+
+
+UNITS = {
+    "excite_sigma": "cells", "inhibit_sigma": "cells", "global_inhibition": "", "energy": "",
+    "speed_noise": "", "heading_noise": "rad / sqrt(s)", "drift": "m", "drift_heading": "rad",
+    "drift_end": "m", "drift_heading_end": "rad", "decoding": "m", "decoding_heading": "rad",
+    "reseeded": "", "larger": "",
+}  # fmt: skip
+"""Units of the columns of the table; '' for shares and numbers."""
+NOTE = """\
+drift: packet, followed round the torus, minus true pose, rms over the course; end: after the last step.
+decoding: mean distance on the torus. reseeded: share of steps at which activity had died out. larger: share
+of steps that needed more than the smallest window. Rank correlations are Spearman's, over all sets."""
+
+
+class CellReport(NamedTuple):
+    """The scores of a study, with its sets in order of their drift [sets]."""
+
+    study: CellStudy
+    scores: SetScores
+    order: np.ndarray
+
+
+def make_cell_report(study: CellStudy, scores: SetScores) -> CellReport:
+    """The report of a study's scores."""
+    return CellReport(study, scores, np.argsort(scores.drift, kind="stable"))
+
+
+def render_cells(report: CellReport) -> str:
+    """Best, median and worst set by drift, and the rank correlations, as Markdown."""
+    table = [["", "set", *(f"{name} {unit}".strip() for name, unit in UNITS.items())]]
+    columns = _columns(report)
+    for name, k in _chosen(report).items():
+        table.append([name, str(k), *(format_number(float(column[k])) for column in columns.values())])
+    study = report.study
+    links = [["rank correlation with", *PARAMETERS]]
+    for name in ("drift", "drift_heading", "decoding", "decoding_heading"):
+        links.append([name, *(_rank_correlation(columns[each], columns[name]) for each in PARAMETERS)])
+    return "\n".join([render_table(table), "", render_table(links), "", NOTE, _describe(study)])
+
+
+def save_cells(report: CellReport, folder: Path) -> list[Path]:
+    """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
+    decoding.png and maps.png."""
+    study, scores = report.study, report.scores
+    write_text_atomically(folder / "table.csv", _csv(report))
+    write_text_atomically(folder / "table.md", f"{render_cells(report)}\n")
+    course = study.course
+    write_atomically(
+        folder / "maps.npz",
+        lambda path: np.savez_compressed(
+            path, maps=scores.maps, cell=course.chosen, x_edges=course.x_edges, y_edges=course.y_edges
+        ),
+    )
+    paths = [folder / name for name in ("table.csv", "table.md", "maps.npz")]
+    for name, figure in _figures(report).items():
+        write_atomically(folder / name, figure.savefig)
+        paths.append(folder / name)
+    return paths
+
+
+def _figures(report: CellReport) -> dict:
+    study, scores = report.study, report.scores
+    columns, line = _columns(report), _describe(study)
+    parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
+    rows = [MapRow(name, scores.maps[k]) for name, k in _chosen(report).items()]
+    course = study.course
+    return {
+        "drift.png": draw_scores(f"Drift: {study.name}", line, parameters, scores.drift, "drift, rms (m)"),
+        "decoding.png": draw_scores(
+            f"Decoding error: {study.name}", line, parameters, scores.decoding, "decoding error (m)"
+        ),
+        "maps.png": draw_rate_maps(
+            f"Rate maps by drift: {study.name}",
+            f"Least, median and most drift of {len(scores.drift)} sets; above each map its largest activity",
+            rows,
+            course.x_edges,
+            course.y_edges,
+        ),
+    }
+
+
+def _chosen(report: CellReport) -> dict[str, int]:
+    """Indices of the best, the median and the worst set by drift."""
+    order = report.order
+    return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
+
+
+def _columns(report: CellReport) -> dict[str, np.ndarray]:
+    parameters = dict(zip(PARAMETERS, report.study.parameters.T, strict=True))
+    return {name: parameters[name] if name in parameters else getattr(report.scores, name) for name in UNITS}
+
+
+def _rank_correlation(a: np.ndarray, b: np.ndarray) -> str:
+    if not np.ptp(a) or not np.ptp(b):
+        return "-"
+    return f"{np.corrcoef(rankdata(a), rankdata(b))[0, 1]:+.2f}"
+
+
+def _describe(study: CellStudy) -> str:
+    course, config = study.course, study.course.config
+    side = course.x_edges[-1] - course.x_edges[0]
+    torus = config.cells_xy * config.cell_size
+    how = "with views" if study.plan.views else "path integration"
+    return (
+        f"{len(study.parameters)} sets, {len(course.expected)} steps, {course.seconds.sum():.0f} s, {how}, "
+        f"{study.plan.precision}; path {side:.2f} m across, torus {torus:.2f} m."
+    )
+
+
+def _csv(report: CellReport) -> str:
+    columns = _columns(report)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["set", *columns])
+    writer.writerows(
+        [k, *(repr(float(column[k])) for column in columns.values())] for k in range(len(report.order))
+    )
+    return text.getvalue()

@@ -21,7 +21,7 @@ from ratslam.cli.common import (
 )
 from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError, tell
-from tactile.base.new_file import require_new_file, require_own_folder
+from tactile.base.files import require_new_file, require_own_folder
 
 GROWTH = "growth"
 """Preset that measures long sessions."""
@@ -109,7 +109,7 @@ class Progress:
 
     def report_failures(self) -> int:
         """Prints the failed runs; returns the exit code."""
-        from evaluation.studies.study_summary import label
+        from evaluation.studies.study_report import label
 
         for record in self.failed:
             copy = f", copy {record.copy_number}" if record.copy_number else ""
@@ -140,7 +140,7 @@ def _study(arguments: argparse.Namespace) -> int:
     from evaluation.studies.metrics import find_error
     from evaluation.studies.parameter_search import search_plan
     from evaluation.studies.presets import preset_study
-    from evaluation.studies.records import RunLog
+    from evaluation.studies.run_job import RunLog
     from evaluation.studies.study import read_study
 
     remarks: list[str] = []
@@ -167,8 +167,8 @@ def _folder(arguments: argparse.Namespace, name: str, mark: str) -> Path:
 
 def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
     from evaluation.studies.executor import Executor
+    from evaluation.studies.run_job import measure_jobs, run_jobs
     from evaluation.studies.study_report import make_report
-    from evaluation.studies.study_runner import measure_jobs, run_jobs
 
     jobs = study.jobs
     alone = study.plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
@@ -189,8 +189,7 @@ def _growth(arguments: argparse.Namespace) -> int:
         if getattr(arguments, option):
             found = f"with --preset {GROWTH}"
             raise InputError(f"--{option}", found, "one session at a time, without search", "leave it out")
-    from evaluation.studies.growth import growth_study
-    from evaluation.studies.growth_report import read_rows, render_growth, run_growth, save_growth
+    from evaluation.studies.growth import growth_study, read_rows, render_growth, run_growth, save_growth
 
     study = growth_study(find_config(arguments.config), arguments.set)
     folder = _folder(arguments, study.name, "growth.jsonl")
@@ -209,8 +208,14 @@ def _cells(arguments: argparse.Namespace) -> int:
     for option in ("search", "error"):
         if getattr(arguments, option):
             raise InputError(f"--{option}", f"with --preset {CELLS}", "no search", "leave it out")
-    from evaluation.studies.cell_report import make_cell_report, render_cells, save_cells
-    from evaluation.studies.cell_study import FOLDER, cell_study, run_cell_study
+    from evaluation.studies.cell_study import (
+        FOLDER,
+        cell_study,
+        make_cell_report,
+        render_cells,
+        run_cell_study,
+        save_cells,
+    )
     from evaluation.studies.executor import Executor
 
     study = cell_study(find_config(arguments.config), arguments.set)
@@ -264,11 +269,11 @@ def _size(arguments: argparse.Namespace) -> int:
         changed_settings_yaml,
         recommend,
         render_recommendations,
+        render_trial_runs,
+        try_settings,
     )
-    from evaluation.studies.scene_statistics import scene_of
-    from evaluation.studies.tiers import with_tier
-    from evaluation.studies.trial_runs import render_trial_runs, try_settings
-    from ratslam.runs.open_source import open_source
+    from evaluation.studies.scene_statistics import scene_of, with_tier
+    from ratslam.runs.build_session import open_source
     from ratslam.runs.settings.completion import complete
 
     path, config = arguments.config, read_config(arguments)

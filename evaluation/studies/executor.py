@@ -18,7 +18,7 @@ from contextlib import ExitStack, closing, suppress
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from robot.drivers.withheld_signals import withheld_signals
+from robot.drivers.processes import withheld_signals
 from tactile.base.errors import InputError, tell
 
 ANSWER_TIME = 10  # time that a scheduler has for its first answer, s

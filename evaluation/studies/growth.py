@@ -1,27 +1,74 @@
 """A growth study: a long session on known ground and one on new ground, measured at growing lengths.
 
 A simulation of whiskers gives both. Another session whose true poses are known, a recording of views or ids,
-gives known ground: its course again and again, with noise of its own each time."""
+gives known ground: its course again and again, with noise of its own each time.
+
+Plot of the cost of a step against the length of a session.
+
+Measures a session of a growth study, one step at a time, at each of its lengths.
+
+Runs a growth study, each session in a process of its own, and writes its table and picture.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import islice, pairwise
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from threading import RLock
+from time import perf_counter, process_time, thread_time
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, PositiveInt
 
+from evaluation.metrics.energy_metric import energy_all_pairs
+from evaluation.metrics.trajectory import ate
+from evaluation.plots import style
+from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION, WIDTH
+from evaluation.studies.executor import Executor
+from evaluation.studies.machine import (
+    Machine,
+    compilations,
+    machine,
+    peak_memory,
+    reset_peak_memory,
+    watch_load,
+)
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE
+from evaluation.studies.perturbation import repeat_course
+from evaluation.studies.run_job import KILLED
 from evaluation.studies.study import with_settings
+from evaluation.studies.study_report import (
+    describe_machines,
+    find_disturbances,
+    format_number,
+    render_table,
+)
+from ratslam.core.session import Session
+from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, override, validate
-from ratslam.runs.settings.strict_yaml.document import Place
+from ratslam.runs.settings.yaml_document import Place
 from robot.simulation.head.simulated_session import HeadSimulation
-from robot.world.maze_routes import winding_loop
+from robot.sources.in_memory import load_into_memory
+from robot.world.maze import winding_loop
 from robot.world.scene import PAPER_CIRCUITS, PathConfig
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
+from tactile.base.files import write_atomically, write_text_atomically
 from tactile.base.random_streams import stream
+from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
+from tactile.base.types import Observation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 SIDE = 64
 """Columns and rows of the maze of new ground, cells: the largest that can be simulated."""
@@ -132,3 +179,301 @@ def _length(config: RunConfig) -> int:
     cheapest = with_settings(config, {"simulation.fidelity": "kinematic", "simulation.raw": False}).simulation
     assert cheapest is not None
     return HeadSimulation(cheapest, config.touch.head).length or 0
+
+
+_TALL, _BOTTOM = 4.4, 1.15  # inches: height of the axes, and below them
+_COLORS = (BLUE, VERMILLION, GREEN, PURPLE)
+_DASHES = (("mean", "-", "o"), ("99 %", "--", "s"), ("largest", ":", "^"))
+
+
+class GrowthCurve(NamedTuple):
+    """The cost of a session's steps up to each of N lengths.
+
+    Attributes:
+        name: of the session. steps: [N] lengths. cost: [N, 3] mean, 99 % quantile and largest of the steps
+            since the length before, positive.
+    """
+
+    name: str
+    steps: np.ndarray
+    cost: np.ndarray
+
+
+def draw_growth(title: str, line: str, curves: Sequence[GrowthCurve], cost: str) -> style.Figure:
+    """Draws mean, 99 % quantile and largest cost of each session on logarithmic axes.
+
+    Args:
+        curves: 1 to 4. cost: axis label with unit.
+    """
+    inner = WIDTH - style.LEFT - style.RIGHT
+    figure = style.new_figure(style.TOP + _TALL + _BOTTOM, title, line)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _TALL)
+    every = np.concatenate([curve.cost.ravel() for curve in curves])
+    style.log_axes(axes, np.concatenate([curve.steps for curve in curves]), every)
+    for curve, color in zip(curves, _COLORS, strict=False):
+        for values, (name, dash, mark) in zip(curve.cost.T, _DASHES, strict=True):
+            axes.plot(
+                curve.steps, values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0,
+                label=f"{curve.name}, {name}",
+            )  # fmt: skip
+    style.name_axes(axes, "length of the session (steps)", cost)
+    style.add_legend(figure, axes, columns=len(curves))
+    return figure
+
+
+SEED = 0
+"""Seed of the noise of a course that is repeated."""
+TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
+"""Fields of a row that need a step that compiled nothing."""
+
+
+class GrowthRow(Settings):
+    """A session at one length. Times are of the steps since the length before, or of the window of
+    `GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
+
+    ground: Ground
+    steps: int  # length of the session
+    keyframes: int  # number of rows of the backend's memory in use
+    mean: float | None  # processor time of a step on the session's own thread, mean, us
+    process_mean: float | None  # the same, with the process's other threads, us
+    median: float | None  # processor time of a step on the session's own thread, us
+    p99: float | None  # the same, 99 % quantile, us
+    largest: float | None  # the same, largest, us
+    longest: float | None  # wall time of the longest step, with waits for other threads, us
+    compiling: float  # wall time of the steps that compiled code, s
+    memory: float  # peak resident memory, MiB
+    energy: float  # Energy Metric of the online map, all pairs, m^2 + rad^2
+    ate: float  # ATE of the online map, m
+    energy_odometry: float  # Energy Metric of odometry, all pairs, m^2 + rad^2
+    closures: int  # number of loop closures of the final map
+    false_closures: int  # number of these between steps farther apart than `FALSE_CLOSURE_DISTANCE`
+    end: float  # processor time of the final optimisation if the session ended here, s
+    energy_final: float  # Energy Metric of the final map, all pairs, m^2 + rad^2
+    ate_final: float  # ATE of the final map, m
+    machine: Machine
+
+
+class _Clocks(NamedTuple):
+    """Processor time of this thread and of the process, and wall time, s."""
+
+    own: float
+    process: float
+    wall: float
+
+    @classmethod
+    def now(cls) -> _Clocks:
+        return cls(thread_time(), process_time(), perf_counter())
+
+
+class _StepClock:
+    """Times steps, apart from those that compile code."""
+
+    def __init__(self) -> None:
+        self._compiled = compilations()
+        self.restart()
+
+    def take(self, step: Callable[[], object]) -> None:
+        """Takes and times a step."""
+        compiled, before = len(self._compiled), _Clocks.now()
+        step()
+        own, process, wall = np.subtract(_Clocks.now(), before)
+        if len(self._compiled) == compiled:
+            self._steps.append((own, wall))
+        else:
+            self._compiling += wall
+            self._others += own - process  # threads that compile are no cost of a step
+
+    def read(self) -> dict[str, float | None]:
+        """The times of `GrowthRow` since the last call or restart."""
+        now = _Clocks.now()
+        others = self._others + (now.process - self._began.process) - (now.own - self._began.own)
+        steps, compiling = self._steps, self._compiling
+        self.restart()
+        if not steps:
+            return {"compiling": compiling} | dict.fromkeys(TIMES)
+        own, wall = 1e6 * np.array(steps).T
+        # Threads beside the session also work between its steps.
+        mean, beside = own.mean(), 1e6 * max(others, 0.0) / len(own)
+        found = mean, mean + beside, np.median(own), np.quantile(own, 0.99), own.max(), wall.max()
+        times: dict[str, float | None] = {"compiling": compiling}
+        return times | dict(zip(TIMES, map(float, found), strict=True))
+
+    def restart(self) -> None:
+        """Forgets the steps so far."""
+        self._steps: list[tuple[float, float]] = []
+        self._compiling, self._others, self._began = 0.0, 0.0, _Clocks.now()
+
+
+def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[GrowthRow]:
+    """Plays the session once, to its greatest length; yields a row at each length.
+
+    Args:
+        done: called after each step.
+    """
+    with open_observations(task.config) as (config, source):
+        # Rows reserved for the greatest length would cost from the first step on.
+        reserve = config.session.reserve or 1
+        kept = config.session.model_copy(update={"reserve": reserve})
+        if config.simulation is None:
+            source = repeat_course(load_into_memory(source), task.lengths[-1], SEED)
+        session = build_session(config.model_copy(update={"session": kept}), source)
+        rows, clock = read_observations(source), _StepClock()
+        truth, motion = list[np.ndarray](), list[np.ndarray]()
+        for before, length in pairwise([0, *task.lengths]):
+            load = watch_load()
+            reset_peak_memory()
+            window = min(task.window or length, length - before)
+            for step, (sample, observation) in enumerate(islice(rows, length - before)):
+                if step == length - before - window:
+                    clock.restart()
+                clock.take(_step(session, observation))
+                assert sample.truth is not None
+                truth.append(sample.truth)
+                motion.append(np.asarray(observation.odometry[:3], float))
+                done()
+            times = clock.read() | {"memory": peak_memory()}
+            here = machine().model_copy(update={"other_load": load()})
+            errors = _errors(session, np.array(truth), integrate(np.array(motion)))
+            keyframes = session.backend.rows(session.state)
+            found = {"keyframes": keyframes, "machine": here, **times, **errors}
+            yield GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
+
+
+def _step(session: Session, observation: Observation) -> Callable[[], object]:
+    return lambda: session.step(observation)
+
+
+def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[str, float]:
+    """The errors of `GrowthRow`, and the time of the final optimisation; the session stays as it is."""
+    online = session.map.online_trajectory()
+    began = thread_time()
+    final, end = session.map.trajectory(), thread_time() - began
+    closures = session.map.closures()
+    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
+    return {
+        "end": end,
+        "energy_odometry": energy_all_pairs(odometry, truth).total,
+        "closures": len(closures),
+        "false_closures": int((apart > FALSE_CLOSURE_DISTANCE).sum()),
+        "energy": energy_all_pairs(online, truth).total,
+        "ate": ate(online, truth),
+        "energy_final": energy_all_pairs(final, truth).total,
+        "ate_final": ate(final, truth),
+    }
+
+
+FILE = "growth.jsonl"  # name of the file of rows in a study's folder
+COLUMNS = {
+    "": "ground", "steps": "steps", "keyframes": "keyframes", "mean us": "mean",
+    "all threads us": "process_mean", "median us": "median", "99 % us": "p99", "largest us": "largest",
+    "longest us": "longest", "memory MiB": "memory", "EM m^2 + rad^2": "energy", "ATE m": "ate",
+    "odometry EM": "energy_odometry", "end s": "end", "final EM": "energy_final",
+    "final ATE m": "ate_final", "closures": "closures", "false": "false_closures",
+}  # fmt: skip
+"""Fields of a row by their column in the table."""
+NOTE = """\
+mean, median, 99 %, largest: processor time of a step on the session's thread, over the steps since the length
+before or the window, without those that compiled code. all threads: the mean with other threads. longest:
+wall time of a step, with waits for the selection of closures, as steps follow one another without pause.
+memory: peak since the length before. EM and ATE: of the online map so far. end: processor time of the final
+optimisation if the session ended here. final, closures, false: of the map after it; closures of places more
+than 0.1 m apart."""
+
+
+def run_growth(study: GrowthStudy, folder: Path) -> None:
+    """Runs the sessions of a study one after another; each row is in `folder/FILE` as soon as it is measured.
+
+    Raises:
+        InputError: the folder cannot be made, a session cannot be simulated, or its process was killed.
+    """
+    with os_errors_of(folder, "cannot be written to", "a folder to write to"):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / FILE).write_bytes(b"")
+    with Executor(fresh=True) as executor:
+        for _ in executor.completed(partial(_append_rows, folder / FILE), study.tasks, _killed):
+            pass
+
+
+def read_rows(folder: Path) -> list[GrowthRow]:
+    """The rows measured so far."""
+    path, found = folder / FILE, []
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        try:
+            found.append(GrowthRow.model_validate_json(line))
+        except ValueError:  # cut off by a kill
+            continue
+    return found
+
+
+def render_growth(rows: Sequence[GrowthRow]) -> str:
+    """The table and its notes as Markdown."""
+    table = [list(COLUMNS)]
+    table += [[_cell(getattr(row, name)) for name in COLUMNS.values()] for row in rows]
+    machines = [row.machine for row in rows]
+    remarks = [f"{each[0].upper()}{each[1:]}." for each in find_disturbances(machines)]
+    measured = describe_machines(machines, 1)
+    return "\n".join([render_table(table), "", NOTE, "; ".join(measured.values()) + ".", *remarks])
+
+
+def draw(name: str, rows: Sequence[GrowthRow]) -> Figure | None:
+    """Cost of a step against length; None without a step that compiled nothing."""
+    timed = [row for row in rows if row.largest]
+    curves = []
+    for ground in dict.fromkeys(row.ground for row in timed):
+        these = [row for row in timed if row.ground == ground]
+        cost = np.array([[row.mean, row.p99, row.largest] for row in these], float) / 1e3
+        curves.append(GrowthCurve(ground, np.array([row.steps for row in these]), cost))
+    if not curves:
+        return None
+    measured = describe_machines([row.machine for row in rows], 1)
+    line = "  ·  ".join(measured[part] for part in ("machine", "build"))
+    return draw_growth(
+        f"Cost of a step against length: {name}", line, curves, "processor time of a step (ms), own thread"
+    )
+
+
+def save_growth(name: str, rows: Sequence[GrowthRow], folder: Path) -> list[Path]:
+    """Writes table.csv, table.md and, if there is something to draw, growth.png."""
+    write_text_atomically(folder / "table.csv", _csv(rows))
+    write_text_atomically(folder / "table.md", f"{render_growth(rows)}\n")
+    paths, picture = [folder / "table.csv", folder / "table.md"], folder / "growth.png"
+    figure = draw(name, rows)
+    if figure is None:
+        picture.unlink(missing_ok=True)  # of an earlier call
+        return paths
+    write_atomically(picture, figure.savefig)
+    return [*paths, picture]
+
+
+def _cell(value: str | float | None) -> str:
+    if value is None:
+        return "-"
+    return format_number(value) if isinstance(value, float) else str(value)
+
+
+def _csv(rows: Sequence[GrowthRow]) -> str:
+    lines = [row.model_dump(exclude={"machine"}) | {"other_load": row.machine.other_load} for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return text.getvalue()
+
+
+def _append_rows(path: Path, task: GrowthTask) -> None:
+    """Measures a session, with a progress bar; appends its rows to a file."""
+    from tqdm import tqdm
+
+    tqdm.set_lock(RLock())  # the default is a semaphore, which is left over when this process is ended
+    with (
+        tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5) as bar,
+        path.open("a", encoding="utf-8") as file,
+    ):
+        for row in measure_growth(task, bar.update):
+            file.write(row.model_dump_json() + "\n")
+            file.flush()
+
+
+def _killed(task: GrowthTask) -> None:
+    """Raises an `InputError` for a session whose process was killed."""
+    raise InputError(task.ground, KILLED, "memory for the whole session", "measure a shorter one")

@@ -12,10 +12,8 @@ from itertools import chain, islice
 from typing import Any
 
 from evaluation.studies.executor import Executor
-from evaluation.studies.records import RunLog, RunRecord
-from evaluation.studies.schema import SearchPlan
-from evaluation.studies.study import Job, Study, searched_jobs
-from evaluation.studies.study_runner import run_jobs
+from evaluation.studies.run_job import RunLog, RunRecord, run_jobs
+from evaluation.studies.study import Job, SearchPlan, Study, searched_jobs
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 

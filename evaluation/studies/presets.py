@@ -8,11 +8,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from evaluation.studies.scene_statistics import shortened
 from evaluation.studies.study import Study, check_study, is_study_key, seed_key
-from evaluation.studies.tiers import shortened
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, override, validate
-from ratslam.runs.settings.strict_yaml.document import Place
+from ratslam.runs.settings.yaml_document import Place
 from robot.simulation.head.simulated_session import choose_tier
 from tactile.base.errors import InputError
 

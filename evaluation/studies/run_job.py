@@ -1,42 +1,126 @@
-"""One run of a study: a session played in memory, scored and timed."""
+"""One run of a study: a session played in memory, scored and timed.
+
+The record of a run, and the file of a study that holds one record a line.
+
+Runs the jobs of a study; a job with a record is not run again.
+"""
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
 import numpy as np
+from pydantic import Field
 
-from evaluation.artifacts.grid_npz import read_grid
+from evaluation.artifacts.grid_files import read_grid
 from evaluation.metrics.energy_metric import read_relations
-from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.metric import Finding, Quantity
-from evaluation.metrics.occupancy_score import score_grid
+from evaluation.metrics.occupancy_score import MAIN_CONVENTION, score_grid
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import anchored_errors, recognition_error
 from evaluation.metrics.scorecard import score_run
-from evaluation.studies.machine import Stopwatch, machine
+from evaluation.studies.executor import Executor
+from evaluation.studies.machine import (
+    Machine,
+    Stopwatch,
+    machine,
+    one_core,
+    peak_memory,
+    reset_peak_memory,
+    watch_load,
+)
 from evaluation.studies.metrics import quantity
 from evaluation.studies.perturbation import perturb
-from evaluation.studies.records import RunRecord, record_of
-from evaluation.studies.resources import peak_memory, reset_peak_memory, watch_load
-from evaluation.studies.study import Job
-from evaluation.studies.tiers import compare_with_tier
+from evaluation.studies.scene_statistics import compare_with_tier
+from evaluation.studies.study import Job, run_key
 from ratslam.core.session import CHUNK, Session
-from ratslam.runs.artifacts import true_grid
-from ratslam.runs.build_session import build_session
-from ratslam.runs.online_error import OnlineErrorLog
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import build_session, open_observations, read_observations
+from ratslam.runs.run_directory import OnlineErrorLog, true_grid
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from robot.sources.source import Source
 from robot.world.arena import read_arena
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, os_errors_of
 from tactile.base.se2 import integrate
+from tactile.base.settings import Settings
+
+FILE = "runs.jsonl"  # name of the file of records in a study's directory
+
+
+class RunRecord(Settings):
+    """Outcome of one run. `quantities` and `steps` do not depend on the machine; the rest does."""
+
+    hash: str  # hash of the configuration without its seed
+    seed: int  # seed of the simulation or session
+    copy_number: int = 0  # seed of the perturbed copy of the session; 0: the session itself
+    row: str = ""  # name of the study's row
+    varied: dict[str, Any] = Field(default_factory=dict)  # combination of the varied settings, by key path
+    steps: int = 0  # number of observations
+    source: str = ""  # digest of the session
+    quantities: dict[str, Quantity] = Field(default_factory=dict)  # scored quantities by name
+    measured: dict[str, float | None] = Field(default_factory=dict)  # by names of `metrics.MEASURED`
+    machine: Machine | None = None  # where it was computed
+    error: str | None = None  # why there is no outcome
+
+    @property
+    def key(self) -> str:
+        """Identifies the run: two runs with one key are the same."""
+        return run_key(self.hash, self.seed, self.copy_number)
+
+    def value(self, name: str) -> float | None:
+        """A quantity by its name in `metrics.METRICS`; None if the run has none."""
+        return self.quantities[name].value if name in self.quantities else self.measured.get(name)
+
+    def odometry(self, name: str) -> float | None:
+        """A quantity of raw odometry; None if the run has none."""
+        return self.quantities[name].odometry if name in self.quantities else None
+
+
+def record_of(job: Job, error: str | None = None, machine: Machine | None = None) -> RunRecord:
+    """The record of a job without an outcome."""
+    names = {name: getattr(job, name) for name in ("hash", "seed", "copy_number", "row", "varied")}
+    return RunRecord(**names, error=error, machine=machine)
+
+
+class RunLog:
+    """The records in a directory. A kill loses at most the record that was being written.
+
+    Args:
+        directory: is created if missing; an `InputError` says that it cannot be.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        with os_errors_of(directory, "cannot be made", "a folder to write to"):
+            directory.mkdir(parents=True, exist_ok=True)
+        self.path = directory / FILE
+        self.records: dict[str, RunRecord] = {}
+        for line in self.path.read_bytes().splitlines() if self.path.exists() else []:
+            try:
+                record = RunRecord.model_validate_json(line)
+            except ValueError:  # cut off by a kill
+                continue
+            self.records[record.key] = record
+
+    def append(self, record: RunRecord) -> None:
+        """Adds a record; it is on disk when this returns."""
+        with self.path.open("ab+") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 1, 0))
+            cut_off = size > 0 and file.read(1) != b"\n"
+            # One write: two studies may append to one file.
+            file.write(b"\n" * cut_off + record.model_dump_json().encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self.records[record.key] = record
+
 
 SAME_PLACE = 2.5  # largest true distance between the ends of a true loop closure, pose cells
 
@@ -159,3 +243,60 @@ def _precision(wanted: str) -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_enable_x64", before)
+
+
+KILLED = "its process was killed, for lack of memory for example"
+Done = Callable[[RunRecord], object]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    log: RunLog,
+    executor: Executor,
+    done: Done | None = None,
+    function: Callable[[Job], RunRecord] | None = None,
+) -> Iterator[RunRecord]:
+    """Yields the records of all jobs in their order; each is on disk before.
+
+    Args:
+        log: records of earlier calls; new ones are added, except of a killed process: the next call runs its
+            job again. done: called with each record in the order of completion, once for each key.
+        function: runs a job; default `run_job`.
+    """
+    found, done = dict(log.records), done or (lambda record: None)
+    killed = partial(record_of, error=KILLED)
+    wanted: dict[str, Job] = {}
+    for job in jobs:
+        wanted.setdefault(job.key, job)
+    missing = [job for key, job in wanted.items() if key not in found]
+    for key in filter(found.get, wanted):
+        done(_labelled(found[key], wanted[key]))
+    with closing(executor.completed(function or run_job, missing, killed)) as completed:
+        for job in jobs:
+            while job.key not in found:
+                _, record = next(completed)
+                if record.error != KILLED:
+                    ran = record.machine and record.machine.model_copy(update={"workers": executor.processes})
+                    record = record.model_copy(update={"machine": ran})
+                    log.append(record)
+                found[record.key] = record
+                done(_labelled(record, wanted[record.key]))
+            yield _labelled(found[job.key], job)
+
+
+def measure_jobs(jobs: Sequence[Job], log: RunLog, done: Done | None = None) -> list[RunRecord]:
+    """The records of all jobs, measured one at a time on one core, each in a process of its own.
+
+    Jobs run seed by seed, so that a disturbance of the machine spreads over all configurations. Only the
+    first run of a configuration compiles its kernels.
+    """
+    order = sorted(range(len(jobs)), key=lambda k: (jobs[k].seed, jobs[k].copy_number))
+    with TemporaryDirectory(ignore_cleanup_errors=True) as kernels, one_core(), Executor(fresh=True) as fresh:
+        alone = partial(run_job_alone, Path(kernels))
+        records = dict(zip(order, run_jobs([jobs[k] for k in order], log, fresh, done, alone), strict=True))
+    return [records[k] for k in range(len(jobs))]
+
+
+def _labelled(record: RunRecord, job: Job) -> RunRecord:
+    """The record under this job's row: several rows may have the same configuration."""
+    return record.model_copy(update={"row": job.row, "varied": job.varied})

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.classic.cell_batch import CellCourse
-from ratslam.classic.pose_cell_config import NetworkConfig, network_of, rings, units
+from ratslam.classic.batch import CellCourse
+from ratslam.classic.config import NetworkConfig, network_of, rings, units
 from ratslam.network.config import PoseCellConfig
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.odometry import from_poses
 from robot.sources.source import Source

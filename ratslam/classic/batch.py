@@ -2,10 +2,17 @@
 
 Sessions are computed a few at a time, each from beginning to end, because all at once exceed the processor's
 cache. On a GPU blocks may be as large as its memory.
+
+Many networks over one long course: parameter sets and noise, a segment of the course at a time.
+
+Every segment is computed for blocks of networks at the smallest window level; those that needed a larger one
+in it are computed again, one by one with all levels, from where the segment began. Memory is that of the
+networks' states and of one segment, whatever the length of the course.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,9 +22,11 @@ import numpy as np
 from jax import lax
 
 from ratslam.classic import pose_cells
+from ratslam.classic.cell_probe import activity_of
+from ratslam.classic.config import NetworkConfig, rings
 from ratslam.classic.excitation_inhibition import with_kernels
-from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig
+from ratslam.classic.levels import Level, window_levels
+from ratslam.classic.pose_cells import PoseCells
 from ratslam.core.estimates import Estimate
 from tactile.base.types import Array, Observation, Odometry
 
@@ -111,3 +120,206 @@ def trials(kernel: Any, states: Any, observations: Observation, block: int = 1) 
         return lax.scan(step, *trial)[1]
 
     return lax.map(simulate, (states, observations), batch_size=block)
+
+
+SEGMENT = 128
+"""Steps of a segment: long enough that calls cost nothing, short enough that little is computed again."""
+LONGEST_WAIT = 64
+"""Largest number of segments that a network which needed larger levels is computed with all of them before
+the smallest alone is tried again; the wait doubles with each failure."""
+
+
+class CellSets(NamedTuple):
+    """B networks and the noise on their odometry.
+
+    Attributes:
+        network: their parameters. speed_noise: [B] standard deviation of a step's motion, as a share of it.
+            heading_noise: [B] of the heading, rad / sqrt(s).
+    """
+
+    network: Network
+    speed_noise: Array
+    heading_noise: Array
+
+
+class CellCourse(NamedTuple):
+    """Input of the networks over T steps.
+
+    View matching does not depend on the network, so that the templates of a course are known before.
+
+    Attributes:
+        motion: [T, 3] body-frame odometry, m, m, rad. noise: [T, 2] unit noise of the motion, and of the
+            heading times the square root of the step's duration in s. template: [T] int32 template seen; 0
+            without view. novel: [T] bool, seen for the first time. turned: [T] heading of the robot minus
+            that at which the template was stored, cells. energy: [T] injected where the packet was then.
+    """
+
+    motion: Array
+    noise: Array
+    template: Array
+    novel: Array
+    turned: Array
+    energy: Array
+
+
+class CellTrack(NamedTuple):
+    """A segment of S steps of B networks, host NumPy.
+
+    Attributes:
+        pose: [B, S, 3] decoded packets, cells. activity: [B, S, C] of the chosen cells. outcome: [B, S] an
+            `Outcome`. level: [B, S] window level.
+    """
+
+    pose: np.ndarray
+    activity: np.ndarray
+    outcome: np.ndarray
+    level: np.ndarray
+
+
+class _Walker(NamedTuple):
+    """One network on its way: its state, and the packets [M, 3] at which templates were first seen."""
+
+    cells: PoseCells
+    packet: Array
+
+
+class _Fleet:
+    """B networks on their way, on the host.
+
+    Args:
+        sets, course, chosen: as in `walk`.
+    """
+
+    def __init__(self, config: NetworkConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray) -> None:
+        self._config, self._chosen = config, tuple(map(int, chosen))
+        dtype = np.dtype(course.motion.dtype)
+        self._sets = jax.tree.map(lambda column: np.asarray(column, dtype), sets)
+        self._count = len(self._sets.speed_noise)
+        templates = int(np.max(course.template, initial=0)) + 1
+        start = jax.device_get(_start(config, dtype, templates))
+        self._walkers = [start] * self._count
+        self._wait = np.zeros(self._count, int)  # segments until the smallest level alone is tried again
+        self._failures = np.zeros(self._count, int)  # of the smallest level, one after the other
+
+    def advance(self, rows: CellCourse, block: int) -> CellTrack:
+        """The networks over a segment [S] of the course, `block` of them at a time where that is exact."""
+        found: dict[int, CellTrack] = {}
+        small = [walker.cells.activity.level == 0 for walker in self._walkers]
+        tried = [k for k in range(self._count) if small[k] and not self._wait[k]]
+        for first in range(0, len(tried), block):
+            found |= self._advance_together(rows, tried[first : first + block], block)
+        for k in set(tried) - set(found):
+            self._failures[k] += 1
+            self._wait[k] = min(1 << self._failures[k], LONGEST_WAIT)
+        for k in range(self._count):
+            if k not in found:
+                self._wait[k] = max(self._wait[k] - 1, 0)
+                own = self._of(k), self._walkers[k], rows, self._chosen
+                self._walkers[k], found[k] = jax.device_get(_walk_alone(self._config, *own))
+        return jax.tree.map(lambda *tracks: np.stack(tracks), *(found[k] for k in range(self._count)))
+
+    def _advance_together(self, rows: CellCourse, group: list[int], block: int) -> dict[int, CellTrack]:
+        """The tracks of those networks of a group for which the smallest level sufficed."""
+        # A group is filled up with its first network, whose copies are thrown away.
+        members = np.resize(group, block)
+        members[len(group) :] = group[0]
+        states = [_at_smallest(self._walkers[k]) for k in members]
+        together = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+        after, track = jax.device_get(
+            _walk_together(self._config, self._of(members), together, rows, self._chosen)
+        )
+        found = {}
+        for j, k in enumerate(group):
+            if not track.level[j].any():
+                state = jax.tree.map(lambda leaf, j=j: leaf[j], after)
+                self._walkers[k] = _with_larger_levels(state, self._walkers[k])
+                self._failures[k], found[k] = 0, jax.tree.map(lambda leaf, j=j: leaf[j], track)
+        return found
+
+    def _of(self, members: int | np.ndarray) -> CellSets:
+        return jax.tree.map(lambda column: column[members], self._sets)
+
+
+def walk(
+    config: NetworkConfig, sets: CellSets, course: CellCourse, chosen: np.ndarray, block: int = BLOCK
+) -> Iterator[CellTrack]:
+    """Simulates B networks over a course; yields its segments, of `SEGMENT` steps except for the last.
+
+    Args:
+        course: T steps, whose dtype is that of the networks. chosen: [C] cells of the flattened network
+            [K, N, N] whose activity is recorded. block: networks computed at a time.
+    """
+    fleet, steps = _Fleet(config, sets, course, chosen), len(course.motion)
+    for first in range(0, steps, SEGMENT):
+        # The last segment is filled up with the last row, whose steps are thrown away.
+        at = np.minimum(np.arange(first, first + SEGMENT), steps - 1)
+        rows = jax.tree.map(lambda column, at=at: np.asarray(column)[at], course)
+        track = fleet.advance(rows, block)
+        yield jax.tree.map(lambda column, left=steps - first: column[:, :left], track)
+
+
+@partial(jax.jit, static_argnames=("config", "dtype", "templates"))
+def _start(config: NetworkConfig, dtype: np.dtype, templates: int) -> _Walker:
+    return _Walker(pose_cells.start(config, dtype), jnp.zeros((templates, 3), dtype))
+
+
+def _at_smallest(walker: _Walker) -> _Walker:
+    """The walker with the block of the smallest level alone."""
+    activity = walker.cells.activity
+    activity = activity._replace(blocks=activity.blocks[:1])
+    return walker._replace(cells=walker.cells._replace(activity=activity))
+
+
+def _with_larger_levels(walker: _Walker, whole: _Walker) -> _Walker:
+    """The walker at the smallest level with the other blocks, which do not count, of one with all levels."""
+    activity = walker.cells.activity
+    activity = activity._replace(blocks=(*activity.blocks, *whole.cells.activity.blocks[1:]))
+    return walker._replace(cells=walker.cells._replace(activity=activity))
+
+
+@partial(jax.jit, static_argnames=("config", "chosen"))
+def _walk_together(
+    config: NetworkConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: tuple[int, ...]
+) -> tuple[_Walker, CellTrack]:
+    """Networks over a segment, at the smallest level alone."""
+    levels = window_levels(config, np.dtype(rows.motion.dtype))[:1]
+    return jax.vmap(partial(_walk, config, levels), (0, 0, None, None))(sets, walkers, rows, chosen)
+
+
+@partial(jax.jit, static_argnames=("config", "chosen"))
+def _walk_alone(
+    config: NetworkConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: tuple[int, ...]
+) -> tuple[_Walker, CellTrack]:
+    """One network over a segment, with all levels."""
+    levels = window_levels(config, np.dtype(rows.motion.dtype))
+    return _walk(config, levels, own, walker, rows, chosen)
+
+
+def _walk(
+    config: NetworkConfig,
+    levels: tuple[Level, ...],
+    own: CellSets,
+    walker: _Walker,
+    rows: CellCourse,
+    chosen: tuple[int, ...],
+) -> tuple[_Walker, CellTrack]:
+    dtype, network = rows.motion.dtype, own.network
+    kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
+    tuned = tuple(level._replace(window=with_kernels(level.window, *kernels)) for level in levels)
+    ring = rings(config, dtype)
+
+    def step(walker: _Walker, row: CellCourse) -> tuple[_Walker, CellTrack]:
+        faster, turn = 1 + own.speed_noise * row.noise[0], own.heading_noise * row.noise[1]
+        moved = Odometry(
+            row.motion[0] * faster, row.motion[1] * faster, row.motion[2] + turn, jnp.ones((), dtype)
+        )
+        seen = walker.packet[row.template]
+        # A template is learnt with the packet before the step.
+        packet = walker.packet.at[row.template].set(jnp.where(row.novel, walker.cells.pose, seen))
+        turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
+        recall, energy = (seen + turned) % ring, row.energy * network.energy
+        cells, info = pose_cells.step(config, tuned, walker.cells, moved, recall, energy)
+        active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
+        return _Walker(cells, packet), CellTrack(cells.pose, active, info.outcome, info.level)
+
+    return lax.scan(step, walker, rows)

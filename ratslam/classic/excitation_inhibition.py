@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic.pose_cell_config import NetworkConfig
+from ratslam.classic.config import NetworkConfig
 from tactile.base.types import Array
 
 TIE = 1e-9

@@ -15,11 +15,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.classic.adaptive_window import step_at_smallest_level
+from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import TIE, deposit_gain, ring_difference, rotate
-from ratslam.classic.level_step import StepInput
-from ratslam.classic.levels import Activity, Level, point_activity, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.levels import (
+    Activity,
+    Level,
+    StepInput,
+    point_activity,
+    step_at_smallest_level,
+    window_levels,
+)
 from tactile.base.types import Array, Odometry
 
 LARGEST_SUBSTEP = 0.75

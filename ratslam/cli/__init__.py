@@ -14,25 +14,15 @@ from importlib.metadata import entry_points
 from types import FrameType
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
-from ratslam.cli import (
-    check,
-    doctor,
-    files,
-    fitting,
-    live,
-    localise,
-    look,
-    maps,
-    merge,
-    path,
-    run,
-    tools,
-)
+from ratslam.cli import doctor, live, maps, run, tools
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
-from tactile.base.atomic_write import FULL
 from tactile.base.errors import InputError, printable, tell
+from tactile.base.files import FULL
 
-MODULES = (run, live, localise, merge, maps, path, look, doctor, fitting, files, check, tools)
+COMMANDS = (
+    run.add_run, live.add_commands, maps.add_localise, maps.add_merge, maps.add_map, maps.add_path,
+    run.add_look, doctor.add_doctor, doctor.add_fit, tools.add_export, tools.add_check, tools.add_tools,
+)  # fmt: skip
 """The commands that are always there, in the order of the help."""
 INSTALLED = "ratslam.commands"
 """Group of the entry points of further commands: functions that take `Commands` and register theirs."""
@@ -135,8 +125,8 @@ def build_parser() -> Program:
     """The parser of the whole program."""
     parser = Program(prog="ratslam", description=DESCRIPTION)
     parser.commands = Commands(parser)
-    for module in MODULES:
-        module.add_commands(parser.commands)
+    for add in COMMANDS:
+        add(parser.commands)
     for point in sorted(entry_points(group=INSTALLED), key=lambda point: point.name):
         try:
             point.load()(parser.commands)

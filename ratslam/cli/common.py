@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import shtab
 
-from ratslam.core.xla_flags import add_xla_flags
+from ratslam.core.compilation import add_xla_flags
 from ratslam.runs.settings.packaged import packaged_configs
-from tactile.base.new_file import require_new_file, require_own_folder
+from tactile.base.files import require_new_file, require_own_folder
 
 if TYPE_CHECKING:
     from ratslam.runs.settings.run_config import RunConfig
@@ -169,7 +169,7 @@ def read_config(arguments: argparse.Namespace) -> RunConfig:
 
 
 def prepare_jax(keep_compiled: bool = True) -> None:
-    """Sets the variables that JAX reads at import: `ratslam.core.xla_flags`, and a disk cache.
+    """Sets the variables that JAX reads at import: `ratslam.core.compilation`, and a disk cache.
 
     Args:
         keep_compiled: whether compiled kernels are cached on disk; of no use to commands that run many
@@ -179,7 +179,7 @@ def prepare_jax(keep_compiled: bool = True) -> None:
     os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return
-    from ratslam.core.kernel_cache import cache_settings, keep_kernels
+    from ratslam.core.compilation import cache_settings, keep_kernels
 
     for name, value in cache_settings().items():
         os.environ.setdefault(name.upper(), str(value))  # for child processes

@@ -1,4 +1,7 @@
-"""The command doctor."""
+"""The command doctor.
+
+The command fit.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,18 @@ from typing import TYPE_CHECKING
 
 from ratslam.cli.common import Commands, add_set, prepare_jax
 from tactile.base.errors import InputError
-from tactile.base.new_file import make_new_file
+from tactile.base.files import make_new_file
 
 if TYPE_CHECKING:
-    from ratslam.service.doctor.diagnosis import Diagnosis
+    from ratslam.runs.settings.run_config import RunConfig
+    from ratslam.service.recording_check import Diagnosis
+
 
 FAULTY = 1
 """Exit code if a fault was found."""
 
 
-def add_commands(commands: Commands) -> None:
+def add_doctor(commands: Commands) -> None:
     """Registers the commands of this module."""
     doctor = commands.add(
         "doctor", _doctor, "say what a recording, run or robot is, and what to do",
@@ -41,20 +46,20 @@ def add_commands(commands: Commands) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from ratslam.service.doctor.diagnosis import render
+    from ratslam.service.recording_check import render
 
     if arguments.set and not arguments.live:
         raise InputError("--set", "settings without --live", "the configuration of a live session")
     if arguments.live:
         # Whether a live session could start.
         from ratslam.runs.settings.run_config import load_config
-        from ratslam.service.doctor.live_check import diagnose_live
+        from ratslam.service.run_check import diagnose_live
 
         prepare_jax()
         config = load_config(arguments.path, arguments.set)
         diagnosis = diagnose_live(config, str(arguments.path), Path("runs"))
     elif (arguments.path / "manifest.json").exists():
-        from ratslam.service.doctor.run_check import diagnose_run
+        from ratslam.service.run_check import diagnose_run
 
         diagnosis = diagnose_run(arguments.path)
     else:
@@ -66,7 +71,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     """What the recording is; writes its configuration."""
     from ratslam.runs.settings.strict_yaml import dump_data
-    from ratslam.service.doctor.recording_check import diagnose_recording
+    from ratslam.service.recording_check import diagnose_recording
 
     like = None
     if arguments.like is not None:
@@ -84,3 +89,61 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
+
+
+def add_fit(commands: Commands) -> None:
+    """Registers the commands of this module."""
+    fit = commands.add(
+        "fit", _fit, "measure wheels, whiskers and head from a record", "fit create_lab -o rig.yaml", "look"
+    )
+    fit.add_argument(
+        "record", type=Path, metavar="RECORD",
+        help="recording, or the configuration (YAML, or name of a packaged one) that reads it",
+    )  # fmt: skip
+    fit.add_argument(
+        "-o", "--output", type=Path, metavar="YAML",
+        help="write the settings to a new file, for `include: [FILE]` in a configuration",
+    )  # fmt: skip
+    fit.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the bootstrap (default 0)")
+    add_set(fit)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    if arguments.seed < 0:
+        raise InputError("--seed", str(arguments.seed), "a non-negative integer")
+    prepare_jax()
+    from ratslam.service.record_fit import fit_record
+    from ratslam.service.rig_fit import render_rig, rig_file
+
+    rig = fit_record(_config_of(arguments), arguments.seed)
+    print(render_rig(rig))
+    if not rig.quantities and not rig.settings:
+        raise InputError(str(arguments.record), "nothing that tells of the rig", "true poses or whiskers")
+    output: Path | None = arguments.output
+    if output is not None:
+        text = rig_file(rig, str(arguments.record))
+        make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
+        print(f"{output}: written")
+    return 0
+
+
+def _config_of(arguments: argparse.Namespace) -> RunConfig:
+    """The configuration that reads the record: the one given, or that which the doctor finds."""
+    from ratslam.runs.settings.packaged import packaged_configs
+    from ratslam.runs.settings.run_config import RunConfig, load_config
+    from ratslam.runs.settings.strict_yaml import dump_data, override, parse, validate
+    from ratslam.service.recording_check import UNREADABLE, diagnose_recording
+    from robot.sources.input_files import raise_errors
+
+    record: Path = arguments.record
+    named = not record.exists() and str(record) in packaged_configs()
+    if named or record.suffix.lower() in (".yaml", ".yml"):
+        return load_config(record, arguments.set)
+    diagnosis = diagnose_recording(record)
+    if not diagnosis.config:
+        raise_errors([InputError("", fault) for fault in diagnosis.faults if fault != UNREADABLE])
+        cure = f"`python -m ratslam doctor {record}` says what is missing"
+        raise InputError(str(record), "no configuration reads it", "a recording", cure)
+    text = dump_data(diagnosis.config)
+    config = validate(override(parse(text, record.name), arguments.set), RunConfig)
+    return config.with_absolute_paths(Path.cwd())

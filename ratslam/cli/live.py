@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
 from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
-from robot.drivers.process_priority import put_last
+from robot.drivers.processes import put_last
 from tactile.base.errors import InputError, tell
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def add_commands(commands: Commands) -> None:
 
 def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from evaluation.report.summary import summarise
+    from evaluation.report.verdict import summarise
     from ratslam.live.live_session import run_live_session
     from ratslam.runs.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
@@ -123,7 +123,7 @@ def monitor() -> Iterator[Callable[[Path], None]]:
 
     At the end of the block the process is ended, and `watch.png` is drawn once more with the final state.
     """
-    from evaluation.monitor.watch import watch_run
+    from evaluation.monitor import watch_run
 
     processes: dict[Path, subprocess.Popen[bytes]] = {}
 

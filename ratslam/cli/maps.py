@@ -1,23 +1,35 @@
-"""The command map: what is in a saved map, what differs between two, undoing a closure sequence, cropping."""
+"""The command map: what is in a saved map, what differs between two, undoing a closure sequence, cropping.
+
+The command localise.
+
+The command merge.
+
+The command path.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from functools import partial
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, prepare_jax
+from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax
+from ratslam.cli.run import add_rerun, open_target
 from tactile.base.errors import InputError, tell
+from tactile.base.files import require_new_file
 
 if TYPE_CHECKING:
+    from ratslam.places.route import Way
     from ratslam.runs.saved_map import SavedMap
+    from ratslam.runs.settings.run_config import RunConfig
 
 
-def add_commands(commands: Commands) -> None:
+def add_map(commands: Commands) -> None:
     """Registers `map` with its commands."""
     help = "show, compare, crop or correct saved maps"
     kinds = Commands(commands.add("map", None, help, "map info runs/square", "maps"))
@@ -205,3 +217,177 @@ def render_difference(found: dict) -> str:
     lines.append(f"sensor    {found['sensor'] or 'the same'}")
     lines += [f"setting   {key}: {one!r} and {other!r}" for key, (one, other) in found["settings"].items()]
     return "\n".join(lines)
+
+
+CONFIGURATIONS = (".yaml", ".yml", "")
+"""Suffixes of a configuration or its name; other files, and folders, are recordings."""
+
+
+def add_localise(commands: Commands) -> None:
+    """Registers the command."""
+    localise = commands.add(
+        "localise", _localise, "find a recording's poses in a saved map",
+        "localise runs/whisker_maze another_day.yaml -o runs/found", "maps",
+    )  # fmt: skip
+    localise.add_argument("map", type=Path, metavar="MAP", help="a run directory or its map.npz")
+    localise.add_argument(
+        "recording", type=Path, metavar="RECORDING",
+        help="configuration with the recording or simulation to localise, or a recording of the map's sensor "
+        "(the method and its settings are those of the map)",
+    )  # fmt: skip
+    add_set(localise)
+    localise.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/RECORDING_in_MAP)"
+    )
+    add_rerun(localise)
+
+
+def _localise(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from evaluation.report.verdict import summarise
+    from ratslam.runs.localise import localise
+    from ratslam.runs.saved_map import read_map
+    from ratslam.service.viewer_link import open_viewer
+
+    target, saved = open_target(arguments), read_map(arguments.map, tell)
+    config = _read_recording(arguments, saved)
+    place = arguments.map.name.removesuffix(".npz") or "map"
+    directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"
+    with open_viewer(target) as observers:
+        card, summary, interrupted = localise(saved, config, directory, observers)
+    print(summary.describe())
+    print(f"{directory}/localisation.csv holds the state and the probability of every step,")
+    print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
+    print(summarise(directory, card, f"localising in {arguments.map}"))
+    return INTERRUPTED if interrupted else 0
+
+
+def _read_recording(arguments: argparse.Namespace, saved: SavedMap) -> RunConfig:
+    from ratslam.runs.localise import check_assignments, recorded_alike
+    from ratslam.runs.settings.run_config import load_config
+
+    file: Path = arguments.recording
+    if file.suffix in CONFIGURATIONS and not file.is_dir():
+        config = load_config(file, arguments.set)
+    else:
+        config = recorded_alike(file, saved, arguments.set)
+    check_assignments(arguments.set, saved)
+    return config
+
+
+def add_merge(commands: Commands) -> None:
+    """Registers the command."""
+    merge = commands.add(
+        "merge", _merge, "make one map of the sessions in several",
+        "merge runs/monday runs/tuesday -o runs/both", "maps",
+    )  # fmt: skip
+    merge.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="run directories or map files")
+    merge.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="MAP",
+        help="the new map: a file that ends in .npz, or a folder for it with its trajectory and graph",
+    )  # fmt: skip
+    merge.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _merge(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.runs.merge import merge_maps
+
+    report = merge_maps(arguments.maps, arguments.output, tell)
+    print(json.dumps(report.to_json(), indent=2) if arguments.json else report.describe())
+    return 0
+
+
+Place = tuple[float, float] | int
+"""A point x, y (m) or the number of an experience."""
+NO_WAY = 1
+"""Exit code where no way joins start and goal."""
+
+
+def add_path(commands: Commands) -> None:
+    """Registers the commands of this module."""
+    path = commands.add(
+        "path", _path, "find the way on a saved map", "path runs/square --from here --to -0.1,0.8", "maps"
+    )
+    path.add_argument("map", type=Path, metavar="MAP", help="run directory, or its map.npz")
+    path.add_argument(
+        "--from", dest="start", default="here", metavar="X,Y|EXPERIENCE|here",
+        help="start: a point, m, such as -0.1,0.2, an experience, or the map's last pose (default)",
+    )  # fmt: skip
+    path.add_argument(
+        "--to", dest="goal", required=True, metavar="X,Y|EXPERIENCE",
+        help="goal: a point, m, such as -0.1,0.2, or an experience; the way ends at the first experience "
+        "within 0.02 m of it, at any heading",
+    )  # fmt: skip
+    path.add_argument(
+        "--mode", choices=("time", "temporal"), default="time",
+        help="least expected time (default), or RatSLAM's goal temporal map",
+    )  # fmt: skip
+    path.add_argument(
+        "-o", "--output", type=Path, metavar="PNG", check=_require_new_picture,
+        help="draw the way to a new file",
+    )  # fmt: skip
+    path.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _path(arguments: argparse.Namespace) -> int:
+    start = None if arguments.start == "here" else read_place(arguments.start, "--from")
+    goal = read_place(arguments.goal, "--to")
+    prepare_jax()
+    from ratslam.places.route import NoWay
+    from ratslam.runs.goal_planner import draw_map_way, find_map_way
+    from ratslam.runs.saved_map import read_map
+
+    saved = read_map(arguments.map, tell)
+    made = saved.open_session().map
+    try:
+        way = find_map_way(made, saved, start, goal, arguments.mode)
+    except NoWay as error:
+        print(f"ratslam: no way: {error}", file=sys.stderr)
+        return NO_WAY
+    if arguments.output is not None:
+        draw_map_way(arguments.output, made, saved, way)
+    content = way._asdict() | {"poses": way.poses.tolist()}
+    print(json.dumps(content) if arguments.json else render_way(way, goal))
+    return 0
+
+
+def render_way(way: Way, goal: Place) -> str:
+    """A way to a goal as text."""
+    places = way.experiences
+    lines = [
+        f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
+    ]
+    if not isinstance(goal, int):
+        apart = math.dist(way.poses[-1][:2], goal)
+        lines.append(f"ends {apart:.2f} m from {goal[0]:g},{goal[1]:g}")
+    elif places[-1] != goal:
+        lines.append(f"ends at {places[-1]}, which is so near to {goal} that it counts as the same place")
+    lines.append(
+        f"expected {way.expected:.0f} s, as a link may be blocked: one driven n times before is counted as "
+        "free with probability (n + 1) / (n + 2)"
+    )
+    return "\n".join(lines)
+
+
+def read_place(text: str, where: str) -> Place:
+    """The place of a text.
+
+    Raises:
+        InputError: it is not a place.
+    """
+    try:
+        if "," not in text:
+            return int(text)
+        x, y = map(float, text.split(","))
+        if math.isfinite(x) and math.isfinite(y):
+            return x, y
+    except ValueError:
+        pass
+    raise InputError(where, repr(text), "X,Y in m (finite numbers), or the number of an experience")
+
+
+def _require_new_picture(path: Path) -> None:
+    if path.suffix.lower() != ".png":
+        raise InputError(f"-o {path}", "not the name of a picture", "a new file that ends in .png")
+    require_new_file(path)

@@ -1,4 +1,9 @@
-"""The command tools, of what is seldom needed: recover, convert, schema, version, completion."""
+"""The command tools, of what is seldom needed: recover, convert, schema, version, completion.
+
+The command check: conformance checks of registered parts.
+
+The command export.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +11,21 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands
+from ratslam.cli.common import Commands, positive_integer, prepare_jax
 from ratslam.runs.settings import SCHEMA_START
-from tactile.base.atomic_write import write_text_atomically
-from tactile.base.new_file import make_new_file, require_new_file
+from tactile.base.errors import tell
+from tactile.base.files import make_new_file, require_new_file, write_text_atomically
+
+if TYPE_CHECKING:
+    from ratslam.service.check_results import Result
 
 
-def add_commands(commands: Commands) -> None:
+def add_tools(commands: Commands) -> None:
     """Registers `tools` with its commands."""
     help = "repair recordings, convert settings, complete commands"
     tools = Commands(commands.add("tools", None, help, "tools version", "files"))
@@ -113,3 +123,128 @@ def _completion(arguments: argparse.Namespace) -> int:
 
     print(shtab.complete(arguments.program, arguments.shell))
     return 0
+
+
+FAILED = 1
+"""Exit code if a check failed."""
+
+
+def add_check(commands: Commands) -> None:
+    """Registers `check` with a command for each kind of part."""
+    check = commands.add(
+        "check", None, "check a backend, source, touch front end or metric", "check backend recall", "files"
+    )
+    kinds = Commands(check)
+    backend = kinds.add("backend", _backend, "check a SLAM method", "check backend recall")
+    source = kinds.add("source", _source, "check a source or recording format", "check source my_robot")
+    touch = kinds.add("touch", _touch, "check a touch front end", "check touch my_taxels --source my_array")
+    metric = kinds.add("metric", _metric, "check a metric", "check metric my_error")
+    for parser in (backend, source, touch, metric):
+        parser.add_argument("name", metavar="NAME", help="name under which it is registered")
+        parser.add_argument(
+            "--set", action="append", default=[], metavar="settings.a=value",
+            help="replace a setting of it; may be repeated",
+        )  # fmt: skip
+    source.add_argument(
+        "--touch", metavar="NAME",
+        help="front end for readings that are not observations; its settings by --set touch.a=value",
+    )  # fmt: skip
+    source.add_argument(
+        "--samples", type=positive_integer, metavar="N", help="samples to examine (default 4096)"
+    )
+    touch.add_argument(
+        "--source", metavar="NAME",
+        help="registered source of its readings, its settings by --set source.a=value (default: a simulated "
+        "whisker head)",
+    )  # fmt: skip
+
+
+def _backend(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.service.backend_checks import check_backend
+
+    tell("the checks take a minute or two, and several on a busy machine")
+
+    return _report(arguments, check_backend(arguments.name, arguments.set))
+
+
+def _source(arguments: argparse.Namespace) -> int:
+    from ratslam.service.source_checks import SAMPLES, check_source
+
+    most = arguments.samples or SAMPLES
+    return _report(arguments, check_source(arguments.name, arguments.set, arguments.touch, most))
+
+
+def _touch(arguments: argparse.Namespace) -> int:
+    from ratslam.service.touch_checks import check_touch
+
+    return _report(arguments, check_touch(arguments.name, arguments.set, arguments.source))
+
+
+def _metric(arguments: argparse.Namespace) -> int:
+    from ratslam.service.metric_checks import check_metric
+
+    return _report(arguments, check_metric(arguments.name, arguments.set))
+
+
+def _report(arguments: argparse.Namespace, results: Iterator[Result]) -> int:
+    statuses = []
+    for result in results:
+        statuses.append(result.status)
+        print(result.line(), flush=True)
+    failed, skipped = statuses.count("FAIL"), statuses.count("-")
+    rest = f", {skipped} not run" if skipped else ""
+    print(f"{arguments.name}: {len(statuses)} checks, {failed} failed{rest}")
+    return FAILED if failed else 0
+
+
+def add_export(commands: Commands) -> None:
+    """Registers the command of this module."""
+    export = commands.add(
+        "export", _export, "write a run as a standard file",
+        "export runs/square -o runs/square.mcap", "files",
+    )  # fmt: skip
+    export.add_argument("run", type=Path, metavar="RUN", help="the run directory")
+    export.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE",
+        help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
+        "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells, .csv their scores; a name "
+        "without a suffix becomes a ROS 2 bag folder",
+    )  # fmt: skip
+    export.add_argument(
+        "--peak-rate", type=_rate, default=20.0, metavar="HZ",
+        help="cells: rate of a cell at the peak of a settled packet (default 20 Hz)",
+    )  # fmt: skip
+    export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from ratslam.service.export_formats import export_run
+    from ratslam.service.spikes import SpikeConfig
+
+    export_run(
+        arguments.run,
+        arguments.output,
+        lambda text: tell(f"warning: {text}"),
+        SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
+    )
+    print(f"{arguments.output}: written")
+    return 0
+
+
+def _rate(text: str) -> float:
+    """Argument type of a rate in Hz."""
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0")
+    return rate
+
+
+def _seed(text: str) -> int:
+    """Argument type of a seed."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} must be an integer from 0 on")
+    return int(text)

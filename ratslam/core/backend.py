@@ -3,6 +3,8 @@
 A backend is a pure kernel and a map that folds the kernel's results. The kernel has no access to the map and
 the map none to the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. The only
 feedback of the map to the kernel is a plain record, applied to the state at fixed step counts.
+
+The smallest map: the path of a backend's own estimates.
 """
 
 from __future__ import annotations
@@ -14,12 +16,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Estimate, GridDrawing, PoseCellActivity
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
 if TYPE_CHECKING:
     import networkx
+
 
 State = Any
 """A pytree of arrays of fixed shapes and dtypes."""
@@ -229,3 +234,23 @@ def enlarge(rows: Any, empty: Any) -> Any:
         return old if old.shape == new.shape else new.at[tuple(slice(0, n) for n in old.shape)].set(old)
 
     return jax.tree.map(fill, rows, empty)
+
+
+class PathMap(Checkpointed, Map):
+    """A map for backends that estimate the pose in the map frame and have no graph."""
+
+    def __init__(self) -> None:
+        self._pose = GrowableArray((3,), np.float64)
+
+    def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
+        """Adds the pose of a step."""
+        self._pose.append(estimate.pose)
+        return estimate
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] the estimates of all steps."""
+        return self._pose.rows.copy()
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """None."""
+        return {}

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.arrays import GrowableArray
 
 
 class Checkpointed:

@@ -4,6 +4,8 @@ Live and replay run the same compiled function over a chunk of fixed length with
 one observation, replay up to `CHUNK`, and both give the same bits. At the start of a chunk the capacity grows
 to a power of two that depends only on the rows in use, the kernel follows the map where rows of its memory
 are merged or restored, and it takes over the map's feedback.
+
+Observations without values that are NaN or infinite.
 """
 
 from __future__ import annotations
@@ -18,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.core.arrays import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.backend import Backend, Evidence, Map, State
 from ratslam.core.checkpoint import with_prefix
+from ratslam.core.compilation import Precision, check_precision
 from ratslam.core.estimates import Estimate
-from ratslam.core.packing import Layout, PackedRecords, allocate, layout_of
-from ratslam.core.precision import Precision, check_precision
 from tactile.base.errors import InputError
-from tactile.base.types import Observation
+from tactile.base.types import Array, Observation, Odometry
 
 CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
@@ -90,7 +92,7 @@ class Session:
 
     Raises:
         InputError: the state would take more than `MOST_STATE`.
-        ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.precision`).
+        ValueError: `precision` is float64 and JAX's 64-bit types are disabled (`ratslam.core.compilation`).
     """
 
     def __init__(
@@ -331,3 +333,20 @@ def _loop(kernel: Any, state: Any, chunk: PackedRecords) -> tuple[Any, PackedRec
 
     _, *output = jax.eval_shape(kernel, state, jax.eval_shape(chunk.at, jnp.int32(0)))
     return body, allocate(layout_of(tuple(output)), CHUNK, jnp.zeros)
+
+
+def finite_values(dtype: np.dtype, observation: Observation) -> tuple[Odometry, Array, Array, Array]:
+    """The odometry and view of an observation in this precision; a value that is not finite zeroes the whole
+    motion or the whole view.
+
+    Returns:
+        odometry; view [R, C, K]; bool: the view was finite; bool: nothing was masked.
+    """
+    odometry = Odometry(*(jnp.asarray(value, dtype) for value in observation.odometry))
+    moves = jnp.stack(odometry[:3])
+    fine = jnp.all(jnp.isfinite(moves))
+    dx, dy, dtheta = jnp.where(fine, moves, 0.0)
+    view = jnp.asarray(observation.view, dtype)
+    visible = jnp.all(jnp.isfinite(view))
+    clean = fine & (visible | ~observation.view_seen)
+    return Odometry(dx, dy, dtheta, odometry.dt), jnp.where(visible, view, 0.0), visible, clean

@@ -11,10 +11,10 @@ from evaluation.cells.head_direction import mean_vector_length
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import arena_edges, bin_activity
 from evaluation.plots.cell_plot import draw_cells, map_sums
-from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.core.precision import prepare_precision
-from ratslam.service.rats.driven_network import DrivenNetwork
-from robot.simulation.rat.rat_odometry import RatOdometryConfig
+from ratslam.classic.config import NetworkConfig
+from ratslam.core.compilation import prepare_precision
+from ratslam.service.rat_agents import DrivenNetwork
+from robot.simulation.rat.rat_path import RatOdometryConfig
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 
 CELLS = 529 + np.arange(6) * 2690  # of 36 x 21 x 21 over heading, y, x

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import ratslam
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, PathMap
 from ratslam.core.estimates import Action, Estimate, Scalar
-from ratslam.core.finite_values import finite_values
-from ratslam.core.path_map import PathMap
+from ratslam.core.session import finite_values
 from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
 from tactile.base.se2 import compose
 from tactile.base.settings import Settings

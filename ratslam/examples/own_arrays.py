@@ -13,9 +13,7 @@ from pydantic import PositiveInt
 import ratslam
 from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import from_velocities
-from robot.sources.source import Source
-from robot.sources.source_info import SourceInfo
-from robot.sources.source_registry import SOURCES, SourceEntry
+from robot.sources.source import SOURCES, Source, SourceEntry, SourceInfo
 from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
 

@@ -13,9 +13,9 @@ from matplotlib.patches import Rectangle
 
 from evaluation.plots.style import BLUE, GREY, INK, add_axes, add_legend, name_axes, new_figure
 from ratslam.classic import pose_cells
+from ratslam.classic.config import NetworkConfig
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Odometry
 

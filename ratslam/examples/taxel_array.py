@@ -11,7 +11,7 @@ from pydantic import PositiveFloat, PositiveInt
 import ratslam
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.examples import own_arrays
-from robot.sources.source_registry import SOURCES
+from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH, TouchEntry
 from tactile.base.se2 import compose
 from tactile.base.settings import Settings

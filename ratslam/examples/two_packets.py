@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.classic import pose_cells
+from ratslam.classic.config import NetworkConfig
 from ratslam.classic.levels import to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 from tactile.base.types import Odometry
 
 WEAK, STRONG, STEPS = 0.005, 0.05, 25

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from evaluation.plots.style import BLUE, GREY, add_axes, name_axes, new_figure
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 
 LENGTH, STEP, PIXELS = 10.0, 0.1, 24  # m, m, columns of a view
 CONFIG = TemplateConfig(threshold=0.06)

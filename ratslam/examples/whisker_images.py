@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import INK, add_axes, name_axes, new_figure
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import open_observations, read_observations
 
 WHISKS, SHOWN = 120, (0, 4, 8, 12, 16, 20)
 

@@ -1,4 +1,16 @@
-"""Localisation of a session in a finished grid map, which does not change."""
+"""Localisation of a session in a finished grid map, which does not change.
+
+The search for a session in a finished grid map: supposed poses as particles, from anywhere in the map.
+
+Global localisation by particles is Fox et al. 1999 and Thrun et al. 2001. That the session is in the map at
+all is judged beside them, by odds against the best pose in another place that looks alike.
+
+How much a report speaks for a supposed pose in a finished map.
+
+Reports were counted in arenas 100 to 119: at the true poses of sessions in the map of their arena, and at the
+best of the four poses at which the walls of *another* arena fit, as `Expectation` classes them. The classes
+are in shares of a whisker's length, so the counts do not depend on its size. The method is ours.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +18,29 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.estimates import Action, Estimate, GridDrawing
-from ratslam.core.localisation import Localisation, LocalisedCourse, LocalisedPose, pieces_of
-from tactile.base.types import Observation
+from ratslam.core.estimates import (
+    Action,
+    Estimate,
+    GridDrawing,
+    Localisation,
+    LocalisedCourse,
+    LocalisedPose,
+    Scalar,
+    pieces_of,
+)
+from ratslam.grid import particles
+from ratslam.grid.config import GridConfig
+from ratslam.grid.contact_features import ContactFeatures
+from ratslam.grid.expectation import CLASSES, CROSSINGS, TIPS, Expectation
+from ratslam.grid.particles import Particles
+from tactile.base.types import Array, Observation, Odometry
 
 UNEXPLAINED = 4
 """The session is not in the map if this many searches in a row have failed."""
@@ -142,3 +170,230 @@ class GridLocaliser(Checkpointed, Map):
 
 def _chance(log_odds: float) -> float:
     return float(1 / (1 + np.exp(-np.clip(log_odds, -700, 700))))
+
+
+REPEATED = 0.5
+"""Weight of what reports repeat, free whiskers and the robot's body, against new contacts and walls."""
+TEMPER = 0.6
+"""Weight of all of it where supposed poses compete: the map is wrong alike for many reports."""
+SPREAD, TURN = 0.12, 0.01
+"""Displacement of a copy: standard deviation in cells of the map, and rad."""
+MIN_EFFECTIVE = 0.5
+"""Effective particles, as a share of all, below which they are resampled."""
+BIN, BINS_AROUND = 2.0, 12
+"""Bins in which the best cluster is looked for: side in cells of the map, and number of headings."""
+NEAR, NEAR_HEADING = 3.0, 0.5
+"""Poses that are the same: within this distance, cells of the map, and this difference in heading, rad."""
+
+
+class Supposed(NamedTuple):
+    """N supposed poses.
+
+    Attributes:
+        swarm: the particles. odds: [N] log-odds of the session being there, on its own way, against the most
+            alike place elsewhere. best: [N] their largest value on that way.
+    """
+
+    swarm: Particles
+    odds: Array
+    best: Array
+
+
+class Cluster(NamedTuple):
+    """The supposed poses that are the same as the most likely one.
+
+    Attributes:
+        pose: [3] their mean, m, m, rad. covariance: [3, 3]. share: of all weights. log_odds: mean of their
+            log-odds. fall: by how much these are below their best.
+    """
+
+    pose: Array
+    covariance: Array
+    share: Scalar
+    log_odds: Scalar
+    fall: Scalar
+
+
+class Search:
+    """Particles in a finished map.
+
+    Args:
+        free: [n, 2] middles of the cells of `expected` in which the robot may stand, m. count: N, number of
+            particles.
+    """
+
+    def __init__(
+        self,
+        config: GridConfig,
+        expected: Expectation,
+        agreement: Agreement,
+        free: np.ndarray,
+        count: int,
+        dtype: np.dtype,
+    ) -> None:
+        self.config, self.expected, self.count, self.dtype = config, expected, count, dtype
+        self.agreement = Agreement(*(values.astype(dtype) for values in agreement))
+        self._free, self._cell = free.astype(dtype), expected.cell
+        jitter = {"length": SPREAD * config.cell, "heading": TURN}
+        self._resampling = config.resampling.model_copy(update=jitter)
+        self._extent = expected.side * expected.cell
+
+    def places(self) -> float:
+        """Number of poses that can be told apart."""
+        return self.expected.places(len(self._free), NEAR * self.config.cell, NEAR_HEADING)
+
+    def begin(self, key: Array) -> Supposed:
+        """Supposed poses at random poses in all free cells."""
+        errors, places, turns = jax.random.split(key, 3)
+        cell = (jnp.arange(self.count) * len(self._free)) // self.count
+        off = jax.random.uniform(places, (self.count, 2), self.dtype, -0.5, 0.5) * self._cell
+        heading = jax.random.uniform(turns, (self.count, 1), self.dtype, -np.pi, np.pi)
+        pose = jnp.concatenate([jnp.asarray(self._free)[cell] + off, heading], axis=1)
+        return self._suppose(errors, pose, 0.0)
+
+    def begin_at(self, key: Array, pose: np.ndarray, odds: float) -> Supposed:
+        """Supposed poses about one [3], with standard deviations of a cell and of half the same heading, and
+        with log-odds to begin with."""
+        errors, places = jax.random.split(key)
+        spread = jnp.array([self.config.cell, self.config.cell, NEAR_HEADING / 2], self.dtype)
+        draws = lax.optimization_barrier(jax.random.normal(places, (self.count, 3), self.dtype))
+        at = jnp.asarray(pose, self.dtype)[None] + spread[None] * draws
+        return self._suppose(errors, at, odds)
+
+    def _suppose(self, key: Array, pose: Array, odds: float) -> Supposed:
+        swarm = particles.start(self.config.drift, key, self.count, self.dtype)._replace(pose=pose)
+        begun = jnp.full(self.count, odds, self.dtype)
+        return Supposed(swarm, begun, begun)
+
+    def move(
+        self, known: Supposed, odometry: Odometry, changed: Array, key: Array, pressed: Array
+    ) -> Supposed:
+        """The supposed poses after an odometry reading; see `particles.move`."""
+        swarm = particles.move(self.config.drift, known.swarm, odometry, changed, key, pressed)
+        return known._replace(swarm=swarm)
+
+    def weigh(self, known: Supposed, features: ContactFeatures, touched: Array) -> tuple[Supposed, Array]:
+        """The supposed poses weighed by a report, and whether all weights vanished.
+
+        Args:
+            touched: [W] bool, whiskers in contact at the report before.
+        """
+        agreement, pose = self.agreement, known.swarm.pose
+        seen = self.expected.whisker_classes(pose)
+        free = features.free & ~touched & ~features.turning
+        wall = self.expected.wall_classes(pose, features.on_wall, features.direction)
+        body = jnp.asarray(agreement.body)[self.expected.body_classes(pose)]
+
+        def total(whisker: np.ndarray, walls: np.ndarray) -> Array:
+            met = jnp.where(features.new[None], jnp.asarray(whisker[CONTACT])[seen], 0)
+            passed = jnp.where(free[None], REPEATED * jnp.asarray(whisker[FREE])[seen], 0)
+            return jnp.sum(met + passed, axis=1) + jnp.where(features.wall, jnp.asarray(walls)[wall], 0)
+
+        likelihood = TEMPER * total(agreement.whisker, agreement.wall)
+        likelihood += jnp.where(features.valid, TEMPER * REPEATED * body, 0)
+        swarm, vanished = particles.weigh(known.swarm, likelihood)
+        odds = known.odds + total(agreement.odds, agreement.wall_odds)
+        return Supposed(swarm, odds, jnp.maximum(known.best, odds)), vanished
+
+    def resample(self, known: Supposed, key: Array) -> tuple[Supposed, Array, Array]:
+        """The supposed poses, resampled if few are effective; the effective number, and whether they were."""
+        share = particles.normalised_weights(known.swarm.weight)
+        worth = particles.effective_count(share)
+        pick, jitter = jax.random.split(key)
+        needed = worth < MIN_EFFECTIVE * self.count
+
+        def draw() -> Supposed:
+            drawn = particles.resample(self._resampling, share, pick)
+            swarm = particles.copy_particles(self._resampling, known.swarm, drawn, jitter)
+            return Supposed(swarm, known.odds[drawn.ancestor], known.best[drawn.ancestor])
+
+        return lax.cond(needed, draw, lambda: known), worth, needed
+
+    def best_cluster(self, known: Supposed) -> Cluster:
+        """The most likely pose and those near it."""
+        share, pose = particles.normalised_weights(known.swarm.weight), known.swarm.pose
+        side = BIN * self.config.cell
+        across = int(np.ceil(self._extent / side))
+        turn = 2 * np.pi / BINS_AROUND
+        column, row = jnp.clip(
+            jnp.floor((pose[:, :2] + self._extent / 2) / side).astype(jnp.int32), 0, across - 1
+        ).T
+        heading = jnp.floor(pose[:, 2] / turn).astype(jnp.int32) % BINS_AROUND
+        index = (row * across + column) * BINS_AROUND + heading
+        binned = jnp.zeros(across * across * BINS_AROUND, self.dtype).at[index].add(share)
+        most = lax.argmax(binned, 0, np.int32)
+        within = jnp.where(index == most, share, 0.0)
+        mean, _ = particles.weighted_mean(pose, within / jnp.sum(within))
+        for _ in range(2):
+            within = jnp.where(self._same(pose, mean), share, 0.0)
+            total = jnp.sum(within)
+            mean, _ = particles.weighted_mean(pose, within / jnp.maximum(total, 1e-12))
+        off = pose - mean[None]
+        off = off.at[:, 2].add(-2 * np.pi * jnp.round(off[:, 2] / (2 * np.pi)))
+        part = within / jnp.maximum(total, 1e-12)
+        covariance = jnp.sum(part[:, None, None] * off[:, :, None] * off[:, None, :], axis=0)
+        return Cluster(
+            mean, covariance, jnp.minimum(total, 1.0), part @ known.odds, part @ (known.best - known.odds)
+        )
+
+    def _same(self, pose: Array, mean: Array) -> Array:
+        turned = pose[:, 2] - mean[2]
+        turned -= 2 * np.pi * jnp.round(turned / (2 * np.pi))
+        apart = jnp.hypot(pose[:, 0] - mean[0], pose[:, 1] - mean[1])
+        return (apart < NEAR * self.config.cell) & (jnp.abs(turned) < NEAR_HEADING)
+
+
+PRIOR = 3.0
+"""Reports in each class before any were counted."""
+FREE, CONTACT = 0, 1
+"""Rows of `WhiskerCounts`: a free whisker, a new contact."""
+_TRUE = [
+    [[2, 12, 44], [14, 13, 303], [1, 4, 880], [72, 68, 685], [951, 73, 34], [9449, 175, 57]],
+    [[0, 1, 16], [0, 0, 330], [0, 0, 107], [0, 0, 5], [0, 0, 1], [0, 7, 0]],
+]
+_ALIKE = [
+    [[67, 296, 546], [28, 39, 934], [6, 14, 1625], [163, 149, 1185], [1937, 125, 57], [19245, 543, 95]],
+    [[0, 43, 80], [0, 2, 469], [0, 0, 233], [1, 3, 47], [12, 3, 1], [43, 26, 7]],
+]
+"""Free whiskers and new contacts [2, CROSSINGS, TIPS] at true poses, and at poses in another arena."""
+_TRUE_WALLS, _ALIKE_WALLS = [304, 4, 0, 0, 4, 24], [494, 42, 19, 1, 18, 124]
+"""Walls by the difference of their direction."""
+_TRUE_BODY = [5684, 16, 0, 0]
+_DRIVEN_BODY = [0.97, 0.01, 0.01, 0.01]
+"""Bodies at true poses, and the shares of the classes anywhere on driven ground."""
+
+
+class Agreement(NamedTuple):
+    """Log-likelihoods of a report's parts by class.
+
+    Attributes:
+        whisker: [2, CLASSES] of a free whisker and of a new contact at a true pose. wall: [WALL_CLASSES].
+            body: [4], less those anywhere. odds, wall_odds: as `whisker` and `wall`, less those at an alike
+            pose elsewhere.
+    """
+
+    whisker: np.ndarray
+    wall: np.ndarray
+    body: np.ndarray
+    odds: np.ndarray
+    wall_odds: np.ndarray
+
+
+def counted_agreement() -> Agreement:
+    """The log-likelihoods as counted."""
+    true, alike = (_chances(np.array(counts, float)) for counts in (_TRUE, _ALIKE))
+    wall, other = (_shares(np.array(counts, float)) for counts in (_TRUE_WALLS, _ALIKE_WALLS))
+    body = _shares(np.array(_TRUE_BODY, float)) - np.log(_DRIVEN_BODY)
+    return Agreement(true, wall, body, true - alike, wall - other)
+
+
+def _chances(counts: np.ndarray) -> np.ndarray:
+    """[2, CLASSES] logarithms of the chances of no contact and of a contact."""
+    assert counts.shape == (2, CROSSINGS, TIPS)
+    counts = counts.reshape(2, CLASSES)
+    counts = counts + PRIOR * counts.sum(axis=1, keepdims=True) / counts.sum()
+    return np.log(counts / counts.sum(axis=0))
+
+
+def _shares(counts: np.ndarray) -> np.ndarray:
+    return np.log((counts + 1) / (counts + 1).sum())

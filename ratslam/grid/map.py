@@ -1,22 +1,148 @@
-"""The map of the grid filter: the mean path of the surviving particles, and contacts drawn along it."""
+"""The map of the grid filter: the mean path of the surviving particles, and contacts drawn along it.
+
+The map drawn from contacts along a path (Fox et al. 2012, II-E and II-F).
+
+A wall of known direction is drawn as an edge (eq. 4), other contacts as blobs (eq. 3). Each footprint is a
+probability that tends to 0.5 far away, where eq. 3 and 4 as printed tend to 0 and would erase the map;
+footprints are added as log-odds.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import expit, logit
 
+from ratslam.core.arrays import GrowableArray
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Estimate, GridDrawing
-from ratslam.core.growable_array import GrowableArray
-from ratslam.grid.config import GridConfig
-from ratslam.grid.genealogy import Genealogy
-from ratslam.grid.map_drawing import ContactLog, contact_log, draw_occupancy
-from tactile.base.types import Observation
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from ratslam.grid.config import DrawingConfig, GridConfig
+from ratslam.grid.particles import Genealogy
+from tactile.base.se2 import compose
+from tactile.base.types import MotionKind, Observation
+from tactile.whisker_geometry import PlanarWhiskers
+
+FAR = 3.0
+"""Standard deviations beyond which a footprint is 0."""
+
+
+class ContactLog(NamedTuple):
+    """Contacts of T reports with W whiskers.
+
+    Attributes:
+        valid: [T] bool, the report counts as evidence. contact, free: [T, W] bool. turning: [T] bool. point:
+            [T, W, 2] contacts in base_link, m. wall: [T, 2] nearest point of the wall in base_link, m; NaN
+            where unknown.
+    """
+
+    valid: np.ndarray
+    contact: np.ndarray
+    free: np.ndarray
+    turning: np.ndarray
+    point: np.ndarray
+    wall: np.ndarray
+
+
+def contact_log(
+    motion: np.ndarray, contact: np.ndarray, alive: np.ndarray, point: np.ndarray, wall: np.ndarray
+) -> ContactLog:
+    """The log of T reports: motion [T], contact and alive [T, W], point [T, W, 2], wall [T, 2].
+
+    A contact without a finite point is dropped, and its whisker does not count as free.
+    """
+    valid = motion != MotionKind.BACK
+    counts = alive & valid[:, None]
+    finite = np.isfinite(point).all(axis=2)
+    turning = motion == MotionKind.TURN
+    return ContactLog(valid, contact & counts & finite, ~contact & counts, turning, point, wall)
+
+
+class _Footprint(NamedTuple):
+    """Centre [2] in m, probability there, standard deviation in m, and a wall's direction in rad or NaN."""
+
+    place: np.ndarray
+    chance: float
+    sd: float
+    direction: float
+
+
+def draw_occupancy(
+    config: GridConfig, whiskers: PlanarWhiskers, side: int, path: np.ndarray, log: ContactLog
+) -> np.ndarray:
+    """[S, S] probability of an obstacle in each cell.
+
+    Args:
+        side: S, cells. path: [T, 3] pose at each report, relative to the middle of the map.
+    """
+    drawing, cell, most = config.drawing, config.cell, config.drawing.max_log_odds
+    evidence = np.zeros((side, side))
+    for footprint in _footprints(drawing, config.body, whiskers, path, log):
+        reach = FAR * (drawing.edge_sd if np.isfinite(footprint.direction) else footprint.sd)
+        place = footprint.place / cell + (side - 1) / 2
+        low = np.clip(np.ceil(place - reach / cell), 0, side).astype(int)
+        high = np.clip(np.floor(place + reach / cell) + 1, 0, side).astype(int)
+        across, up = (np.arange(low[k], high[k]) * cell - place[k] * cell for k in (0, 1))
+        chance = 0.5 + (footprint.chance - 0.5) * _shape(drawing, footprint, across[None, :], up[:, None])
+        rows = slice(low[1], high[1]), slice(low[0], high[0])
+        evidence[rows] = np.clip(evidence[rows] + logit(chance), -most, most)
+    return expit(evidence + logit(config.prior))
+
+
+def _shape(config: DrawingConfig, footprint: _Footprint, across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    away = across**2 + up**2
+    if not np.isfinite(footprint.direction):
+        return np.exp(-away / (2 * footprint.sd**2))
+    # Direction from the contact modulo pi, so that the edge extends both ways.
+    off = np.mod(np.arctan2(up, across) - footprint.direction + np.pi / 2, np.pi) - np.pi / 2
+    off = np.where(away > 0, off, 0.0)
+    return np.exp(-away / (2 * config.edge_sd**2) - off**2 / (2 * config.edge_sector**2))
+
+
+def _footprints(
+    config: DrawingConfig, body: float, whiskers: PlanarWhiskers, path: np.ndarray, log: ContactLog
+) -> list[_Footprint]:
+    """All footprints in order of time; a contact's blob gives way to a later edge of its wall."""
+    middles = whiskers.points(np.array([0.5]))[:, 0]
+    made: list[_Footprint] = []
+    before = np.zeros(log.contact.shape[1], bool)
+    pending: list[_Footprint] = []
+    for k, pose in enumerate(path):
+        contact = log.contact[k]
+        if not log.valid[k]:
+            made += pending
+            pending, before = [], np.zeros_like(before)
+            continue
+        made += [_Footprint(_at(pose, p), config.free, config.free_sd, np.nan) for p in middles[log.free[k]]]
+        if body:
+            made.append(_Footprint(pose[:2], config.body, body, np.nan))
+        if not contact.any():
+            made += pending
+            pending = []
+        new = log.point[k][contact & ~before & ~log.turning[k]]
+        pending += [_Footprint(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in new]
+        distance = np.hypot(*log.wall[k])
+        if np.isfinite(distance) and distance > 1e-6 and contact.any():
+            pending = []
+            made.append(_edge(config, pose, log.wall[k], log.point[k][contact].mean(axis=0)))
+        before = contact
+    return made + pending
+
+
+def _edge(config: DrawingConfig, pose: np.ndarray, foot: np.ndarray, middle: np.ndarray) -> _Footprint:
+    """The edge of a wall with its nearest point at `foot` [2] and contacts around `middle` [2], base_link."""
+    distance = np.hypot(*foot)
+    normal = foot / distance
+    place = _at(pose, middle + normal * (distance - normal @ middle))
+    direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
+    return _Footprint(place, config.contact, config.blob_sd, float(direction))
+
+
+def _at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    return compose(pose, np.array([*point, 0.0]))[:2]
 
 
 class GridMap(Checkpointed, Map):

@@ -2,6 +2,15 @@
 
 Each particle carries estimates of the odometry's errors: scale errors constant over the session, scale errors
 constant over a movement, and a heading drift constant over the session.
+
+The genealogy of particles: the paths of the ancestors of the particles that survived.
+
+Memory is bounded: of more than `MAX_POSES` poses, the older half is replaced by the weighted mean path.
+
+The maps of N particles, read and written through small windows, so that work is independent of map size.
+
+A map holds evidence (log-odds, 0 where unexplored) and a vector field of doubled wall directions. Places are
+in cells. Cells outside the map always count as unexplored.
 """
 
 from __future__ import annotations
@@ -10,8 +19,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.grid.config import DriftConfig, ResamplingConfig
 from tactile.base.types import Array, Odometry
 
@@ -196,3 +208,126 @@ def weighted_mean(pose: Array, share: Array) -> tuple[Array, Array]:
     length = jnp.clip(jnp.hypot(c, s), 1e-12, 1.0)
     heading = jnp.sqrt(-2 * jnp.log(length))
     return jnp.append(middle, jnp.arctan2(s, c)), jnp.append(spread, heading)
+
+
+MAX_POSES = 4_000_000
+"""Poses stored for individual particles."""
+
+
+class Genealogy(Checkpointed):
+    """Poses and ancestors of N particles at each report."""
+
+    VALUES = ("_weight",)
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._settled = GrowableArray((3,), np.float64)
+        self._ancestor = GrowableArray((count,), np.int32)
+        self._pose = GrowableArray((count, 3), np.float64)
+        self._weight = np.full(count, 1.0 / count)
+
+    def __len__(self) -> int:
+        return len(self._settled.rows) + len(self._pose.rows)
+
+    def append(self, poses: np.ndarray, weights: np.ndarray, ancestor: np.ndarray) -> None:
+        """Adds a report: poses [N, 3], normalised weights [N], and the next ancestors [N]."""
+        self._pose.append(poses)
+        self._ancestor.append(ancestor)
+        self._weight = np.asarray(weights, float)
+        if len(self._pose.rows) * self.count > MAX_POSES and len(self._pose.rows) > 1:
+            self._settle(len(self._pose.rows) // 2)
+
+    def path(self) -> np.ndarray:
+        """[T, 3] the weighted mean of the ancestral paths of the present particles."""
+        return np.concatenate([self._settled.rows, self._mean_path()])
+
+    def _mean_path(self) -> np.ndarray:
+        pose, ancestor = self._pose.rows, self._ancestor.rows
+        path = np.zeros((len(pose), 3))
+        here = np.arange(self.count)
+        for k in range(len(pose) - 1, -1, -1):
+            if k + 1 < len(pose):
+                here = ancestor[k][here]
+            path[k] = _mean(pose[k][here], self._weight)
+        return path
+
+    def _settle(self, reports: int) -> None:
+        for pose in self._mean_path()[:reports]:
+            self._settled.append(pose)
+        self._pose.replace(self._pose.rows[reports:].copy())
+        self._ancestor.replace(self._ancestor.rows[reports:].copy())
+
+
+def _mean(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    heading = np.arctan2(weight @ np.sin(pose[:, 2]), weight @ np.cos(pose[:, 2]))
+    return np.array([*(weight @ pose[:, :2]), heading])
+
+
+EVIDENCE, COSINE, SINE = 0, 1, 2
+LAYERS = 3
+
+
+class Windows(NamedTuple):
+    """One window per particle: corner [N, 2] int32, first column and row, and size in cells."""
+
+    corner: Array
+    size: int
+
+
+def empty_maps(count: int, side: int, dtype: jnp.dtype) -> Array:
+    """[N, layers, side, side] empty maps; rows are y, columns x."""
+    return jnp.zeros((count, LAYERS, side, side), dtype)
+
+
+def to_cells(point: Array, cell: float, side: int) -> Array:
+    """[..., 2] positions in m as places in cells, from the middle of the first cell."""
+    return point / cell + (side - 1) / 2
+
+
+def windows_around(place: Array, side: int, size: int) -> Windows:
+    """Windows of `size` x `size` cells around places [N, 2] in cells, moved to lie inside the map."""
+    size = min(size, side)
+    corner = jnp.floor(place).astype(jnp.int32) - (size // 2 - 1)
+    return Windows(jnp.clip(corner, 0, side - size), size)
+
+
+def read_window(maps: Array, windows: Windows, layer: int) -> Array:
+    """[N, size, size] one layer of the maps inside the windows."""
+
+    def read(rows: Array, corner: Array) -> Array:
+        return lax.dynamic_slice(rows[layer], (corner[1], corner[0]), (windows.size, windows.size))
+
+    return jax.vmap(read)(maps, windows.corner)
+
+
+def write_window(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
+    """The maps with one layer inside the windows replaced by values [N, size, size]."""
+    zero = jnp.int32(layer)
+
+    def write(rows: Array, corner: Array, value: Array) -> Array:
+        return lax.dynamic_update_slice(rows, value[None], (zero, corner[1], corner[0]))
+
+    return jax.vmap(write)(maps, windows.corner, values)
+
+
+def to_window(place: Array, windows: Windows) -> Array:
+    """[N, K, 2] places in the windows, from places in the map; cells."""
+    return place - windows.corner[:, None, :].astype(place.dtype)
+
+
+def interpolate(maps: Array, layer: int, place: Array) -> Array:
+    """[N, K] one layer at places [N, K, 2] in cells, interpolated bilinearly; 0 at the rim and outside."""
+    count, layers, side, _ = maps.shape
+    low = jnp.floor(place)
+    inside = jnp.all((low >= 0) & (low < side - 1), axis=2)
+    column, row = jnp.moveaxis(jnp.where(inside[:, :, None], low, 0.0).astype(jnp.int32), 2, 0)
+    right, up = jnp.moveaxis(place - low, 2, 0)
+    first = ((jnp.arange(count, dtype=jnp.int32)[:, None] * layers + layer) * side + row) * side + column
+    flat = maps.reshape(-1)
+
+    def at(index: Array) -> Array:
+        return flat.at[index].get(mode="promise_in_bounds")
+
+    below = at(first) * (1 - right) + at(first + 1) * right
+    above = at(first + side) * (1 - right) + at(first + side + 1) * right
+    return jnp.where(inside, below * (1 - up) + above * up, 0.0)

@@ -14,12 +14,10 @@ from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
-from robot.live.create_loop import MotionReport, run_create_loop
-from robot.live.create_rig import CreateRig
+from robot.live.create_rig import CreateRig, MotionReport, run_create_loop
 from robot.live.create_selftest import find_devices, start_and_check
 from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
-from robot.world.arena import Arena, wall_segments
-from robot.world.random_arena import make_arena
+from robot.world.arena import Arena, make_arena, wall_segments
 from tactile.base.errors import InputError
 from tactile.base.types import StepEnd
 

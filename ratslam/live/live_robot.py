@@ -16,7 +16,7 @@ from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.recorder import LiveRecorder
 from robot.recordings.recording_config import RecordingConfig
-from tactile.features.calibration import Calibration
+from tactile.calibration import Calibration
 
 RECORDING = "session.mcap"
 """The recording in the run directory."""

@@ -21,12 +21,12 @@ from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.run import catch_interrupt
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import Fault, SessionOutcome
-from robot.drivers.process_priority import urgent
+from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
 from robot.live.selftest import check_disk
-from tactile.base.new_file import require_new_file
-from tactile.features.calibration import Calibration
+from tactile.base.files import require_new_file
+from tactile.calibration import Calibration
 
 
 def run_live_session(

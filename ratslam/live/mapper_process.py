@@ -24,15 +24,13 @@ import numpy as np
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.session import Step
 from ratslam.runs.settings.run_config import RunConfig
-from robot.drivers.process_priority import step_back
-from robot.drivers.withheld_signals import withheld_signals
-from robot.sources.source import Sample
-from robot.sources.source_info import SourceInfo
+from robot.drivers.processes import step_back, withheld_signals
+from robot.sources.source import Sample, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
-from tactile.features.calibration import Calibration
+from tactile.calibration import Calibration
 from tactile.frontend import TouchConfig
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
@@ -276,7 +274,7 @@ def _map(line: Connection) -> None:
     from ratslam.runs.build_session import build_session
     from ratslam.runs.runner import check_finished_map, open_runner
     from ratslam.runs.settings.completion import complete
-    from ratslam.service.viewer.observer import open_viewer
+    from ratslam.service.viewer_link import open_viewer
     from robot.touch_source import open_touch_source
     from tactile.base.types import Odometry, observation
 

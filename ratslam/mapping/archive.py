@@ -1,17 +1,35 @@
-"""All keyframes and closure candidates of a map whose keyframes are merged, as they were taken."""
+"""All keyframes and closure candidates of a map whose keyframes are merged, as they were taken.
+
+Closure selection on the unmerged keyframes.
+
+A merge takes for granted that its ground is right, and what the map solves for afterwards cannot show that it
+was wrong, because merged keyframes move together. So each time the keyframes have doubled, all closure
+sequences are selected anew on the unmerged keyframes, from the present map and from odometry; the result is
+merged anew and replaces the map. It costs much more than a selection among the kept keyframes, so it stops at
+`LARGEST` keyframes.
+
+Merging of keyframes during a session, with an archive that undoes merges on ground that was wrong.
+"""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.growable_array import GrowableArray
 from ratslam.mapping.appearance import ConfirmedPairs
+from ratslam.mapping.closure_selection import MapHypotheses
+from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog
 from ratslam.mapping.map_solution import MapSolution
-from ratslam.mapping.merging import Merge
-from tactile.base.se2 import compose
+from ratslam.mapping.merging import Merge, find_merge, merge_keyframes, no_merge
+from ratslam.mapping.selection_worker import DelayedJob, SelectedMap, SelectionWorker
+from ratslam.recall.memory import MergedRows
+from tactile.base.se2 import compose, fit_rigid_motion, inverse
 
 CONFIRMED_MASS = 0.95
 """Least posterior mass of a closure for the likelihoods to learn from it."""
@@ -123,3 +141,176 @@ def confirmed_pairs(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     frame, match, shift = table[sure, :3].astype(int).T
     reversed = np.cos(shift * graph.sector_angle) < 0
     return np.column_stack([graph.taken.rows[frame], graph.taken.rows[match], reversed])
+
+
+FIRST, LARGEST = 1600, 6400
+"""Numbers of keyframes at the first and the last selection of unmerged keyframes."""
+DELAY = 8
+"""Such a selection is taken up when there are a `DELAY`-th more keyframes."""
+THREAD = ThreadPoolExecutor(1, "selection of unmerged keyframes")
+"""Of all maps of the process."""
+
+
+class UnmergedMap(Checkpointed):
+    """The result of a selection on E unmerged keyframes, and how they are merged anew."""
+
+    VALUES = ("kept", "onto", "offset")
+    PARTS = ("selected",)
+
+    def __init__(self, selected: SelectedMap) -> None:
+        self.selected = selected
+        self.kept, self.onto, self.offset = no_merge(0)
+
+    def select(self, graph: KeyframeGraph) -> UnmergedMap:
+        """Selects, and decides what to merge; changes `graph`."""
+        selected = self.selected.select(graph)
+        if selected.found:
+            graph.pose.rows[:] = selected.poses
+            graph.bias, graph.turn_error = selected.calibration
+            selected.log.confirm(graph.config.merge_stood)
+            merge = find_merge(graph, selected.log, graph.config.merge_newest)
+            self.kept, self.onto, self.offset = merge or no_merge(graph.count)
+        return self
+
+    def replace(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Merge:
+        """Replaces the map by the archive with this result, not merged yet, continued by the map since.
+
+        Returns:
+            how to merge it.
+        """
+        selected, size, count = self.selected, len(self.onto), archive.graph.count
+        before, newer = archive.poses(graph.pose.rows), graph.taken.rows >= size
+        moved = compose(selected.poses[-1], inverse(before[size - 1]))
+        poses = np.concatenate([selected.poses, compose(moved, before[size:])])
+        cut = np.full(count, -1)
+        cut[:size] = selected.cut.rows
+        cut[graph.taken.rows[newer]] = graph.cut.rows[newer]
+        whole = archive.unmerged_log(log)
+        selected.judge(whole)
+        whole.confirm(graph.config.merge_stood)
+        log.restore(whole.arrays())
+        graph.replace(archive.graph, compose(fit_rigid_motion(poses, before), poses), cut)
+        graph.place_pieces(log)
+        graph.bias, graph.turn_error = selected.calibration
+        graph.heading_noise = selected.noise
+        rest = np.arange(size, count)
+        number = np.arange(len(self.kept), len(self.kept) + len(rest))
+        return Merge(
+            np.concatenate([self.kept, rest]),
+            np.concatenate([self.onto, number]),
+            np.concatenate([self.offset, np.zeros((len(rest), 3))]),
+        )
+
+
+class ArchiveSelection(Checkpointed):
+    """Selects on the unmerged keyframes each time they have doubled."""
+
+    PARTS = ("_job",)
+
+    def __init__(self) -> None:
+        self._job = DelayedJob(THREAD, lambda: UnmergedMap(SelectedMap(ClosureLog(), MapHypotheses())))
+
+    @property
+    def busy(self) -> bool:
+        """Whether a selection is in progress."""
+        return self._job.busy
+
+    def begin(self, archive: Archive) -> None:
+        """Begins a selection if it is due; poses and verdicts of the archive are those of the present map."""
+        count = archive.graph.count
+        unmerged = UnmergedMap(SelectedMap(archive.log.copy(), MapHypotheses()))
+        self._job.begin(count + count // DELAY, partial(unmerged.select, archive.graph.copy()))
+
+    def take(self, count: int) -> UnmergedMap | None:
+        """The result when it is due at `count` keyframes; None if it found no map."""
+        unmerged = self._job.take(count)
+        return unmerged if unmerged is not None and unmerged.selected.found else None
+
+
+def is_due(count: int) -> bool:
+    """Whether unmerged keyframes are selected on at this number of them."""
+    doublings, rest = divmod(count, FIRST)
+    return rest == 0 and FIRST <= count <= LARGEST and doublings & (doublings - 1) == 0
+
+
+class KeyframeMerger(Checkpointed):
+    """Merges keyframes after each closure selection; `archive` keeps them.
+
+    Attributes:
+        archive_selection: on the unmerged keyframes. merge_due: a selection has changed the map since the
+            last merge.
+    """
+
+    VALUES = ("merge_due",)
+    PARTS = ("archive_selection",)
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+        self.archive_selection = ArchiveSelection()
+        self.merge_due = False
+
+    def note_selection(self, graph: KeyframeGraph) -> None:
+        """Takes note that a selection has changed the map; a merge is due."""
+        self.merge_due = graph.config.merge_stood > 0
+
+    def select(self, graph: KeyframeGraph, log: ClosureLog) -> None:
+        """Begins a selection on the unmerged keyframes if it is due."""
+        if self._archive.begun and graph.config.select_every and is_due(graph.ever):
+            self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
+            self.archive_selection.begin(self._archive)
+
+    def merge(
+        self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, experiences: Experiences
+    ) -> MergedRows | None:
+        """Merges keyframes of confirmed ground if that is due, or replaces the map by the one selected on the
+        unmerged keyframes, merged anew; returns what the kernel needs to follow."""
+        if selection.busy:
+            return None
+        unmerged = self.archive_selection.take(graph.ever)
+        if unmerged is not None:
+            return self._replace(unmerged, graph, log, selection, experiences)
+        if not self.merge_due or self.archive_selection.busy:
+            return None
+        self.merge_due = False
+        merge = self.merge_all(graph, log, selection, graph.config.merge_newest)
+        if merge is None:
+            return None
+        experiences.merge(merge.kept, merge.onto, merge.offset)
+        views = graph.appearance.stored(graph.taken.rows)
+        return MergedRows(merge.kept, *views, merge.onto, merge.offset)
+
+    def merge_all(
+        self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, newest: int
+    ) -> Merge | None:
+        """Merges the keyframes of confirmed ground but the `newest`; None without any."""
+        merge = find_merge(graph, log, newest)
+        if merge is not None:
+            self._archive.merge(merge, graph, log)
+            _merge(merge, graph, log, selection)
+        return merge
+
+    def _replace(
+        self,
+        unmerged: UnmergedMap,
+        graph: KeyframeGraph,
+        log: ClosureLog,
+        selection: SelectionWorker,
+        experiences: Experiences,
+    ) -> MergedRows:
+        archive = self._archive
+        taken, row = graph.taken.rows.copy(), archive.row.rows.copy()
+        merge = unmerged.replace(graph, log, archive)
+        archive.row.replace(merge.onto)
+        archive.offset.replace(merge.offset)
+        selection.hypotheses = unmerged.selected.hypotheses
+        _merge(merge, graph, log, selection)
+        graph.optimise(log)
+        source, onto = row[merge.kept], merge.onto[taken]
+        experiences.merge(source, onto, merge.offset[taken])
+        return MergedRows(source, *graph.appearance.stored(merge.kept), onto, merge.offset[taken])
+
+
+def _merge(merge: Merge, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker) -> None:
+    log.merge(~merge.is_kept(), merge.onto, merge.turned())
+    merge_keyframes(graph, merge)
+    selection.hypotheses.merge(merge)

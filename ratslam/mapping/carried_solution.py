@@ -29,19 +29,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compiled import compiled
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.compilation import compiled
 from ratslam.mapping.closure_selection import (
     CUT,
+    MapHypotheses,
     Selection,
     SelectionProblem,
     cut_odometry,
     optimise_with_cuts,
 )
-from ratslam.mapping.gain_odds import BINS, GainOdds, learn_gain_odds
+from ratslam.mapping.ground import BINS, GainOdds, learn_gain_odds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_hypotheses import MapHypotheses
 from ratslam.mapping.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
 from ratslam.mapping.optimizer import MapFit, MapProblem, System
 from ratslam.mapping.pose_tracks import SelfTraverse, Track

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compiled import compiled, wrapped
+from ratslam.core.compilation import compiled, wrapped
 from ratslam.core.estimates import Action
-from ratslam.core.growable_array import GrowableArray
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

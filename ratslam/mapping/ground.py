@@ -1,13 +1,28 @@
-"""The keyframes of a finished map as ground on which a session is placed."""
+"""The keyframes of a finished map as ground on which a session is placed.
+
+Following a supposed pose through a session: how its views fit the ground that it would be on.
+
+Log-odds that a session is where it is supposed to be, learned from the map's own revisits.
+
+A view's *gain* at a supposed pose is its log-likelihood there less that at a new place. Gains of true poses
+are high; of false poses that happen to look alike they are lower and scattered. Both distributions are
+counted in the map itself: at revisits, and at the other places that look most alike for a while. So the odds
+need no constant of the sensor. The method is ours.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.checkpoint import Checkpointed
 from ratslam.recall.config import RecallConfig, sector_shifts
-from tactile.base.se2 import wrap
+from tactile.base.se2 import compose, inverse, wrap
 
 REACH = 1.2
 """Distance from a keyframe within which the robot is at it, cells."""
@@ -121,3 +136,287 @@ def ground_of(
     turns = -sector_shifts(recall) * sector_angle
     least = 0.6 * abs(sector_angle) if len(turns) > 2 else 0.0
     return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near_share)
+
+
+DEVIATIONS = 2.0
+"""Standard deviations of a supposed pose by which the reach of the ground grows."""
+MOST_REACH, MOST_REACH_HEADING = 3.0, 2.0
+"""Largest reaches, as multiples of those of the ground."""
+
+
+class Supposed(NamedTuple):
+    """A supposed pose in the map: mean [3] m, m, rad; covariance [3, 3]. Or P of them: [P, 3] and
+    [P, 3, 3]."""
+
+    pose: np.ndarray
+    covariance: np.ndarray
+
+    def is_comparable(self, ground: Ground) -> bool:
+        """Whether the pose is so well known that all keyframes it may be at are compared with it."""
+        position, heading = self.deviations()
+        reach_heading = MOST_REACH_HEADING * ground.reach_heading
+        return DEVIATIONS * position <= MOST_REACH * ground.reach and DEVIATIONS * heading <= reach_heading
+
+    def log_share(self, ground: Ground, pose: np.ndarray) -> float:
+        """Logarithm of the probability that the robot is at `pose` [3], as far as views can tell it from
+        others."""
+        error = pose - self.pose
+        error[2] = wrap(error[2])
+        spread = self.covariance + np.diag(ground.variance)
+        _, volume = np.linalg.slogdet(spread)
+        return float(np.log(ground.variance).sum() - volume - error @ np.linalg.solve(spread, error)) / 2
+
+    def deviations(self) -> tuple[float, float]:
+        """Standard deviations: of the position in the direction where it is largest, m; of the heading,
+        rad."""
+        (xx, xy), (_, yy) = self.covariance[:2, :2].tolist()
+        largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+        return math.sqrt(largest), math.sqrt(self.covariance[2, 2])
+
+
+class Motion(NamedTuple):
+    """Odometry between consecutive keyframes of a session: motion [3] without its systematic errors, m, m,
+    rad, and variance [3]."""
+
+    motion: np.ndarray
+    variance: np.ndarray
+
+    def reversed(self) -> Motion:
+        """The same driven backwards."""
+        return Motion(inverse(self.motion), self.variance)
+
+
+STILL = Motion(np.zeros(3), np.zeros(3))
+
+
+def advance(
+    ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
+) -> tuple[Supposed, float | None]:
+    """Moves a supposed pose, and corrects it by the keyframes near by, weighted by how well their views fit.
+
+    Args:
+        gain: [S, N] log-likelihood of the newest view at each keyframe less that at a new place, nat; None
+            if it shows nothing.
+
+    Returns:
+        the pose thereafter; the gain of the best keyframe near by, nat, NaN where no keyframe is near, None
+        of a view that shows nothing.
+    """
+    at = move(at, moved)
+    if gain is None:
+        return at, None
+    shift, frame = ground.near(at.pose, *_reaches(ground, *at.deviations()))
+    if not len(frame):
+        return at, np.nan
+    gains = gain[shift, frame].astype(float)
+    best = float(gains.max())
+    if best <= 0:
+        return at, best
+    weight = np.exp(gains - best)
+    error = ground.claims(shift, frame) - at.pose
+    error[:, 2] = wrap(error[:, 2])
+    return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
+
+
+def advance_all(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray) -> tuple[Supposed, np.ndarray]:
+    """`advance` for P supposed poses that move alike, and the gains [P], nat. Most of many poses fit
+    nowhere: only the others are corrected, one by one."""
+    pose, covariance = (each.copy() for each in move(at, moved))
+    (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(covariance, 0, -1)
+    position = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
+    one, shift, frame = ground.near_all(pose, *_reaches(ground, position, np.sqrt(heading)))
+    best = np.full(len(pose), np.nan)
+    near, first = np.unique(one, return_index=True)
+    if len(near):
+        best[near] = np.maximum.reduceat(gain[shift, frame].astype(float), first)
+    for k in np.flatnonzero(best > 0).tolist():
+        corrected, _ = advance(ground, Supposed(at.pose[k], at.covariance[k]), moved, gain)
+        pose[k], covariance[k] = corrected
+    return Supposed(pose, covariance), best
+
+
+def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
+    """The reaches, m and rad, of a pose with these standard deviations."""
+    reach = np.minimum(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
+    most = MOST_REACH_HEADING * ground.reach_heading
+    return reach, np.minimum(ground.reach_heading + DEVIATIONS * heading, most)
+
+
+def move(at: Supposed, moved: Motion) -> Supposed:
+    """A pose moved by odometry, to first order in its noise (Smith and Cheeseman 1986)."""
+    if not moved.motion.any() and not moved.variance.any():
+        return at
+    turn, lever = np.zeros((2, *at.covariance.shape))
+    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(at.pose[..., 2])
+    turn[..., 1, 0] = np.sin(at.pose[..., 2])
+    turn[..., 0, 1], turn[..., 2, 2] = -turn[..., 1, 0], 1.0
+    ahead = turn @ moved.motion
+    lever[..., range(3), range(3)] = 1.0
+    lever[..., 0, 2], lever[..., 1, 2] = -ahead[..., 1], ahead[..., 0]
+    covariance = lever @ at.covariance @ np.swapaxes(lever, -1, -2)
+    covariance += (turn * moved.variance) @ np.swapaxes(turn, -1, -2)
+    return Supposed(compose(at.pose, moved.motion), covariance)
+
+
+def _correct(at: Supposed, error: np.ndarray, variance: np.ndarray) -> Supposed:
+    """The Kalman filter's update by a measured difference [3] with this variance [3]."""
+    share = np.linalg.solve((at.covariance + np.diag(variance)).T, at.covariance.T).T
+    pose = at.pose + share @ error
+    pose[2] = wrap(pose[2])
+    covariance = at.covariance - share @ at.covariance
+    return Supposed(pose, (covariance + covariance.T) / 2)
+
+
+BINS = 24
+"""Number of bins of the gain."""
+PRIOR_COUNT = 40.0
+"""Number of gains that the prior counts as."""
+FARTHEST = 20.0
+"""Largest absolute value of the limits between bins, nat: gains beyond are certain, and finer bins tell
+more."""
+OUTLIERS = 0.04
+"""Share of either distribution that is drawn from the other: something has changed, or was misread."""
+LEAVING = -2.0
+"""Log-odds of leaving mapped ground: false supposed poses do so more often than true ones."""
+
+
+class GainPrior(NamedTuple):
+    """Gains before any were counted: mean and standard deviation at `true` and at `false` poses, nat."""
+
+    true: tuple[float, float]
+    false: tuple[float, float]
+
+
+class GainOdds(NamedTuple):
+    """Attributes:
+    edges: [BINS - 1] limits between the bins of the gain, nat. odds: [BINS] log-odds of each, ascending,
+        nat. expected: mean log-odds at a true pose, nat.
+    """
+
+    edges: np.ndarray
+    odds: np.ndarray
+    expected: float
+
+    def of(self, gain: float) -> float:
+        """Log-odds of one gain, both in nat."""
+        return float(self.odds[np.searchsorted(self.edges, gain)])
+
+
+PRIOR = GainPrior(true=(1.9, 0.8), false=(0.5, 1.6))
+"""Of plain gains."""
+
+
+def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIOR) -> GainOdds:
+    """Log-odds of gains from those counted at true poses [n] and at false ones [m]."""
+    from scipy.optimize import isotonic_regression  # slow to import
+
+    prior_true, prior_false = (_quantiles(*each) for each in prior)
+    pooled = np.concatenate([true, false, prior_true, prior_false])
+    low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
+    edges = np.linspace(low, high, BINS - 1)
+    same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
+    mixed_same, mixed_other = (
+        (1 - OUTLIERS) * same + OUTLIERS * other,
+        (1 - OUTLIERS) * other + OUTLIERS * same,
+    )
+    tiny = np.finfo(float).tiny  # a bin without counts has no odds
+    raw = np.log((mixed_same + tiny) / (mixed_other + tiny))
+    # A better fit is never evidence against a place; bins without gains say little.
+    odds = isotonic_regression(raw, weights=same + other + 1e-6).x
+    return GainOdds(edges, odds, float(same @ odds))
+
+
+def _quantiles(mean: float, deviation: float) -> np.ndarray:
+    """Evenly spread quantiles of a normal distribution."""
+    from scipy.special import ndtri  # slow to import
+
+    share = (np.arange(64) + 0.5) / 64
+    return mean + deviation * ndtri(share)
+
+
+def _density(edges: np.ndarray, counted: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """[BINS] smoothed shares of the counted gains and of the prior."""
+    count = np.bincount(np.searchsorted(edges, counted), minlength=BINS).astype(float)
+    count += PRIOR_COUNT / len(prior) * np.bincount(np.searchsorted(edges, prior), minlength=BINS)
+    smooth = np.convolve(np.pad(count, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
+    return smooth / smooth.sum()
+
+
+GroundKey = tuple[int, int, int]
+"""What tells a ground from the others of a map: its number of keyframes, its first and its last keyframe."""
+
+
+class LearnedOdds(Checkpointed):
+    """The log-odds of gains on each ground, as they were when it was first asked for.
+
+    Learning them takes long, so they are not learned anew while the ground is the same, although the poses
+    and the metric of the views change a little. A checkpoint without any has no array of them.
+    """
+
+    def __init__(self) -> None:
+        self.ground = GrowableArray((3,), np.int64)
+        self.edges = GrowableArray((BINS - 1,), np.float64)
+        self.odds = GrowableArray((BINS,), np.float64)
+        self.expected = GrowableArray((), np.float64)
+
+    def of(self, ground: GroundKey, learn: Callable[[], GainOdds]) -> GainOdds:
+        """The log-odds on a ground; `learn` is called if they are not known."""
+        known = np.flatnonzero((self.ground.rows == ground).all(axis=1))
+        if len(known):
+            row = int(known[0])
+            return GainOdds(self.edges.rows[row], self.odds.rows[row], float(self.expected.rows[row]))
+        found = learn()
+        self.ground.append(ground)
+        for array, values in zip((self.edges, self.odds, self.expected), found, strict=True):
+            array.append(values)
+        return found
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return super().arrays() if len(self.ground.rows) else {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        if arrays:
+            super().restore(arrays)
+        else:
+            for array in (self.ground, self.edges, self.odds, self.expected):
+                array.replace(array.rows[:0])
+
+
+COMMON = 0.5
+"""Factor on the logarithm of a view's mean likelihood over the whole ground, subtracted from its gains."""
+COMMON_OF_PIECE = 0.25
+"""The same factor for a piece of a growing map."""
+
+
+class Weighing(NamedTuple):
+    """Attributes:
+    weigh: from gains [..., S, N] of views on a whole ground to those that are counted. prior: of these.
+    matching: mean of those before one above which a false pose still looks right, nat.
+    """
+
+    weigh: Callable[[np.ndarray], np.ndarray]
+    prior: GainPrior
+    matching: float
+
+
+def _as_they_are(gain: np.ndarray) -> np.ndarray:
+    return gain
+
+
+def less_where_common(gain: np.ndarray, share: float = COMMON) -> np.ndarray:
+    """Gains [..., S, N] of views on a ground, less where the whole ground fits a view: a view that fits many
+    places, or any wall, tells little of where the robot is, nor whether it is on this ground. Ours; a full
+    Bayes filter would divide by the mean likelihood."""
+    most = gain.max(axis=(-2, -1), keepdims=True, initial=-np.inf)
+    mean = np.exp(gain - most).mean(axis=(-2, -1), keepdims=True)
+    return gain - share * (most + np.log(mean))
+
+
+PLAIN = Weighing(_as_they_are, PRIOR, 1.0)
+"""For two pieces of finished maps, of which many keyframes are compared."""
+PIECE = Weighing(
+    partial(less_where_common, share=COMMON_OF_PIECE), GainPrior(true=(2.4, 0.8), false=(1.0, 1.6)), 1.5
+)
+"""For the newest piece of a growing map."""
+DISTINCT = Weighing(less_where_common, GainPrior(true=(2.95, 0.8), false=(1.55, 1.6)), 2.0)
+"""For a session of which few keyframes are known."""

@@ -16,11 +16,10 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.growable_array import GrowableArray
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.config import Ablation, KeyframeMapConfig
-from ratslam.mapping.edges import Edges
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.odometry_calibration import learn_heading_noise, starting_calibration, starting_noise
 from ratslam.mapping.optimizer import (
@@ -33,6 +32,7 @@ from ratslam.mapping.optimizer import (
     OdometryChain,
     solve,
 )
+from ratslam.mapping.pose_graph import Edges
 from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion, integrate, inverse
 
 LOOSE = 1e4

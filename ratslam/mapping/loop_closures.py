@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.growable_array import GrowableArray
 from ratslam.mapping.optimizer import LoopClosures
 
 CSV_COLUMNS = (

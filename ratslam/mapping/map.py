@@ -21,25 +21,26 @@ from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance
-from ratslam.mapping.archive import MOST_SOLVED, Archive
+from ratslam.mapping.archive import MOST_SOLVED, Archive, KeyframeMerger
 from ratslam.mapping.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.mapping.closure_judge import doubt_of_closures
 from ratslam.mapping.config import FULL, Ablation, KeyframeMapConfig
-from ratslam.mapping.edges import Edges
 from ratslam.mapping.experiences import ExperienceChange, Experiences
-from ratslam.mapping.gain_odds import LearnedOdds
-from ratslam.mapping.io import write_g2o, write_json
+from ratslam.mapping.ground import LearnedOdds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.keyframe_merger import KeyframeMerger
-from ratslam.mapping.live_filter import LiveFilter
 from ratslam.mapping.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
-from ratslam.mapping.map_health import DOUBTED, worse_than_odometry
-from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.mapping.map_solution import (
+    DOUBTED,
+    MapSolution,
+    selected_solution,
+    solved_map,
+    worse_than_odometry,
+)
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
 from ratslam.mapping.piece_ties import FindTie, no_tie, tie_newest_piece
+from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
-from ratslam.mapping.step_record import StepRecord, leading_to
-from ratslam.mapping.travel import HALT, Travel
+from ratslam.mapping.step_record import HALT, LiveFilter, StepRecord, Travel, leading_to
 from ratslam.mapping.verification import continues_sequence, has_same_heading
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation

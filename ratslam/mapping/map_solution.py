@@ -11,6 +11,20 @@ Odometry that is honestly noisy is explained with little noise if only the closu
 sequence costs its whole evidence here, beside its bounded cost in the selection: in doubt the map stays that
 explains more of what was recognised. The rule is ours; the evidence is that of MacKay 1992, see
 `odometry_noise`.
+
+Revisits that the poses of a map claim, and whether the views bear them out.
+
+A keyframe near older ones that face alike claims a revisit: one of each pass of the robot there, so that a
+pass that is right does not hide one that is wrong. Where a claim is right, the view is more like those near
+it than like views elsewhere; where it is wrong, it is so by chance. The comparison is by ranks: no constant
+is in units of the sensor, and views that are alike everywhere count little. The rules are ours.
+
+Health of a map: the probability that its error is worse than odometry's, told without truth.
+
+Map and odometry are compared as predictors of revisits (`claimed_revisits`) and of the closure sequences that
+the map refused; a map that bends odometry is suspect where odometry itself foretells revisits well. A
+logistic regression on these statistics was fitted to maps with known error (`python -m ratslam reproduce
+tables health`). The statistics are ours.
 """
 
 from __future__ import annotations
@@ -22,14 +36,16 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
-from ratslam.core.growable_array import GrowableArray
-from ratslam.mapping.claimed_revisits import claims_cost
+from ratslam.core.arrays import GrowableArray
+from ratslam.mapping.appearance import near_facing
 from ratslam.mapping.closure_judge import judge_anew
 from ratslam.mapping.closure_selection import (
     ACCEPTED_WEIGHT,
     FINE,
     STEPS,
+    MapHypotheses,
     Selection,
     SelectionProblem,
     select_closures,
@@ -37,8 +53,6 @@ from ratslam.mapping.closure_selection import (
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph, number_pieces
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
-from ratslam.mapping.map_hypotheses import MapHypotheses
-from ratslam.mapping.odometry_breaks import find_break
 from ratslam.mapping.odometry_calibration import (
     HeadingNoise,
     learn_heading_noise,
@@ -46,8 +60,73 @@ from ratslam.mapping.odometry_calibration import (
     starting_noise,
 )
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
-from ratslam.mapping.piece_joining import spans_pieces
-from tactile.base.se2 import compose, inverse
+from ratslam.mapping.verification import find_break, spans_pieces
+from tactile.base.se2 import between, compose, inverse, wrap
+
+RADIUS = 2.0
+"""Distance within which keyframes are near each other, cells."""
+FACING = float(np.cos(0.5))
+"""Cosine of the largest difference in heading of two keyframes that face alike."""
+CONTROLS = np.arange(1, 9) / 9
+"""Shares of the older keyframes by which those near a keyframe are moved on in memory, as controls."""
+JUDGED = 150
+"""Largest number of keyframes by whose claims a map is compared with others."""
+SHAPE, DOUBTFUL = 4.0, 0.05
+"""The likeness of right claims has the density `SHAPE` u^(`SHAPE` - 1), and a share of uniform ones."""
+ALONE = 5.0
+"""Number of successive keyframes whose views count as one, because they are alike."""
+
+
+class ClaimedRevisits(NamedTuple):
+    """n claims by `examined` keyframes.
+
+    Attributes:
+        frame: [n] keyframe. match: [n] the first of the older keyframes near it, of one pass. likeness: [n]
+            share of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by chance. A
+            control is as many keyframes elsewhere among the older ones, in the same order.
+    """
+
+    frame: np.ndarray
+    match: np.ndarray
+    likeness: np.ndarray
+    examined: int
+
+
+def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> ClaimedRevisits:
+    """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly."""
+    first, count = graph.guard + 1, len(poses)
+    frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
+    facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
+    whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
+    row, near = np.nonzero(facing if whiskers else facing > 0)
+    frame, reversed = frames[row], facing[row, near] < 0
+    if not len(frame):
+        return ClaimedRevisits(frame, near, np.zeros(0), len(frames))
+    shares = np.concatenate([[0.0], CONTROLS])
+    older = (frame - graph.guard)[:, None]
+    others = (near[:, None] + (older * shares).astype(int)) % older
+    repeated = len(shares)
+    unlike = graph.unlikeness(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
+    passes = np.flatnonzero(np.diff(near, prepend=-1 - graph.guard) > graph.guard)
+    passes = np.union1d(passes, np.flatnonzero(np.diff(frame, prepend=-1)))
+    best = np.minimum.reduceat(unlike.reshape(others.shape), passes, axis=0)
+    here, elsewhere = best[:, :1], best[:, 1:]
+    likeness = (here < elsewhere).mean(axis=1) + (here == elsewhere).mean(axis=1) / 2
+    return ClaimedRevisits(frame[passes], near[passes], likeness, len(frames))
+
+
+def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
+    """What the views say against poses [N, 3] of the keyframes, chi-square: -2 times the log ratio of the
+    density of the likenesses where claims are right to that where they are wrong (uniform), for as many
+    independent views as there are times `ALONE` keyframes."""
+    claims = claimed_revisits(graph, poses, JUDGED)
+    if not len(claims.frame):
+        return 0.0
+    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * claims.likeness ** (SHAPE - 1)
+    _, frame = np.unique(claims.frame, return_inverse=True)
+    each = np.bincount(frame, np.log(right)) / np.bincount(frame)
+    return float(-2 * each.sum() * len(poses) / (claims.examined * ALONE))
+
 
 Place = Callable[[np.ndarray], np.ndarray]
 """Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
@@ -273,3 +352,98 @@ def _settle(case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: Hea
     seen = log_posterior(noise.log_factor - start.log_factor, fit, System(case.measurements))
     refused = case.evidence[fit.weights <= ACCEPTED_WEIGHT].sum()
     return Settled(selection, seen - case.views_cost(fit.poses) / 2 - float(refused))
+
+
+INTERCEPT = -0.69
+WEIGHTS = np.array([-1.22, -0.03, 0.46, 0.91, 5.19])
+"""Of `HealthFeatures`, in order; printed by `python -m ratslam reproduce tables health --sessions 3`."""
+DOUBTED = 0.7
+"""Probability above which odometry is given instead; good maps where odometry hardly drifts reach 0.6."""
+EXAMINED = 300
+"""Largest number of keyframes whose claims are examined."""
+LEAST_CLAIMS = 0.03
+"""Added to the claims borne out and contradicted by each keyframe, so that few claims say little."""
+WINDOW = 20
+"""Keyframes over which the strain of the odometry is summed."""
+LEAST_SCORE, LEAST_LENGTH = 2.0, 2
+"""Least evidence and number of candidates of a refused sequence that counts."""
+FULL_SCORE = 12.0
+"""Evidence at which a refused sequence has its full weight."""
+PLACE, HEADING = 2.0, 0.5
+"""Deviation from a refused sequence at which half of its evidence is explained, cells and rad."""
+NEUTRAL = 3.0
+"""Evidence added to that of the refused sequences, half of it explained."""
+
+
+class HealthFeatures(NamedTuple):
+    """Statistics of a map.
+
+    Attributes:
+        gain: log ratio of borne-out to contradicted claims of revisits, the map's minus odometry's. odometry:
+            the same log ratio of odometry. strain: log10 of the largest chi-square of the odometry within
+            `WINDOW` keyframes. contested: strain times that log ratio of odometry. unexplained: share of the
+            evidence of refused sequences that the map does not explain, minus odometry's share.
+    """
+
+    gain: float
+    odometry: float
+    strain: float
+    contested: float
+    unexplained: float
+
+
+def worse_than_odometry(graph: KeyframeGraph, solution: MapSolution) -> float:
+    """Probability that the map's error is worse than odometry's; NaN without closures."""
+    if not len(solution.log.accepted_rows()):
+        return np.nan
+    return float(expit(INTERCEPT + WEIGHTS @ np.array(health_features(graph, solution))))
+
+
+def health_features(graph: KeyframeGraph, solution: MapSolution) -> HealthFeatures:
+    """The statistics of a map; of at least two keyframes."""
+    reckoned = graph.dead_reckoned()
+    of_map = _claims_ratio(graph, solution.fit.poses)
+    of_odometry = _claims_ratio(graph, reckoned)
+    strain, angle = _strain(graph, solution), graph.sector_angle
+    unexplained, before = (
+        _unexplained(solution.log, poses, angle, graph.cell) for poses in (solution.fit.poses, reckoned)
+    )
+    return HealthFeatures(
+        of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before
+    )
+
+
+def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
+    """Log ratio of the claims of revisits that the views bear out to those that they contradict."""
+    claims = claimed_revisits(graph, poses, EXAMINED)
+    sides = 2 * claims.likeness - 1
+    each = max(claims.examined, 1)
+    agreed, contradicted = np.maximum(sides, 0).sum() / each, np.maximum(-sides, 0).sum() / each
+    return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
+
+
+def _strain(graph: KeyframeGraph, solution: MapSolution) -> float:
+    chain, poses = graph.odometry(solution.cut), solution.fit.poses
+    measured = solution.fit.corrected(chain)
+    error = between(poses[:-1], poses[1:]) - measured
+    error[:, 2] = wrap(error[:, 2])
+    sums = np.cumsum((error**2 / chain.variance).sum(axis=1))
+    window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
+    return float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
+
+
+def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) -> float:
+    """Share of the evidence of refused sequences that poses [N, 3] do not explain."""
+    table = log.table()
+    table = table[table[:, 5] >= 0]
+    sequence = table[:, 5].astype(int)
+    scores = log.scores()
+    counts = (log.sizes() >= LEAST_LENGTH) & (scores >= LEAST_SCORE) & (log.verdicts() != Verdict.ACCEPTED)
+    worth = np.where(counts, np.clip(scores / FULL_SCORE, 0.0, 1.0), 0.0)[sequence]
+    worth = worth * np.maximum(table[:, 4], 0.0)
+    j, i = table[:, :2].astype(int).T
+    error = between(poses[i], poses[j])
+    error[:, 2] = wrap(error[:, 2] + table[:, 2] * angle)
+    apart = (error[:, 0] ** 2 + error[:, 1] ** 2) / (PLACE * cell) ** 2 + (error[:, 2] / HEADING) ** 2
+    lost = (worth * apart / (1 + apart)).sum()
+    return float((lost + NEUTRAL / 2) / (worth.sum() + NEUTRAL))

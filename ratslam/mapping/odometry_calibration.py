@@ -8,6 +8,13 @@ makes the closures costly, one too large wastes the odometry. The factor has a l
 at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`:
 closures are accepted for agreeing with odometry, so odometry that is believed too much refuses true ones and
 looks good.
+
+Views of ordered sectors: whether the sectors are ordered, their width, and the heading bias they show.
+
+When the robot turns, the values of a laser or sonar view shift by the turn; those of an unordered view do
+not. So consecutive views show whether sectors are ordered and how wide they are. The shifts then measure the
+turns better than wheels do, which gives the heading bias: the odometry's heading error per metre. No ground
+truth is used. The estimators are ours.
 """
 
 from __future__ import annotations
@@ -17,9 +24,199 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.compilation import compiled
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, System
-from ratslam.mapping.view_sectors import BiasEstimate
+
+FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
+"""Candidate fields of view, rad; negative: clockwise."""
+MIN_SIGNIFICANCE = 3.0
+"""Significance of the improvement by a shift, standard errors, from which sectors count as ordered."""
+MIN_IMPROVEMENT = 0.1
+"""Least share of the unshifted difference that the shift must explain, because a significant improvement may
+still be small."""
+MIN_COUNT = 20
+"""Turns before the field of view is estimated, and pairs of views before the bias is."""
+LAGS = (1, 2)
+"""Keyframes between the views compared for the bias; two estimates, to show their error."""
+SCAN = np.arange(-2, 2.01, 0.125)
+"""Search range for the turn between two views, in sectors around the odometry's turn."""
+BLOCKS = 12
+"""Blocks of a recording for the jackknife estimate of the standard error."""
+
+
+class BiasEstimate(NamedTuple):
+    """Heading error per distance, rad/m, and its standard error."""
+
+    value: float
+    error: float
+
+
+NO_ESTIMATE = BiasEstimate(0.0, np.inf)
+
+
+class SectorFan(Checkpointed):
+    """Estimates sector angle and heading bias from the views of consecutive keyframes, one row for each.
+
+    Args:
+        size: number of values of a view. angle: of a sector, counter-clockwise positive, rad; 0: to be
+            estimated.
+    """
+
+    VALUES = ("_angle", "_due")
+
+    def __init__(self, size: int, angle: float) -> None:
+        self.given = angle
+        self._view = GrowableArray((size,), np.float64)
+        self._step = GrowableArray((2,), np.float64)  # turn, length into the frame
+        self._gain = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
+        # Differences of unshifted views, where a fan would shift them.
+        self._still = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
+        self._pairs = _no_pairs()
+        self._angle = angle
+        self._due = 1
+
+    @property
+    def angle(self) -> float:
+        """Angle of a sector, rad; 0 while sectors are not known to be ordered."""
+        return self._angle
+
+    def append(self, view: np.ndarray, turn: float, length: float) -> None:
+        """Adds a keyframe: its view [size], turn (rad) and distance (m) since the one before."""
+        self._view.append(view)
+        self._step.append((turn, length))
+        if len(self._view.rows) > 1:
+            gain, still = self._gains()
+            self._gain.append(gain)
+            self._still.append(still)
+
+    def estimate(self) -> BiasEstimate:
+        """The heading bias that the views show, to be added to the odometry's turn."""
+        self._estimate_angle()
+        if not self._angle or len(self._view.rows) < 2 * MIN_COUNT:
+            return NO_ESTIMATE
+        answers = [_slope(self._heading_errors(lag), abs(self._angle)) for lag in LAGS]
+        value = float(np.mean([answer.value for answer in answers]))
+        error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
+        return BiasEstimate(value, float(np.sqrt(error)))
+
+    def _estimate_angle(self) -> None:
+        """Sets the sector angle once shifts by the turn explain the views significantly better than no shift;
+        repeated whenever the number of views has doubled."""
+        gain = self._gain.rows
+        if self.given or len(gain) < self._due:
+            return
+        total, count = gain.sum(axis=0), (gain != 0).sum(axis=0)
+        sure = total / np.sqrt(np.maximum((gain**2).sum(axis=0), 1e-300))
+        best = int(np.argmax(np.where(count >= MIN_COUNT, total, -np.inf)))
+        plain = total[best] > MIN_IMPROVEMENT * self._still.rows[:, best].sum()
+        if count[best] >= MIN_COUNT and sure[best] > MIN_SIGNIFICANCE and plain:
+            self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
+            self._due = 2 * len(gain)
+            self._pairs = _no_pairs()
+
+    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """[F] decrease of the difference between the newest two views when they are shifted for each field of
+        view, and their unshifted difference; 0 for fields of view without a shift."""
+        old, now = self._view.rows[-2:]
+        return field_gains(now, old, self._step.rows[-1, 0], FIELDS_OF_VIEW)
+
+    def _heading_errors(self, lag: int) -> np.ndarray:
+        """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
+        pairs = self._pairs[lag]
+        done, count = len(pairs.rows), len(self._view.rows) - lag
+        if count > done:
+            for row in self._measure_turns(np.arange(done, count) + lag, lag):
+                pairs.append(row)
+        return pairs.rows
+
+    def _measure_turns(self, at: np.ndarray, lag: int) -> np.ndarray:
+        angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
+        turn, length = (step[at] - step[at - lag]).T
+        view, offset = self._view.rows, SCAN * abs(angle)
+        shift = -(turn + offset[:, None]) / angle
+        errors = fractional_differences(view[at], view[at - lag], shift)
+        blind = np.isnan(errors).any(axis=0)
+        errors = np.where(blind, 1.0, errors)
+        best, row = errors.argmin(axis=0), np.arange(len(at))
+        inner = (best > 0) & (best < len(SCAN) - 1) & ~blind
+        k = np.clip(best, 1, len(SCAN) - 2)
+        before, least, after = errors[k - 1, row], errors[k, row], errors[k + 1, row]
+        bend = before - 2 * least + after
+        fine = np.where(bend > 0, (before - after) / np.where(bend > 0, 2 * bend, 1.0), 0.0)
+        depth = np.median(errors, axis=0) / (errors.min(axis=0) + 1e-300) - 1
+        trust = np.where(inner & (length > 0), np.clip(depth, 0, 3), 0.0)
+        return np.stack([offset[k] + fine * (offset[1] - offset[0]), trust, length], axis=1)
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`."""
+        super().restore(arrays)
+        self._pairs = _no_pairs()
+
+
+def _no_pairs() -> dict[int, GrowableArray]:
+    return {lag: GrowableArray((3,), np.float64) for lag in LAGS}
+
+
+@compiled
+def field_gains(
+    now: np.ndarray, old: np.ndarray, turn: float, fields: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """[F] decrease of the mean absolute difference of two views when they are shifted by a turn, rad, for
+    each field of view [F], rad, and [F] their unshifted difference; 0 without a shift."""
+    gain, still, size = np.zeros(len(fields)), np.zeros(len(fields)), len(now)
+    unshifted = np.abs(now - old).mean()
+    for f in range(len(fields)):
+        shift = int(np.rint(-turn / (fields[f] / size)))
+        if shift == 0 or abs(shift) > size // 2:
+            continue
+        first, second, total = max(shift, 0), max(-shift, 0), 0.0
+        for at in range(size - abs(shift)):
+            total += abs(now[first + at] - old[second + at])
+        gain[f], still[f] = unshifted - total / (size - abs(shift)), unshifted
+    return gain, still
+
+
+@compiled
+def fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """[F, P] mean absolute differences of P pairs of views [P, size] for fractional shifts [F, P], by
+    interpolation; NaN with less than half overlap."""
+    pairs, size = now.shape
+    found = np.empty(shifts.shape)
+    for f in range(len(shifts)):
+        for p in range(pairs):
+            total, count = 0.0, 0
+            for k in range(size):
+                at = k - shifts[f, p]
+                low = int(np.floor(at))
+                if low < 0 or low + 1 >= size:
+                    continue
+                share = at - low
+                total += abs(now[p, k] - old[p, low] * (1 - share) - old[p, low + 1] * share)
+                count += 1
+            found[f, p] = total / count if count >= max(size // 2, 1) else np.nan
+    return found
+
+
+def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
+    """Robust line through the origin (Huber, a quarter sector) and its jackknife error over blocks."""
+    turned, trust, length = pairs.T
+    if np.count_nonzero(trust) < MIN_COUNT:
+        return NO_ESTIMATE
+    value = 0.0
+    for _ in range(12):
+        weight = trust / np.maximum(np.abs(turned - value * length), angle / 4)
+        value = float((weight * turned * length).sum() / (weight * length**2).sum())
+    top, bottom = weight * turned * length, weight * length**2
+    parts = np.array_split(np.arange(len(pairs)), BLOCKS)
+    rest = np.array([bottom.sum() - bottom[part].sum() for part in parts])
+    if rest.min() <= 1e-9 * bottom.sum():
+        return NO_ESTIMATE  # one block holds all the weight
+    without = np.array([top.sum() - top[part].sum() for part in parts]) / rest
+    return BiasEstimate(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))
+
 
 TEXT = """\
 # Calibration of the odometry after this session. The next session of the same robot starts from it if its

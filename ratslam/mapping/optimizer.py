@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.mapping.block_cholesky import BlockPattern
-from ratslam.mapping.linearisation import (
+from ratslam.mapping.normal_equations import (
+    BlockPattern,
     Equations,
     Measurements,
     add_measurements,

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.gain_odds import LearnedOdds
+from ratslam.mapping.ground import LearnedOdds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.mapping.piece_joining import spans_beginnings
+from ratslam.mapping.verification import spans_beginnings
 
 TIE_EVERY = 4
 """Keyframes between two trials."""

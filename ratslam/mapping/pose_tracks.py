@@ -2,7 +2,7 @@
 
 The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
 on it; none is compared with keyframes of nearly the same time. The rule is that of
-`ratslam.mapping.following` with variances of position and heading alone, in compiled loops, because
+`ratslam.mapping.ground` with variances of position and heading alone, in compiled loops, because
 hundreds of tracks are followed."""
 
 from __future__ import annotations
@@ -11,10 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compiled import compiled
-from ratslam.mapping.following import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING
-from ratslam.mapping.gain_odds import LEAVING, GainOdds
-from ratslam.mapping.ground import REACH, REACH_HEADING, Ground
+from ratslam.core.compilation import compiled
+from ratslam.mapping.ground import (
+    DEVIATIONS,
+    LEAVING,
+    MOST_REACH,
+    MOST_REACH_HEADING,
+    REACH,
+    REACH_HEADING,
+    GainOdds,
+    Ground,
+)
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.optimizer import MapFit
 from tactile.base.se2 import inverse

@@ -8,17 +8,16 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.classic import places, pose_cells, view_templates
+from ratslam.classic import experience_map, pose_cells, view_templates
 from ratslam.classic.cell_probe import active_cells, activity_of, hold_cells
-from ratslam.classic.experience_map import ExperienceMap
+from ratslam.classic.config import network_of, rings, units
+from ratslam.classic.experience_map import ExperienceMap, Places
 from ratslam.classic.levels import activity_sums, window_levels
-from ratslam.classic.places import Places
-from ratslam.classic.pose_cell_config import network_of, rings, units
 from ratslam.classic.pose_cells import Outcome, PoseCells
 from ratslam.classic.view_templates import Match, Templates
 from ratslam.core.backend import Backend, PoseCellProbe, enlarge
 from ratslam.core.estimates import Estimate, PoseCellActivity, Scalar
-from ratslam.core.finite_values import finite_values
+from ratslam.core.session import finite_values
 from ratslam.methods.config import ClassicBackendConfig
 from tactile.base.se2 import wrap
 from tactile.base.types import Array, Observation
@@ -76,7 +75,7 @@ class ClassicBackend(Backend):
         return ClassicState(
             pose_cells.start(self.network, self.dtype),
             view_templates.start(self.config.templates, self.view_shape, capacity, self.dtype),
-            places.start(capacity, self.dtype),
+            experience_map.start(capacity, self.dtype),
             jnp.zeros((), self.dtype),
         )
 
@@ -117,7 +116,7 @@ class ClassicBackend(Backend):
             self.network, self.window_levels, state.cells, odometry, recalled, energy
         )
         canonical = (cells.pose - turned) % self.rings
-        world, decision = places.decide(
+        world, decision = experience_map.decide(
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
         )
 

@@ -7,9 +7,8 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, PositiveFloat
 
-from ratslam.classic.experience_map import ExperienceConfig
-from ratslam.classic.places import PlaceConfig
-from ratslam.classic.pose_cell_config import AttractorConfig
+from ratslam.classic.config import AttractorConfig
+from ratslam.classic.experience_map import ExperienceConfig, PlaceConfig
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.grid.config import GridConfig
 from ratslam.mapping.config import KeyframeMapConfig

@@ -9,9 +9,8 @@ from typing import TypeVar
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.methods.config import LocaliseConfig
-from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.npz import SPOILT, read_arrays
+from tactile.base.files import NPZ_SPOILT, malformed, read_arrays
 
 FinishedMap = TypeVar("FinishedMap", bound=Map)
 
@@ -41,7 +40,7 @@ def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
         cure = "put it back, or set localise.map to where it is"
         raise InputError(str(path), found, "the map in which the session is localised", cure)
     expected = f"a map made by `backend: {method}` with the same settings"
-    with malformed(path, expected, found="{}", spoilt=SPOILT):
+    with malformed(path, expected, found="{}", spoilt=NPZ_SPOILT):
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.startswith("map/")]
             arrays = read_arrays(archive, names, str(path))

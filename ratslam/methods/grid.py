@@ -16,15 +16,14 @@ from jax import lax
 
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
-from ratslam.grid import blob_kernels, likelihoods, particle_maps, particles
+from ratslam.grid import likelihoods, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
-from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
-from ratslam.grid.particles import Particles
+from ratslam.grid.particles import COSINE, EVIDENCE, SINE, Particles
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.whisker_geometry import PlanarWhiskers
 
 FREE_POINTS = (0.2, 0.5, 0.8)
 """Points along a whisker without contact that are marked free, as shares of its length."""
@@ -133,7 +132,7 @@ class GridBackend(Backend):
         first, key = jax.random.split(key)
         return GridState(
             particles.start(self.config.drift, first, count, self.dtype),
-            particle_maps.empty_maps(count, self.side, self.dtype),
+            particles.empty_maps(count, self.side, self.dtype),
             jnp.zeros((count, 2), self.dtype),
             jnp.int32(MotionKind.OTHER),
             jnp.zeros(self.whiskers, bool),
@@ -178,7 +177,7 @@ class GridBackend(Backend):
         if config.model != "evidence":
             return self._printed_likelihood(state.maps, pose, features)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
-        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
+        evidence = particles.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
         shafts = jnp.repeat(features.free, len(FREE_POINTS))
         body = jnp.broadcast_to(features.valid & (self.config.body > 0), len(self.body))
         likelihood = likelihoods.free_space(config, evidence, jnp.concatenate([shafts, body]))
@@ -193,10 +192,10 @@ class GridBackend(Backend):
         """[N] log-likelihood of new contacts, and of a wall's direction given the map there and given the
         directions of all walls."""
         config = self.config.likelihood
-        evidence = particle_maps.interpolate(state.maps, EVIDENCE, self._in_cells(pose, features.point))
+        evidence = particles.interpolate(state.maps, EVIDENCE, self._in_cells(pose, features.point))
         likelihood = likelihoods.contact(config, evidence, features.new)
         place = self._in_cells(pose, features.on_wall[None])
-        field = [particle_maps.interpolate(state.maps, layer, place) for layer in (COSINE, SINE)]
+        field = [particles.interpolate(state.maps, layer, place) for layer in (COSINE, SINE)]
         direction = pose[:, 2] + features.direction
         sharp = jnp.minimum(WALL, 1 / (4 * features.sd**2))
         aligned = likelihoods.wall_direction(config, jnp.concatenate(field, axis=1), 2 * direction, sharp)
@@ -207,7 +206,7 @@ class GridBackend(Backend):
 
     def _printed_likelihood(self, maps: Array, pose: Array, features: ContactFeatures) -> Array:
         cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
-        evidence = particle_maps.interpolate(maps, EVIDENCE, cell)
+        evidence = particles.interpolate(maps, EVIDENCE, cell)
         shape = (len(pose), self.whiskers, SEGMENTS)
         likelihood = likelihoods.printed_likelihood(
             self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
@@ -237,13 +236,13 @@ class GridBackend(Backend):
         """Every particle's map and wall directions after the observation; bool: a contact lies outside."""
         config, cell = self.config.footprint, self.config.cell
         middle = self._in_cells(pose, jnp.zeros((1, 2), self.dtype))
-        windows = particle_maps.windows_around(middle[:, 0], self.side, self.near)
+        windows = particles.windows_around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(features.free, len(FREE_POINTS)).astype(self.dtype)
-        place = particle_maps.to_window(self._in_cells(pose, jnp.asarray(self.free)), windows)
-        footprint = blob_kernels.gaussian_blobs(place, amount, self.free_sd, windows.size)
+        place = particles.to_window(self._in_cells(pose, jnp.asarray(self.free)), windows)
+        footprint = likelihoods.gaussian_blobs(place, amount, self.free_sd, windows.size)
         if self.config.body:
-            body = blob_kernels.disc(
-                particle_maps.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
+            body = likelihoods.disc(
+                particles.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
             )
             footprint -= jnp.where(features.valid, config.body, 0.0) * body
         maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
@@ -264,42 +263,40 @@ class GridBackend(Backend):
         """The maps and wall directions with contacts and a wall added."""
         config, cell = self.config.footprint, self.config.cell
         ends = self._in_cells(pose, features.point)
-        windows = particle_maps.windows_around(
+        windows = particles.windows_around(
             self._in_cells(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
         )
         amount = config.blob * features.new.astype(self.dtype)
-        footprint = blob_kernels.gaussian_blobs(
-            particle_maps.to_window(ends, windows), amount, self.blob_sd, windows.size
+        footprint = likelihoods.gaussian_blobs(
+            particles.to_window(ends, windows), amount, self.blob_sd, windows.size
         )
         maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
         if config.wall == "blob":
             return maps, wall_directions
         place = self._in_cells(pose, features.on_wall[None])
-        windows = particle_maps.windows_around(place[:, 0], self.side, self.long)
-        place = particle_maps.to_window(place, windows)[:, 0]
+        windows = particles.windows_around(place[:, 0], self.side, self.long)
+        place = particles.to_window(place, windows)[:, 0]
         direction = pose[:, 2] + features.direction
         if config.wall == "edge":
-            shape = blob_kernels.wall_sector(
+            shape = likelihoods.wall_sector(
                 place, direction, config.along / cell, config.sector, windows.size
             )
         else:
-            shape = blob_kernels.wall_edge(
+            shape = likelihoods.wall_edge(
                 place, direction, config.along / cell, config.across / cell, windows.size
             )
         shape = jnp.where(features.wall, shape, 0.0)
         maps = self._add_footprint(maps, EVIDENCE, windows, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
-            field = particle_maps.read_window(maps, windows, layer) + shape * part[:, None, None]
-            maps = particle_maps.write_window(maps, windows, layer, field)
+            field = particles.read_window(maps, windows, layer) + shape * part[:, None, None]
+            maps = particles.write_window(maps, windows, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
         return maps, wall_directions + jnp.where(features.wall, pointing, 0.0)
 
-    def _add_footprint(
-        self, maps: Array, layer: int, windows: particle_maps.Windows, footprint: Array
-    ) -> Array:
+    def _add_footprint(self, maps: Array, layer: int, windows: particles.Windows, footprint: Array) -> Array:
         most = self.config.footprint.max_log_odds
-        evidence = jnp.clip(particle_maps.read_window(maps, windows, layer) + footprint, -most, most)
-        return particle_maps.write_window(maps, windows, layer, evidence)
+        evidence = jnp.clip(particles.read_window(maps, windows, layer) + footprint, -most, most)
+        return particles.write_window(maps, windows, layer, evidence)
 
     def _window(self, reach: float) -> int:
         """Side length, cells, of a window that reaches `reach` m in every direction.
@@ -320,7 +317,7 @@ class GridBackend(Backend):
         right, up = points.T[:, None]
         x = pose[:, :1] + c * right - s * up
         y = pose[:, 1:2] + s * right + c * up
-        return particle_maps.to_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
+        return particles.to_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
 
 
 def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:
@@ -334,7 +331,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
             "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
         )
     side = config.side or LIVE_SIDE
-    if config.particles * particle_maps.LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
+    if config.particles * particles.LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
         raise InputError(
             "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"

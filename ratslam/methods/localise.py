@@ -13,8 +13,8 @@ from jax import lax
 
 from ratslam.core.backend import Backend, Map
 from ratslam.core.estimates import Action, Estimate, Scalar
-from ratslam.core.finite_values import finite_values
-from ratslam.mapping.gain_odds import DISTINCT
+from ratslam.core.session import finite_values
+from ratslam.mapping.ground import DISTINCT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig
 from ratslam.methods.finished_map import map_file, restore_map

@@ -13,17 +13,15 @@ from jax import lax
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
-from ratslam.grid.expectation import expect
-from ratslam.grid.localiser import GridLocaliser, SavedGrid
+from ratslam.grid.expectation import draw_surfaces, expect
+from ratslam.grid.localiser import GridLocaliser, SavedGrid, Search, Supposed, counted_agreement
 from ratslam.grid.map import GridMap
-from ratslam.grid.search import Search, Supposed, counted_agreement
-from ratslam.grid.surfaces import draw_surfaces
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
 from ratslam.methods.finished_map import map_file, restore_map
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.whisker_geometry import PlanarWhiskers
 
 DRIVEN = -2.0
 """Log-odds of a surface below which a cell is known to be free, and the robot may stand there."""

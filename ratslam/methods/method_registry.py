@@ -28,7 +28,7 @@ from ratslam.methods.localise_grid import GridLocaliseEvidence, GridLocaliseOutc
 from ratslam.methods.recall import RecallBackend, RecallEvidence, RecallOutcome
 from tactile.base.plugins import Registry, read_settings
 from tactile.base.settings import Settings
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.whisker_geometry import PlanarWhiskers
 
 
 class Sensors(NamedTuple):

@@ -14,18 +14,21 @@ from jax import lax
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, Map, PoseCellProbe, enlarge
 from ratslam.core.estimates import Action, Estimate, PoseCellActivity, Scalar
-from ratslam.core.finite_values import finite_values
-from ratslam.mapping.acceptance import Acceptance, AcceptByEvidence
-from ratslam.mapping.appearance import Appearance, LabelAppearance, ViewAppearance, WhiskerAppearance
+from ratslam.core.session import finite_values
+from ratslam.mapping.acceptance import Acceptance, AcceptByEvidence, AcceptByOdds
+from ratslam.mapping.appearance import (
+    Appearance,
+    LabelAppearance,
+    SignedAppearance,
+    ViewAppearance,
+    WhiskerAppearance,
+)
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.closure_odds import AcceptByOdds
 from ratslam.mapping.config import FULL, Ablation
 from ratslam.mapping.keyframe_graph import KeyframeGraph, piece_start
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.signed_appearance import SignedAppearance
 from ratslam.methods.config import RecallBackendConfig
-from ratslam.methods.map_views import MapViews
-from ratslam.methods.piece_ties import PieceTies
+from ratslam.methods.map_views import MapViews, PieceTies
 from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief

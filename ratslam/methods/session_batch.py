@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.packing import PackedRecords, allocate, layout_of
+from ratslam.core.arrays import PackedRecords, allocate, layout_of
 from ratslam.core.session import CHUNK, Session, run_chunk
 from ratslam.methods.recall import RecallBackend, RecallState
 from ratslam.recall.memory import MapFeedback, MergedRows, pack_feedback

@@ -9,9 +9,8 @@ from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import INTERRUPTED, KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.merged_odometry import take_keyframes
-from ratslam.mapping.step_record import StepRecord
-from ratslam.mapping.travel import HALT, Travel
+from ratslam.mapping.merging import take_keyframes
+from ratslam.mapping.step_record import HALT, StepRecord, Travel
 from ratslam.recall.memory import CroppedRows, MergedRows
 from tactile.base.se2 import between, compose, correct_heading, inverse
 

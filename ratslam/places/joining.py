@@ -21,18 +21,15 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ratslam.mapping.following import STILL, Motion, Supposed, advance
-from ratslam.mapping.gain_odds import GainOdds
-from ratslam.mapping.ground import Ground
+from ratslam.mapping.closure_selection import MapHypotheses
+from ratslam.mapping.ground import STILL, GainOdds, Ground, Motion, Supposed, advance
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_hypotheses import MapHypotheses
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.mapping.optimizer import MapCovariance
-from ratslam.places.paths import Path, at_undriven_headings, counted_beside, keyframe_odds
-from ratslam.places.placement import Stretch, Traverse, closures_along, find_placements
-from ratslam.places.view_comparison import Comparison
+from ratslam.places.hypotheses import Path, at_undriven_headings, counted_beside, keyframe_odds
+from ratslam.places.placement import Comparison, Stretch, Traverse, closures_along, find_placements
 from ratslam.recall.memory import Memory
 from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
 

@@ -1,7 +1,10 @@
 """Where a session is in a finished map: placements that recall proposes, and their evidence.
 
 A placement is followed through the whole session, to its start and to its end: it has to explain all views,
-not only those that proposed it. The rule is ours."""
+not only those that proposed it. The rule is ours.
+
+The views of a session compared with a ground.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,30 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ratslam.mapping.following import Motion, Supposed
-from ratslam.mapping.gain_odds import GainOdds
-from ratslam.mapping.ground import Ground, Match
-from ratslam.places.hypotheses import HOPELESS, same_pose
-from ratslam.places.paths import Path, follow
-from ratslam.places.view_comparison import Comparison
+from ratslam.mapping.ground import GainOdds, Ground, Match, Motion, Supposed
+from ratslam.places.hypotheses import HOPELESS, Path, follow, same_pose
 from tactile.base.se2 import between, compose
+
+
+class Comparison(NamedTuple):
+    """The views of n keyframes of a session, in order of time, compared with a ground of N keyframes.
+
+    Attributes:
+        gain: [n, S, N] log-likelihood of each view at each sector shift and keyframe less that at a new
+            place. shows: [n] bool, whether the view can be compared. match, shift: [n] the keyframe that is
+            recalled, -1 for none, and the row of its sector shift. posterior: [n] of the places around it.
+    """
+
+    gain: np.ndarray
+    shows: np.ndarray
+    match: np.ndarray
+    shift: np.ndarray
+    posterior: np.ndarray
+
+    def gains(self, k: int) -> np.ndarray | None:
+        """[S, N] gains of one view, None if it shows nothing."""
+        return self.gain[k] if self.shows[k] else None
+
 
 CONFIRMING = 3
 """Keyframes after which a recalled pose has to agree with odometry before it is proposed."""

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tactile.base.se2 import wrap
-from tactile.base.segments import segment_distances
+from tactile.base.se2 import segment_distances, wrap
 
 if TYPE_CHECKING:
     import networkx

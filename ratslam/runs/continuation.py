@@ -9,9 +9,8 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.estimate import START, PoseEstimate
-from ratslam.runs.map_settings import check_same_method
+from ratslam.runs.map_settings import check_same_method, check_same_sensor, sensor_of
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, read_map
-from ratslam.runs.sensor import check_same_sensor, sensor_of
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError, tell

@@ -8,22 +8,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes
+from evaluation.artifacts.closure_table import NAME, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.core.localisation import Localisation
+from ratslam.core.estimates import Localisation
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.methods.config import Start
 from ratslam.methods.method_registry import LOCALISING
 from ratslam.places.localiser import Localiser
-from ratslam.runs.open_source import open_observations
-from ratslam.runs.progress import Observer
+from ratslam.runs.build_session import open_observations
+from ratslam.runs.map_settings import check_same_fov
 from ratslam.runs.run import LAST_TASK, catch_interrupt, process_source
-from ratslam.runs.runner import open_runner
+from ratslam.runs.runner import Observer, open_runner
 from ratslam.runs.saved_map import SavedMap, is_map
-from ratslam.runs.sensor import check_same_fov
-from ratslam.runs.settings.other_files import FOLDER, RECORDING, refuse_other_files
 from ratslam.runs.settings.run_config import RunConfig, SourceConfig
-from ratslam.runs.settings.strict_yaml import dump, override, parse, validate
+from ratslam.runs.settings.strict_yaml import (
+    FOLDER,
+    RECORDING,
+    dump,
+    override,
+    parse,
+    refuse_other_files,
+    validate,
+)
 from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError, tell
 

@@ -20,13 +20,12 @@ from ratslam.places.crop import crop_map
 from ratslam.places.difference import MapContent, difference, keyframe_content
 from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
 from ratslam.runs.map_results import holds_results, rewrite_results
+from ratslam.runs.map_settings import disagreement
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
-from ratslam.runs.sensor import disagreement
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
-from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.new_file import make_new_file, require_writable
+from tactile.base.files import make_new_file, malformed, require_writable
 
 CURES = {
     Obstacle.NOT_ACCEPTED: "`ratslam map info {path} --json` lists them",

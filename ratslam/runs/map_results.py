@@ -1,4 +1,7 @@
-"""The files of a run directory or a merged folder that follow from its map; scores and plots of these."""
+"""The files of a run directory or a merged folder that follow from its map; scores and plots of these.
+
+The report: one page of HTML about runs, made from their directories.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,53 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
-from evaluation.artifacts.merged_map import NAME as MERGED
-from evaluation.artifacts.merged_map import is_merged, read_session_steps
-from evaluation.artifacts.pieces_table import NAME as PIECES
-from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_reader import has_steps, read_run
+from evaluation.artifacts.run_reader import MERGED_MAP_NAME as MERGED
+from evaluation.artifacts.run_reader import NAME as PIECES
+from evaluation.artifacts.run_reader import has_steps, is_merged, read_run, read_session_steps, write_pieces
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum, write_tum
+from evaluation.plots.map_plot import draw_sessions
 from evaluation.plots.run_plots import plot_writers
-from evaluation.plots.session_plot import draw_sessions
+from evaluation.report import PAGE_START
+from evaluation.report.page import PageRun, check_report_libraries, write_page
+from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
-from ratslam.runs.report import NAME as REPORT
+from ratslam.runs.settings.changed_settings import ChangedSetting, changed_settings
+from ratslam.runs.settings.packaged import read_citation
 from ratslam.runs.settings.run_config import ScoreConfig
-from tactile.base.atomic_write import write_atomically, write_text_atomically
 from tactile.base.errors import InputError
+from tactile.base.files import require_new_file, write_atomically, write_text_atomically
+
+NAME = "report.html"
+"""Name of the page in a run directory."""
+
+
+def write_report(directories: Sequence[Path], path: Path) -> None:
+    """Writes the page of a run, or of several and their comparison; the file works without network.
+
+    Args:
+        directories: of runs, also of interrupted or killed ones. path: the file; a page that was
+            there is replaced.
+
+    Raises:
+        InputError: a folder holds no run or a malformed one, the file exists and is no page, or the extra
+            [report] is not installed.
+    """
+    check_report_libraries("report")
+    require_new_file(path, replaces=PAGE_START)
+    runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
+    write_page(path, runs, read_citation())
+
+
+def _settings(directory: Path) -> list[ChangedSetting] | None:
+    """The settings of a run that differ from the defaults; None for a configuration of another version."""
+    try:
+        return changed_settings(directory / "config.yaml")
+    except InputError:
+        return None
+
 
 DERIVED = ("pieces.csv", "health.json", "calibration.yaml", "closures.csv")
 """Files that only some maps have."""
@@ -97,7 +131,7 @@ def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:
         raise InputError(str(online), f"{len(time)} steps beside a map of {steps}", "a run that ended", cure)
     write_map_results(folder, made, time)
     score_and_plot(folder, config)
-    (folder / REPORT).unlink(missing_ok=True)
+    (folder / NAME).unlink(missing_ok=True)
 
 
 def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:

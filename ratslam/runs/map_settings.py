@@ -1,15 +1,20 @@
-"""The settings that a map depends on, and which differ between maps or in a session that is to go on."""
+"""The settings that a map depends on, and which differ between maps or in a session that is to go on.
+
+The sensor of a map: what its views are measured with, and how they are made of the readings.
+"""
 
 from __future__ import annotations
 
 import json
 import shlex
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.run_config import RunConfig
+from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
+from robot.sources.source import Source
 from tactile.base.errors import InputError
 
 
@@ -70,3 +75,181 @@ def _settings(config: RunConfig) -> dict[str, Any]:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+WHISKER_HEAD, FIXED_WHISKERS, OTHER_TOUCH = "whisker head", "fixed whiskers", "registered touch sensor"
+VIEWS, LABELS = "camera or laser", "given place labels"
+UNITS = {True: "signed departures from rest, in the sensor's unit", False: "values in 0..1"}
+Difference = tuple[str, Any, Any]
+"""What differs, by the name of a setting or in words, and its values in a map and elsewhere."""
+NORMALISATION = ("source", "normalise_mean", "patch", "patch_sd")
+
+WORDS = {
+    "kind": "the sensor",
+    "view_shape": "the shape of the views",
+    "whiskers": "the number of whiskers",
+    "unit": "the unit of the views",
+}
+CELL = "pose_cells.cell_size"
+SAME_FOV = 0.3  # rad, by which the ends of the scans of one sensor may vary
+GEOMETRY = ("touch.head.", "touch.reports.mounts", "touch.reports.length", "touch.frontend.plugin")
+
+
+class Sensor(NamedTuple):
+    """A sensor. Views of two sessions can be compared only if their sensors agree (`disagreement`).
+
+    Attributes:
+        kind: of the sensor. view_shape: (R, C, K) of the views. whiskers: W, 0 without whiskers.
+        unit: of the views' values. cell: side length of a pose cell, m, the unit of keyframe distances.
+        geometry: of the whiskers, m and degrees. transform: settings that make views of readings; of a
+            recording of finished views they are not known, and left out.
+    """
+
+    kind: str
+    view_shape: tuple[int, int, int]
+    whiskers: int
+    unit: str
+    cell: float
+    geometry: dict[str, Any]
+    transform: dict[str, Any]
+
+    def describe(self) -> str:
+        """The sensor in one line."""
+        rows, columns, channels = self.view_shape
+        count = f", {self.whiskers} whiskers" if self.whiskers else ""
+        return f"{self.kind}{count}; views of {rows} x {columns} x {channels}, {self.unit}"
+
+
+def sensor_of(config: RunConfig, source: Source) -> Sensor:
+    """The sensor of a configuration completed for its source.
+
+    Args:
+        source: its view shape is that of the observations; its info that of the readings or of the
+            observations made of them.
+    """
+    info, touch = source.info, config.touch
+    templates = {name: getattr(config.templates, name) for name in NORMALISATION}
+    geometry: dict[str, Any] = {}
+    if touch.frontend is not None:
+        kind, made = OTHER_TOUCH, {"touch.frontend": touch.frontend.model_dump(mode="json")}
+    elif info.labels_only:
+        kind, made = LABELS, {}
+    elif info.planar_whiskers is not None:
+        reports = touch.reports.model_dump(mode="json")
+        geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
+        kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
+    elif source.whiskers:
+        head = touch.head.model_dump(mode="json")
+        geometry = {f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")}
+        kind, made = WHISKER_HEAD, _sensor_settings("touch.image", touch.image)
+    else:
+        kind, made = VIEWS, _view_settings(config)
+    transform = made | {f"templates.{name}": value for name, value in templates.items()}
+    transform = {
+        name: value for name, value in transform.items() if value is not None or name.startswith("recording.")
+    }
+    plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
+    unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
+    return Sensor(kind, source.view_shape, source.whiskers, unit, cell, *plain)
+
+
+def disagreement(of_map: Sensor, other: Sensor) -> str:
+    """How another sensor differs from that of a map, as a clause; '' if they agree."""
+    found = [[("null" if each is None else each) for each in found] for found in differences(of_map, other)]
+    clauses = [f"{what} is {others} and was {ours}" for what, ours, others in found]
+    return f"{', '.join(clauses)} when the map was made" if clauses else ""
+
+
+def differences(one: Sensor, other: Sensor) -> list[Difference]:
+    """What differs between two sensors. Settings that only one of them knows do not count; of sensors of two
+    kinds, only the kind is named.
+    """
+    if one.kind != other.kind:
+        return [(WORDS["kind"], one.kind, other.kind)]
+    known = flat_settings(one.geometry | one.transform | {CELL: one.cell})
+    others = flat_settings(other.geometry | other.transform | {CELL: other.cell})
+    found = [(key, known[key], value) for key, value in others.items() if known.get(key, value) != value]
+    shaped = any(what.endswith((".rows", ".columns")) for what, _, _ in found)
+    for name in ("view_shape", "whiskers", "unit"):
+        ours, theirs = getattr(one, name), getattr(other, name)
+        if ours != theirs and not (shaped and name == "view_shape"):
+            found.insert(0, (WORDS[name], ours, theirs))
+    return found
+
+
+def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:
+    """The settings that make a sensor that of a map; None if the device or its views differ beyond them."""
+    if any(what in WORDS.values() or what.startswith(GEOMETRY) for what, _, _ in found):
+        return None
+    return {key: ours for key, ours, _ in found}
+
+
+def check_same_sensor(where: str, of_map: Sensor, other: Sensor) -> None:
+    """Raises `InputError` with the reason if a map cannot be used with another sensor, or other settings of
+    it.
+
+    Args:
+        where: the map, for the error.
+    """
+    reason = disagreement(of_map, other)
+    if settings := settings_of_map(differences(of_map, other)):
+        found = f"made with other settings of the sensor: {reason}"
+        cure = f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
+        raise InputError(where, found, "a map of these settings", cure)
+    if reason:
+        raise InputError(where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})")
+
+
+def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
+    """Raises `InputError` if the recordings of two configurations see other angles, as far as they say so;
+    views of two formats, such as a table and a bag, are only compared if both say it.
+
+    Args:
+        where: the map, for the error.
+    """
+    fovs = [config.recall.sector_fov for config in (of_map, other)]
+    formats = [_format_of(config) for config in (of_map, other)]
+    known = [fov for fov in fovs if not isinstance(fov, str)]
+    same_format = formats[0] == formats[1] or "" in formats
+    if not known or (abs(known[0] - known[1]) <= SAME_FOV if len(known) == 2 else same_format):
+        return
+    angles = ["an unknown angle" if isinstance(fov, str) else f"{fov:.4g} rad" for fov in fovs]
+    ours, theirs = (f"{views or 'views'} over {angle}" for views, angle in zip(formats, angles, strict=True))
+    cure = "if it is the same sensor, set recall.sector_fov in both configurations to its field of view"
+    found = f"made with another sensor: {ours}, and not {theirs}"
+    raise InputError(where, found, "a map of this sensor", cure)
+
+
+def _format_of(config: RunConfig) -> str:
+    """What the views of a recording are made of, in words; '' where it does not say."""
+    recording = config.recording
+    if recording is None:
+        return ""
+    if recording.topics is not None:
+        return "topics of a bag"
+    if recording.file.suffix.lower() in VIDEO_SUFFIXES:
+        return "frames of a video"
+    return "a table" if recording.table.views is not None else ""
+
+
+def _sensor_settings(section: str, settings: Any) -> dict[str, Any]:
+    return {f"{section}.{name}": value for name, value in settings.model_dump(mode="json").items()}
+
+
+def _view_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings by which a recording's images or ranges became views, where it is not one of views."""
+    recording = config.recording
+    if recording is None:
+        return {}
+    image = _sensor_settings("recording.image", recording.image)
+    if recording.topics is not None:
+        topic = recording.topics.views
+        kept = {} if topic is None else topic.model_dump(include={"rows", "columns", "max_range", "heights"})
+        return image | {f"recording.topics.views.{name}": value for name, value in kept.items()}
+    if recording.file.suffix.lower() in VIDEO_SUFFIXES:
+        return image
+    table = recording.table
+    if table.views is None:
+        return {}
+    shape = {f"recording.table.{name}": getattr(table, name) for name in ("rows", "columns")}
+    return shape | {"recording.table.views.max_range": table.views.max_range}

@@ -12,23 +12,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.merged_map import NAME as REPORT
+from evaluation.artifacts.run_reader import MERGED_MAP_NAME as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.map_views import MapViews
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.joining import Join, Stretches, join_all
-from ratslam.places.overlap import Overlap, overlap, remembered
-from ratslam.places.union import renew_experiences, unite
-from ratslam.runs.checkpoint_file import digest_of
+from ratslam.places.union import Overlap, overlap, remembered, renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
-from ratslam.runs.map_settings import assignments, differing_settings
-from ratslam.runs.saved_map import NAME, SavedMap, read_map, write_map
-from ratslam.runs.sensor import differences, settings_of_map
+from ratslam.runs.map_settings import assignments, differences, differing_settings, settings_of_map
+from ratslam.runs.saved_map import NAME, SavedMap, digest_of, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.errors import InputError
-from tactile.base.new_file import make_new_file, new_folder
+from tactile.base.files import make_new_file, new_folder
 
 
 class MergeReport(NamedTuple):

@@ -21,11 +21,11 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, render_health, render_warnings, scorecard_html
 from evaluation.plots.run_plots import run_plots
 from evaluation.report.verdict import describe_score, judge_map
-from ratslam.core.kernel_cache import keep_kernels
-from ratslam.mapping.io import read_json
+from ratslam.core.compilation import keep_kernels
+from ratslam.mapping.pose_graph import read_json
+from ratslam.runs.build_session import ConfigLike, resolve_config
 from ratslam.runs.estimate import Health
-from ratslam.runs.open_source import ConfigLike, resolve_config
-from ratslam.runs.report import NAME, write_report
+from ratslam.runs.map_results import NAME, write_report
 from ratslam.runs.run import run as write_run
 from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.errors import InputError

@@ -17,11 +17,10 @@ from tqdm import tqdm
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.session import CHUNK
-from ratslam.runs.open_source import open_observations, open_source
-from ratslam.runs.progress import Observer
-from ratslam.runs.runner import Runner, open_runner
+from ratslam.runs.build_session import open_observations, open_source
+from ratslam.runs.runner import Observer, Runner, open_runner
 from ratslam.runs.settings.run_config import RunConfig
-from robot.recordings.recorder import Recorder
+from robot.recordings.mcap_writer import Recorder
 from robot.sources.source import Source
 from tactile.base.errors import InputError, printable, tell
 from tactile.base.types import Cycle, Whisk

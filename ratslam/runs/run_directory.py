@@ -2,19 +2,50 @@
 
 Text files grow by whole lines, one chunk at a time; all other files appear complete, by renaming. So an
 interrupt, a kill or a full disk leaves a readable prefix.
+
+Writes the world, views and the grid map to a run directory, for scores, plots and the report.
+
+Changes between a map and a session localised in it: the file changes.csv.
+
+The error of the online pose while a run proceeds.
 """
 
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-from tactile.base.atomic_write import write_atomically, write_text_atomically
+import numpy as np
+
+from evaluation.artifacts import recorded_views
+from evaluation.artifacts.closure_table import NAME, ChangeRow, read_closure_table, write_changes
+from evaluation.artifacts.grid_files import read_grid, write_grid_truth, write_nav2
+from evaluation.artifacts.recorded_views import (
+    ClosureViews,
+    WhiskerViews,
+    write_closure_views,
+    write_whisker_views,
+)
+from evaluation.artifacts.run_reader import write_walls
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
+from evaluation.metrics.occupancy_score import score_grid
+from evaluation.metrics.trajectory import current_error
+from ratslam.core.backend import Map
+from ratslam.core.session import CHUNK, Session
+from ratslam.places.change import Change, Touch, session_changes
+from ratslam.places.localiser import Localiser
+from robot.sources.source import SourceInfo
+from robot.world.arena import Arena, is_enclosed, is_occupied, read_arena, wall_segments
+from robot.world.maze import read_maze, wall_boxes
 from tactile.base.errors import os_errors_of
-from tactile.base.new_file import require_new_file
+from tactile.base.files import require_new_file, write_atomically, write_text_atomically
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, inverse
+from tactile.frontend import TouchConfig
+from tactile.whisker_geometry import ur10_head
 
 COLUMNS = (
     "t", "place", "action", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost", "doubt", "outcome",
@@ -57,10 +88,10 @@ class RunDirectory:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for stream in self._streams.values():
+        for file in self._streams.values():
             # A full disk has been reported by the failed write; closing would report it again.
             with suppress(OSError):
-                stream.close()
+                file.close()
 
     def append(self, lines: Mapping[str, Iterable[str]]) -> None:
         """Appends whole lines to the text files and flushes them."""
@@ -90,3 +121,134 @@ class RunDirectory:
             named = OSError(error.errno, error.strerror, error.filename or str(self.path / name))
             named.add_note("the files written before are complete")
             raise named from error
+
+
+WhiskerView = tuple[np.ndarray, np.ndarray]
+"""A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
+
+
+def save_world(info: SourceInfo, directory: RunDirectory) -> None:
+    """Writes maze.txt and walls.csv of a source in a maze, arena.txt of one in an arena."""
+    if info.arena is not None:
+        directory.text("arena.txt", info.arena)
+    maze = info.maze
+    if maze is None:
+        return
+    directory.text("maze.txt", maze.text)
+    boxes = wall_boxes(
+        read_maze(directory.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights
+    )
+    directory.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
+
+
+def save_whisker_views(views: list[WhiskerView], config: TouchConfig, directory: RunDirectory) -> None:
+    """Writes views.npz, if the views are images of the whiskers of a head."""
+    head = ur10_head(config.head)
+    if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
+        return
+    columns = head.shape[1]
+    images = WhiskerViews(
+        view=np.array([view[..., 0] for view, _ in views]),
+        alive=np.array([alive.reshape(head.shape) for _, alive in views]),
+        azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
+        length=head.length[::columns],
+        tallest=config.image.tallest,
+    )
+    directory.file("views.npz", lambda path: write_whisker_views(path, images))
+
+
+def save_closure_views(images: Sequence[np.ndarray | None], directory: RunDirectory) -> None:
+    """Writes recorded_views.npz: the images [R, C] of this run's steps that closures join; None: no view."""
+    joined = np.unique(read_closure_table(directory.path).steps).tolist()
+    seen = {step: image for step, image in enumerate(images) if image is not None}
+    steps = [step for step in joined if step in seen]
+    if steps:
+        views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+        directory.file(recorded_views.NAME, lambda path: write_closure_views(path, views))
+
+
+def save_grid_map(directory: RunDirectory) -> None:
+    """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in the grid are
+    known, which they are not of a localised session, also arena.npz (the true grid) and gridscore.json."""
+    file = directory.path / "grid.npz"
+    if not file.exists():
+        return
+    grid = read_grid(file)
+    write_nav2(directory.path, grid)
+    if not (directory.path / "arena.txt").exists() or (directory.path / "localisation.csv").exists():
+        return
+    arena = read_arena(directory.path / "arena.txt")
+    truth = true_grid(arena, grid)
+    directory.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
+    score = score_grid(grid, truth, directory.path.name)
+    directory.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
+
+
+def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
+    """The arena on the cells of a grid whose frame is the robot's start pose."""
+    place = cell_centres(grid)
+    there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
+    ends = wall_segments(arena).reshape(-1, 2)
+    seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
+    return GridTruth(is_occupied(arena, there), is_enclosed(arena, there), seen.reshape(-1, 4))
+
+
+def save_changes(map: Map, config: TouchConfig, directory: RunDirectory) -> None:
+    """Writes changes.csv of a session that was localised in a map."""
+    if isinstance(map, Localiser):
+        rows = change_rows(map, changes_of(map, config))
+        directory.file(NAME, lambda path: write_changes(path, rows))
+
+
+def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
+    """The places at which a localised session does not agree with its map, the surest first."""
+    touch = Touch(ur10_head(config.head), config.image.tallest)
+    return session_changes(localiser.place, localiser.visits(), touch)
+
+
+def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:
+    """The lines of changes.csv."""
+    steps = localiser.visits().step
+    return [
+        ChangeRow(
+            x=float(change.position[0]),
+            y=float(change.position[1]),
+            extent=change.extent,
+            kind=change.kind,
+            evidence=change.evidence,
+            alarms=change.alarms,
+            passes=change.passes,
+            first_step=int(steps[change.keyframes[0]]),
+            last_step=int(steps[change.keyframes[-1]]),
+        )
+        for change in changes
+    ]
+
+
+class OnlineErrorLog:
+    """Position error of the current pose after the online trajectory is aligned with the truth.
+
+    It is computed at the end of a chunk, less often as the trajectory grows, because each value aligns the
+    whole trajectory.
+
+    Args:
+        skipped: steps of the session's map that have no truth here: those of the run that it continues.
+
+    Attributes:
+        errors: values so far, m.
+    """
+
+    def __init__(self, skipped: int = 0) -> None:
+        self.errors: list[float] = []
+        self._skipped, self._due = skipped, skipped
+
+    def update(self, session: Session, truth: Sequence[np.ndarray] | np.ndarray) -> float | None:
+        """The error now, m; None between two values or if the last row of the truth [steps, 3] is NaN."""
+        if session.steps < self._due or session.steps % CHUNK or not np.isfinite(truth[-1]).all():
+            return None
+        self._due = session.steps + max(CHUNK, session.steps // 256)
+        true = np.asarray(truth)
+        known = np.isfinite(true).all(axis=1)
+        error = current_error(session.map.online_trajectory()[self._skipped :][known], true[known])
+        self.errors.append(error)
+        return error

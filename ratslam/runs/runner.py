@@ -1,4 +1,10 @@
-"""Processes samples with a backend and writes, scores and plots the result in a run directory."""
+"""Processes samples with a backend and writes, scores and plots the result in a run directory.
+
+Reports the progress of a run to observers, as plain data.
+
+Maps are asked at the end of chunks only, and for what takes long less and less often: the cost of all
+questions together stays a small multiple of the last one.
+"""
 
 from __future__ import annotations
 
@@ -10,47 +16,133 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from evaluation.artifacts.closure_views import eight_bit
 from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.recorded_views import eight_bit
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import read_tum
-from ratslam.core.estimates import Action
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.estimates import Action, GridDrawing, PoseCellActivity
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
-from ratslam.runs.artifacts import (
+from ratslam.runs.build_session import build_session
+from ratslam.runs.cell_recorder import open_cell_recorder
+from ratslam.runs.continuation import checkpoint_of, resume_session
+from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
+from ratslam.runs.map_results import score_and_plot, write_map_results
+from ratslam.runs.map_settings import check_same_sensor, sensor_of
+from ratslam.runs.run_directory import (
+    OnlineErrorLog,
+    RunDirectory,
     WhiskerView,
+    save_changes,
     save_closure_views,
     save_grid_map,
     save_whisker_views,
     save_world,
 )
-from ratslam.runs.build_session import build_session
-from ratslam.runs.cell_recorder import open_cell_recorder
-from ratslam.runs.continuation import checkpoint_of, resume_session
-from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
-from ratslam.runs.map_changes import save_changes
-from ratslam.runs.map_results import score_and_plot, write_map_results
-from ratslam.runs.online_error import OnlineErrorLog
-from ratslam.runs.progress import MapReport, MapSchedule, Observer, RunDescription, StepReport
-from ratslam.runs.run_directory import RunDirectory
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
-from ratslam.runs.sensor import check_same_sensor, sensor_of
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump
 from robot.recordings.input_judge import judge_motion
 from robot.sources.source import Sample, Source
 from robot.touch_source import observation_of
-from tactile.base.atomic_write import temporary_path
+from tactile.base.files import temporary_path
 from tactile.base.se2 import between, compose, tum_line
 from tactile.base.types import Observation
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import Head, ur10_head
+
+DRAWN_SHARE = 16
+"""The whole map is reported when the run has grown by this part of its steps."""
+
+
+class RunDescription(NamedTuple):
+    """A run, at its beginning.
+
+    Attributes:
+        name: of its source. backend: by name.
+        head: the whisker head whose images the views are, or None. tallest: obstacle height of brightness 1
+            in them, m. pose_cells: whether the method has them.
+    """
+
+    name: str
+    backend: str
+    head: Head | None = None
+    tallest: float = 1.0
+    pose_cells: bool = False
+
+
+class StepReport(NamedTuple):
+    """One step.
+
+    Attributes:
+        number: of the step, from 0. time: s, on the clock of the source. observation: as mapped.
+        odometry: [3] dead reckoning from the first step of the run. pose: [3] online, in the map frame.
+        place, previous: id of the present place and of the one before, -1 for none. lost: see `Estimate`.
+        doubt: probability that the map is worse than odometry, NaN if not judged.
+    """
+
+    number: int
+    time: float
+    observation: Observation
+    odometry: np.ndarray
+    pose: np.ndarray
+    place: int
+    previous: int
+    lost: bool
+    doubt: float
+
+
+class MapReport(NamedTuple):
+    """The map after a step.
+
+    Attributes:
+        closures: [n, 3] earlier step, later step and verdict, see `Map.judged_closures`. activity: of the
+            pose cells, if the method has them.
+        path: [T, 3] all steps in the present map, and grid: the occupancy grid; None where not due.
+    """
+
+    closures: np.ndarray
+    activity: PoseCellActivity | None
+    path: np.ndarray | None = None
+    grid: GridDrawing | None = None
+
+
+class Observer(Protocol):
+    """Is told of the progress of a run. It must neither raise nor wait: the run would do so too."""
+
+    def begin(self, run: RunDescription) -> None:
+        """The run begins, after its directory is made."""
+
+    def update(self, steps: Sequence[StepReport], map: MapReport | None) -> None:
+        """Steps were mapped; the map is reported at the end of a chunk."""
+
+    def finish(self, map: MapReport) -> None:
+        """The run has ended; `path` is the final trajectory."""
+
+
+class MapSchedule:
+    """Decides when the whole map is reported.
+
+    Args:
+        steps: of the session so far.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self._due = steps
+
+    def is_due(self, steps: int) -> bool:
+        """Whether it is due after so many steps; the next one is due later."""
+        if steps < self._due:
+            return False
+        self._due = steps + steps // DRAWN_SHARE
+        return True
+
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more,

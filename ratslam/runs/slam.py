@@ -11,26 +11,22 @@ from typing import Any, Literal
 import numpy as np
 
 from ratslam.core.backend import Map
-from ratslam.core.kernel_cache import keep_kernels
+from ratslam.core.compilation import keep_kernels
 from ratslam.methods.method_registry import BACKENDS
-from ratslam.runs.build_session import build_session
+from ratslam.runs.build_session import ConfigLike, build_session, open_source, resolve_config
 from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
 from ratslam.runs.localise import localising
-from ratslam.runs.open_source import ConfigLike, open_source, resolve_config
 from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.description import SourceDescription
-from robot.sources.source import Sample, Source
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import Sample, Source, SourceDescription, SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
-from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_new_file
+from tactile.base.files import malformed, require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
-from tactile.features.whisker_image import view_shape
 from tactile.frontend import TouchConfig
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import ur10_head
+from tactile.whisker_image import view_shape
 
 ODOMETRY = len(Odometry._fields)
 
@@ -150,7 +146,7 @@ class Slam:
                 run starts anew.
             mode: `localise`: the map stays as it is, and the robot may stand anywhere in it or elsewhere;
                 `slam.map.localisation()` tells whether and where it was found
-                (`ratslam.core.localisation.LocalisedPose`), `estimate.lost` whether it was not.
+                (`ratslam.core.estimates.LocalisedPose`), `estimate.lost` whether it was not.
 
         Raises:
             InputError: there is no map, or it cannot be used (`read_map`).

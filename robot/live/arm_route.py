@@ -7,15 +7,14 @@ from typing import Protocol
 import numpy as np
 
 from robot.drivers.outcome import Fault
-from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.drivers.ur10.safety import check_target as allowed
 from robot.live.live_config import LiveConfig
 from robot.simulation.head.simulated_session import SimulationConfig
-from robot.world.head_trajectory import HeadPath
-from robot.world.scene import Scene, make_scene
+from robot.world.scene import HeadPath, Scene, make_scene
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import Head
+from tactile.whisker_geometry import Head
 
 
 class MovableArm(Protocol):

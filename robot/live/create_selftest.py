@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from robot.drivers.create.driver_config import CommandRefused, wheel_speeds
 from robot.drivers.create.protocol import Bumps, describe_bumps
 from robot.drivers.create.serial_link import open_port
-from robot.drivers.create.stop_reasons import CommandRefused, wheel_speeds
 from robot.drivers.outcome import SessionOutcome
 from robot.live import selftest
 from robot.live.create_rig import CreateRig, unusual_strain

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.head.driver_config import Address
-from robot.drivers.ur10.base_transform import tcp_from_pose
+from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
@@ -16,7 +16,7 @@ from robot.live.arm_route import plan_path
 from robot.live.live_config import CreateLiveConfig, LiveConfig
 from robot.simulation.head.beam import StreamConfig
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 
 def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:

@@ -1,11 +1,25 @@
-"""The end of a session, and waiting for a condition while devices are polled."""
+"""The end of a session, and waiting for a condition while devices are polled.
+
+The samples of a head as they arrive, with its clock: what every rig does with a head.
+
+The mapper of a session, as its loops see it.
+"""
 
 from __future__ import annotations
 
+import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Protocol
 
+import numpy as np
+
+from robot.drivers.clock_sync import ClockSync
+from robot.drivers.head.decoder import Frames
+from robot.drivers.head.reader import HeadReader, LinkState
+from robot.drivers.head.usb_protocol import FrameFlag
 from robot.drivers.outcome import Fault, SessionOutcome
+from robot.sources.source import Sample
 
 TICK = 0.01
 """Period of the poll, s."""
@@ -46,3 +60,96 @@ def wait_until(
             raise session_fault(late, f"{what} took more than {longest:g} s")
         poll()
         time.sleep(TICK)
+
+
+MAX_CLOCK_STEP = 2e-3
+"""Largest step of the head's clock against its sample count, s."""
+
+
+class HeadStream:
+    """Collects the blocks of a reader, from its thread, for the thread that polls.
+
+    Attributes:
+        clock: of the head, in host time. whisk_starts: sequence numbers of the first frames of whisks.
+        restarts: number of connections of the head.
+    """
+
+    def __init__(self, head: HeadReader) -> None:
+        self._head = head
+        self.clock = ClockSync()
+        self.whisk_starts: list[int] = []
+        self.restarts = 0
+        self._ahead: float | None = None  # s by which the head's clock leads its sample count
+        self._uneven = 0.0
+        self._blocks: queue.SimpleQueue[tuple[Frames, float] | None] = queue.SimpleQueue()
+        head.on_restart.append(lambda device, host: self._blocks.put(None))
+        head.listeners.append(lambda frames, arrival: self._blocks.put((frames, arrival)))
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the head sends samples."""
+        return self._head.state.link is LinkState.STREAMING
+
+    def take(self) -> Iterator[tuple[Frames, float]]:
+        """The blocks since the last call, with their arrival times, s, host."""
+        while not self._blocks.empty():
+            block = self._blocks.get()
+            if block is None:  # the head was reconnected: its clock may have changed
+                self.clock, self.whisk_starts = ClockSync(), []
+                self.restarts += 1
+                self._ahead = None
+                continue
+            frames, arrival = block
+            self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
+            self._count(frames)
+            begins = (frames.flags & np.uint8(FrameFlag.CYCLE)) > 0
+            self.whisk_starts += frames.sequence[begins].tolist()
+            yield frames, arrival
+
+    @property
+    def fault(self) -> Fault | None:
+        """The fault of the head or of its clock, or None."""
+        if self._head.fault:
+            return self._head.fault
+        if self.clock.jumps:
+            return Fault(SessionOutcome.CLOCK_JUMPED, "the head's clock jumped", time.monotonic())
+        if self._uneven > MAX_CLOCK_STEP:
+            detail = f"the head's clock is {self._uneven * 1e3:.1f} ms off its sample count"
+            return Fault(SessionOutcome.CLOCK_JUMPED, detail, time.monotonic())
+        return None
+
+    def _count(self, frames: Frames) -> None:
+        """Checks the head's clock against its sample count; both are independent of the host's load."""
+        assert self._head.identity is not None
+        ahead = frames.time * 1e-6 - frames.sequence / self._head.identity.rate
+        before = ahead[0] if self._ahead is None else self._ahead
+        self._uneven = max(self._uneven, float(np.abs(ahead - before).max()))
+        self._ahead = float(ahead[-1])
+
+
+class AsyncMapper(Protocol):
+    """Asynchronous mapper interface."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether the mapper runs."""
+        ...
+
+    @property
+    def failure(self) -> str:
+        """Reason for the end of the mapper."""
+        ...
+
+    def behind(self) -> float:
+        """Waiting time of the oldest unmapped sample, s."""
+        ...
+
+    def offer(self, sample: Sample) -> None:
+        """Passes the next sample; returns at once."""
+        ...
+
+
+def check_mapper(mapper: AsyncMapper) -> None:
+    """Raises the `SessionFault` of a mapper that has ended."""
+    if not mapper.alive:
+        raise session_fault(SessionOutcome.MAPPER_GONE, mapper.failure)

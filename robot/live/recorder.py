@@ -14,15 +14,24 @@ from typing import Self
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import MAX_FRAMES, Cut, select_frames
-from robot.drivers.head.decoder import Frames
+from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, select_frames
 from robot.drivers.outcome import Fault, SessionOutcome
-from robot.recordings.cdr import encode, encode_truth
-from robot.recordings.cdr_live import Event, encode_cut, encode_event, encode_frames, encode_states
+from robot.recordings.cdr import (
+    ARM,
+    CUT,
+    EVENT,
+    FRAMES,
+    TRUTH,
+    Event,
+    encode,
+    encode_cut,
+    encode_event,
+    encode_frames,
+    encode_states,
+    encode_truth,
+)
 from robot.recordings.mcap_writer import McapWriter, RecordingWriteError
-from robot.recordings.schemas import ARM, CUT, EVENT, FRAMES, TRUTH
-from robot.sources.source import Sample
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import Sample, SourceInfo
 
 BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""

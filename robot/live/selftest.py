@@ -12,14 +12,13 @@ import numpy as np
 
 from robot.drivers.head.reader import HeadReader
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.startup_checks import check_controller
+from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
-from robot.live.head_stream import HeadStream
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import Rig
-from robot.live.polling import TICK, SessionFault
+from robot.live.polling import TICK, HeadStream, SessionFault
 from tactile.base.errors import InputError, os_errors_of
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 LISTEN_TIME = 1.5
 """Time for which both streams are observed, s."""

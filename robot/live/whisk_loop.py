@@ -9,18 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import assemble_cycle, make_cut
-from robot.drivers.head.decoder import Frames
+from robot.drivers.head.decoder import Frames, assemble_cycle, make_cut
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import ArmRoute
-from robot.live.async_mapper import AsyncMapper, check_mapper
 from robot.live.live_rig import Rig
-from robot.live.polling import TICK, SessionFault, session_fault
+from robot.live.polling import TICK, AsyncMapper, SessionFault, check_mapper, session_fault
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry
-from tactile.whiskers.whisking import MID_PROTRACTION
+from tactile.whisking import MID_PROTRACTION
 
 
 class WhiskReport(NamedTuple):

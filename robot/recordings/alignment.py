@@ -11,9 +11,9 @@ from robot.recordings.input_judge import Cures, InputJudge, MotionTrack, unit_cu
 from robot.recordings.sanity_checks import RowName, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
-from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
-from tactile.base.bounded import MOST_PIXELS
+from robot.sources.source import PlanarWhiskersInfo, SourceInfo
 from tactile.base.errors import InputError
+from tactile.base.files import MOST_PIXELS
 
 RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
 

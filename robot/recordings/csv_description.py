@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robot.recordings.csv_config import PER_UNIT
 from robot.recordings.csv_file import CsvFile, read_csv
 from robot.recordings.csv_reader import other_plane, rounded_rate
-from robot.recordings.csv_units import PER_UNIT
 from tactile.base.errors import InputError
 
 TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "header_stamp", "datetime")

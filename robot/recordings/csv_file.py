@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.recordings.csv_units import PER_UNIT, per_unit, split_unit
-from robot.recordings.sanity_checks import count_others
-from robot.recordings.stretch import utc_seconds
+from robot.recordings.csv_config import PER_UNIT, per_unit, split_unit
+from robot.recordings.sanity_checks import count_others, utc_seconds
 from robot.sources.input_files import missing_error, read_bytes, require_file
 from tactile.base.errors import InputError
 

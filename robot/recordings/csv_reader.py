@@ -16,24 +16,24 @@ from robot.recordings.alignment import (
     range_errors,
     range_pixels,
 )
+from robot.recordings.csv_config import split_unit
 from robot.recordings.csv_file import EMPTY, CsvFile, read_csv
-from robot.recordings.csv_units import split_unit
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
 from robot.recordings.sanity_checks import (
     SPOILT,
+    WHOLE,
     RowName,
+    Stretch,
     clock_errors,
     first_error,
     leave_out,
     still_axis,
     view_errors,
 )
-from robot.recordings.stretch import WHOLE, Stretch
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
-from robot.sources.source_info import PlanarWhiskersInfo
-from robot.sources.source_registry import Warn
+from robot.sources.source import PlanarWhiskersInfo, Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 

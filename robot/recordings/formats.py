@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from robot.recordings.bags.topics_config import TopicsConfig
-from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
-from robot.recordings.stretch import Stretch
+from robot.recordings.sanity_checks import Stretch
+from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.input_files import require_file
-from robot.sources.odometry_correction import correct_odometry
-from robot.sources.source import Source
-from robot.sources.source_registry import SOURCES, SourceEntry, Warn
+from robot.sources.odometry import correct_odometry
+from robot.sources.source import SOURCES, Source, SourceEntry, Warn
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 
@@ -51,7 +50,7 @@ def _open_csv(config: RecordingConfig, judge: InputJudge) -> Source:
 
 
 def _open_video(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.camera.video_recording import read_video
+    from robot.recordings.video_recording import read_video
 
     return read_video(config, judge)
 

@@ -27,16 +27,15 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from robot.recordings.csv_units import PER_UNIT, WORDS
-from robot.recordings.sanity_checks import RowName, count_others
-from robot.recordings.stretch import WHOLE, Stretch
-from robot.sources.odometry_correction import (
+from robot.recordings.csv_config import PER_UNIT, WORDS
+from robot.recordings.sanity_checks import WHOLE, RowName, Stretch, count_others
+from robot.sources.odometry import (
     UNCORRECTED,
     OdometryCorrection,
     correct_motions,
     replace_steps,
 )
-from robot.sources.source_registry import Warn
+from robot.sources.source import Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 

@@ -12,18 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.recordings.bags.bag import container_fault
-from robot.recordings.cdr_live import Event
+from robot.recordings.cdr import TRUTH, Event
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner, is_foreign
-from robot.recordings.mcap_writer import McapWriter
-from robot.recordings.recorder import Recorder
+from robot.recordings.mcap_writer import McapWriter, Recorder
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
-from robot.recordings.schemas import TRUTH
 from robot.sources.input_files import digest_of_files, raise_errors, require_file
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
-from tactile.base.atomic_write import flush_to_disk
 from tactile.base.errors import InputError
-from tactile.base.new_file import make_new_file, require_new_file
+from tactile.base.files import flush_to_disk, make_new_file, require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
 
 

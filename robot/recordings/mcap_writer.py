@@ -1,6 +1,8 @@
 """Writes MCAP files that stay readable when the process is killed or the disk is full.
 
 Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
+
+Writes samples to a recording.
 """
 
 from __future__ import annotations
@@ -8,16 +10,17 @@ from __future__ import annotations
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, cast
+from types import TracebackType
+from typing import Any, Self, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, encode, encode_truth
 from robot.recordings.mcap_scanner import METADATA, RecordingDescription
-from robot.recordings.schemas import READINGS, SCHEMAS, TOPICS, TRUTH
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import Sample, SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.new_file import require_new_file
+from tactile.base.files import require_new_file
 
 CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
@@ -179,3 +182,61 @@ def _program() -> str:
         return f"ratslam {version('ratslam')}"
     except PackageNotFoundError:  # in a checkout
         return "ratslam"
+
+
+class Recorder:
+    """Writes samples to a new file; a context manager.
+
+    Args: see `McapWriter`.
+
+    Raises:
+        InputError: the file exists or cannot be created.
+        ValueError, TypeError: provenance in `info` is not JSON.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        view_shape: tuple[int, int, int] = (3, 6, 1),
+        whiskers: int = 0,
+        rate_hz: float = 0.0,
+        info: SourceInfo | None = None,
+        chunk_s: float = 0.5,
+    ) -> None:
+        info = info or SourceInfo()
+        self._writer = McapWriter(
+            path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info, chunk_s=chunk_s
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of samples so far."""
+        return self._writer.count
+
+    def write(self, sample: Sample) -> None:
+        """Append a sample.
+
+        Raises:
+            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
+                the disk is full.
+        """
+        if not np.isfinite(sample.time):
+            raise InputError("time", f"{sample.time}", "a finite number of seconds")
+        described = self._writer.description
+        name, message = encode(sample, described.view_shape, described.whiskers)
+        if sample.truth is not None:  # written first, so that no truncated file has a reading without it
+            self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
+        self._writer.append(name, sample.time, message)
+
+    def close(self) -> None:
+        """Finish the file; may be called again."""
+        self._writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

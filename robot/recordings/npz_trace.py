@@ -23,10 +23,9 @@ from robot.recordings.sanity_checks import RowName, clock_errors, first_error, n
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
-from robot.sources.source_info import SourceInfo
-from tactile.base.bounded import check_size, reason
+from robot.sources.source import SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.npz import SPOILT, read_arrays
+from tactile.base.files import NPZ_SPOILT, check_size, read_arrays, reason
 
 VIEW, ODOMETRY = 1, 2
 FASTEST = 1e6
@@ -137,7 +136,7 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
             return dict(zip(names, arrays, strict=True))
     except InputError:
         raise
-    except SPOILT as error:
+    except NPZ_SPOILT as error:
         cut = content.startswith(b"PK") and isinstance(error, zipfile.BadZipFile)
         cure = "it seems truncated or damaged: copy it again" if cut else "write it with numpy.savez"
         found = f"cannot be read as .npz ({reason(error)})"

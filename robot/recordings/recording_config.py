@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from robot.recordings.bags.topics_config import TopicsConfig
-from robot.recordings.camera.image_view import ImageViewConfig
-from robot.recordings.camera.video import VideoConfig
-from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.csv_config import CsvConfig
 from robot.recordings.input_judge import DEFAULT_LIMITS, UnitLimits
-from robot.recordings.stretch import StretchConfig
-from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection
+from robot.recordings.sanity_checks import StretchConfig
+from robot.recordings.video import ImageViewConfig, VideoConfig, VisualOdometryConfig
+from robot.sources.odometry import UNCORRECTED, OdometryCorrection
 
 
 class RecordingConfig(StretchConfig):

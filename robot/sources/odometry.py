@@ -2,18 +2,25 @@
 
 A motion is a row (dx m, dy m, dtheta rad, dt s): the pose after a step in the frame of the pose before it.
 The first row only sets the clock: its motion and duration are zero.
+
+Correction of an odometry whose systematic errors are known, and of steps that cannot be true.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from robot.sources.source import Source
-from tactile.base.se2 import between, integrate, wrap
+from robot.sources.in_memory import InMemorySource
+from robot.sources.input_files import digest_of
+from robot.sources.source import Sample, Source
+from tactile.base.se2 import between, correct_heading, integrate, wrap
 from tactile.base.settings import Settings
+from tactile.base.types import Observation, Odometry
 
 TURN_THEN_MOVE = 1.0  # share of the turn before the robot moves: all of it, as in OpenRatSLAM
 MIDPOINT = 0.5  # half of it: second order, exact to O(turn^2) for a constant twist
@@ -199,3 +206,96 @@ def odometry_extent(source: Source) -> float:
     moves = np.array([sample.reading.odometry[:3] for sample in source], float).reshape(-1, 3)
     path = integrate(np.where(np.isfinite(moves), moves, 0.0), np.zeros(3))
     return float(np.abs(path[:, :2]).max(initial=0.0))
+
+
+class OdometryCorrection(Settings):
+    """Systematic errors of an odometry, taken out of it; `python -m ratslam fit` finds them."""
+
+    length_scale: PositiveFloat = 1.0
+    """True distance for each metre of the odometry."""
+    turn_scale: PositiveFloat = 1.0
+    """True turn for each radian of the odometry."""
+    heading_bias: float = 0.0
+    """Turn to add for each metre of the odometry, rad/m, counter-clockwise."""
+    largest_step: PositiveFloat | None = None
+    """Longest step that can be true, m: a longer one (a wild pose, a reset, a velocity over a gap) is
+    replaced by the step before it. Null: none is."""
+    largest_turn: PositiveFloat | None = None
+    """Largest turn in a step that can be true, rad, likewise."""
+
+
+UNCORRECTED = OdometryCorrection()
+
+
+def replace_steps(
+    correction: OdometryCorrection, motion: np.ndarray, before: np.ndarray | None = None
+) -> np.ndarray:
+    """Motions [N, 3] (m, m, rad), those beyond the largest step and turn replaced by the last one within.
+
+    Args:
+        before: [3] the motion before the first; None: no motion.
+    """
+    if correction.largest_step is None and correction.largest_turn is None:
+        return motion
+    most = [np.inf if each is None else each for each in (correction.largest_step, correction.largest_turn)]
+    good = (np.hypot(motion[:, 0], motion[:, 1]) <= most[0]) & (np.abs(motion[:, 2]) <= most[1])
+    last = np.maximum.accumulate(np.where(good, np.arange(1, len(motion) + 1), 0))
+    return np.concatenate([np.zeros((1, 3)) if before is None else before[None], motion])[last]
+
+
+def correct_motions(correction: OdometryCorrection, motion: np.ndarray) -> np.ndarray:
+    """Motions [..., 3] (m, m, rad) of an odometry without its systematic errors; none is replaced."""
+    motion = np.asarray(motion, float)
+    length = np.hypot(motion[..., 0], motion[..., 1])
+    scaled = motion * np.array([correction.length_scale, correction.length_scale, 1.0])
+    return correct_heading(scaled, length, correction.heading_bias, correction.turn_scale - 1)
+
+
+def correct_observations(
+    correction: OdometryCorrection, observations: Sequence[Observation]
+) -> list[Observation]:
+    """Observations with the odometry corrected."""
+    motions = np.array([observation.odometry[:3] for observation in observations]).reshape(-1, 3)
+    corrected = correct_motions(correction, replace_steps(correction, motions))
+    return [
+        observation._replace(odometry=Odometry(dx, dy, dtheta, observation.odometry.dt))
+        for observation, (dx, dy, dtheta) in zip(observations, corrected, strict=True)
+    ]
+
+
+def correct_odometry(source: Source, correction: OdometryCorrection) -> Source:
+    """The source with corrected odometry; its digest tells the correction too."""
+    if correction == UNCORRECTED:
+        return source
+    digest = digest_of([source.digest.encode(), correction.model_dump_json(exclude_none=True).encode()])
+    if isinstance(source, InMemorySource):
+        moved, motion = source.moved, source.motion.copy()
+        motion[moved, :3] = correct_motions(correction, replace_steps(correction, motion[moved, :3]))
+        return replace(source, motion=motion, digest=digest)
+    return _CorrectedSource(source, correction, digest)
+
+
+class _CorrectedSource:
+    """A source that corrects each reading as it passes."""
+
+    def __init__(self, source: Source, correction: OdometryCorrection, digest: str) -> None:
+        self._source, self._correction = source, correction
+        self.name, self.rate_hz, self.view_shape = source.name, source.rate_hz, source.view_shape
+        self.whiskers, self.length, self.info = source.whiskers, source.length, source.info
+        self.digest = digest
+
+    def __enter__(self) -> _CorrectedSource:
+        self._source.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._source.__exit__(*error)  # type: ignore[arg-type]
+
+    def __iter__(self) -> Iterator[Sample]:
+        before = np.zeros(3)
+        for sample in self._source:
+            *motion, dt = sample.reading.odometry
+            before = replace_steps(self._correction, np.array([motion], float), before)[0]
+            dx, dy, dtheta = correct_motions(self._correction, before)
+            moved = Odometry(dx, dy, dtheta, dt)
+            yield sample._replace(reading=sample.reading._replace(odometry=moved))

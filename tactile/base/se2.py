@@ -2,6 +2,8 @@
 
 A pose is an array [..., 3] of x (m), y (m), heading (rad, counter-clockwise); REP-103 axes. The functions
 compute in the namespace of the arrays they are given: JAX arrays give JAX arrays.
+
+Distances of points from straight segments in the plane.
 """
 
 from __future__ import annotations
@@ -121,3 +123,18 @@ def tum_line(time: float, pose: np.ndarray) -> str:
     x, y, heading = map(float, pose)
     values = (float(time), x, y, 0.0, 0.0, 0.0, float(np.sin(heading / 2)), float(np.cos(heading / 2)))
     return " ".join(map(repr, values)) + "\n"
+
+
+def segment_distances(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n, E] distances of points [n, 2] from the segments between a and b [E, 2], in their unit."""
+    points, along = np.asarray(points, float).reshape(-1, 1, 2), b - a
+    size = (along**2).sum(axis=-1)
+    size = np.where(size > 0, size, 1.0)  # a segment may be a point
+    share = np.clip(((points - a) * along).sum(axis=-1) / size, 0.0, 1.0)
+    return np.linalg.norm(points - (a + share[..., None] * along), axis=-1)
+
+
+def line_distances(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """[n] distances of points [n, 2] from the line through points [K, 2], K >= 1."""
+    ends = (line[:-1], line[1:]) if len(line) > 1 else (line, line)
+    return segment_distances(points, *ends).min(axis=1)

@@ -12,9 +12,13 @@ import numpy as np
 
 from tactile.base.se2 import inverse
 from tactile.base.types import StepEnd
-from tactile.wall_estimation.sliding_tip import WALL_DIRECTIONS, TipModel, direction_misfit
-from tactile.wall_estimation.strain_templates import TemplateMatch
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.wall_estimation.strain_templates import (
+    WALL_DIRECTIONS,
+    TemplateMatch,
+    TipModel,
+    direction_misfit,
+)
+from tactile.whisker_geometry import PlanarWhiskers
 
 MIN_SEPARATION = 0.05
 """Least distance of two contacts for a line through them, m."""

@@ -25,17 +25,16 @@ from tactile.wall_estimation.estimators import (
     no_wall,
     template_wall,
 )
-from tactile.wall_estimation.sliding_tip import fit_tip_model
 from tactile.wall_estimation.strain_templates import (
     TRAIN_HINT,
     StrainTemplates,
     filter_strain,
+    fit_tip_model,
     match_template,
     read_templates,
     strain_sample_rate,
 )
-from tactile.whiskers.head_geometry import Degrees
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.whisker_geometry import Degrees, PlanarWhiskers
 
 WhiskerMount = tuple[float, float, Degrees]
 RATE_TOLERANCE = 1e-2

@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap
 from ratslam.core.estimates import Action, Estimate
-from ratslam.mapping.edges import Edges
-from ratslam.mapping.least_squares import GraphEquations, Termination, least_squares
+from ratslam.mapping.pose_graph import Edges, GraphEquations, Termination, least_squares
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Odometry, observation
 

@@ -9,8 +9,7 @@ import pytest
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.exm import experience_metric
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_source, read_observations
+from ratslam.runs.build_session import build_session, open_source, read_observations
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.touch_source import open_touch_source

@@ -15,8 +15,7 @@ import numpy as np
 
 from evaluation.metrics.exm import experience_metric
 from ratslam.core.estimates import Action
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.types import Observation
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ratslam.mapping.edges import Edges
-from ratslam.mapping.io import UPPER
+from ratslam.mapping.pose_graph import UPPER, Edges
 
 
 def read_g2o(path: Path) -> tuple[np.ndarray, Edges]:

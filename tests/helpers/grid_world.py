@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.core.arrays import allocate, layout_of
 from ratslam.core.estimates import Estimate
-from ratslam.core.packing import allocate, layout_of
 from ratslam.core.session import CHUNK, run_chunk
 from ratslam.grid.config import GridConfig
 from ratslam.methods.grid import GridBackend, GridEvidence, GridState
 from tactile.base.types import MotionKind, Observation, Odometry, observation
-from tactile.whiskers.planar_whiskers import PlanarWhiskers
+from tactile.whisker_geometry import PlanarWhiskers
 
 MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
 """x m, y m, direction deg, of a Create's whiskers from left to right."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.studies.session_metrics import SessionResult
+from evaluation.studies.metrics import SessionResult
 
 
 def square(word, side=12):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.motions import yaw_of
+from robot.recordings.bags.transforms import yaw_of
 from robot.recordings.csv_file import read_csv
 from robot.sources.odometry import from_motions
 from tactile.base.se2 import integrate

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from robot.sources.in_memory import InMemorySource
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import SourceInfo
 from tactile.base.se2 import between, wrap
 
 CELL = 0.1

@@ -14,17 +14,16 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
-from robot.sources.in_memory import InMemorySource
-from robot.sources.simulated import digest_of_document, wrap_headings
-from robot.sources.source_registry import SourceEntry
+from robot.sources.in_memory import InMemorySource, digest_of_document, wrap_headings
+from robot.sources.source import SourceEntry
 from robot.touch_source import TouchEntry
-from robot.world.head_trajectory import poses_at
+from robot.world.scene import poses_at
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.settings import Settings
 from tactile.base.types import Observation, Odometry, observation
-from tactile.whiskers.head_geometry import Head, shaft_points
-from tactile.whiskers.whisking import whisk_phase
+from tactile.whisker_geometry import Head, shaft_points
+from tactile.whisking import whisk_phase
 
 ROWS, COLUMNS = 3, 22
 """Taxels: a row for each ring of whiskers, evenly spread around the head."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile.base.types import Cycle, Observation, Odometry, Whisk
-from tactile.features.calibration import Calibration
+from tactile.calibration import Calibration
 from tactile.frontend import Frontend, TouchConfig
 
 W = 18

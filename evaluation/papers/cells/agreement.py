@@ -13,11 +13,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from evaluation.cells.autocorrelogram import autocorrelogram
-from evaluation.cells.border import score_borders
-from evaluation.cells.coherence import correlate, neighbour_means
-from evaluation.cells.fields import Fields, find_fields
-from evaluation.cells.grid_score import lattice_scores
+from evaluation.cells.fields import Fields, find_fields, score_borders
+from evaluation.cells.grid_score import autocorrelogram, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, peak_rate
 from evaluation.cells.information import (
     information,
@@ -26,7 +23,14 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps, tuning_curves
+from evaluation.cells.rate_map import (
+    arena_edges,
+    bin_activity,
+    correlate,
+    neighbour_means,
+    rate_maps,
+    tuning_curves,
+)
 from evaluation.cells.recording import BinnedSums
 from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells

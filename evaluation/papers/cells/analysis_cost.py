@@ -14,10 +14,9 @@ from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import shuffled_scores
-from evaluation.papers.cells.figure import CellFigure
+from evaluation.papers.cells.figure import CellFigure, Taken, median, on_one_core, time_call
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells
 from evaluation.papers.cells.shuffles import PLACE_SCORES, place_bins
-from evaluation.papers.cells.timing import Taken, median, on_one_core, time_call
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 
 CELLS, SHUFFLES, ROUNDS = 500, 100, 3

@@ -18,18 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.papers.cells.figure import CellFigure, CellTask
-from evaluation.papers.cells.panel_grid import head_panel, panel_grid
-from evaluation.papers.cells.timing import time_call
+from evaluation.papers.cells.figure import CellFigure, CellTask, head_panel, panel_grid, time_call
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording
 from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
-from evaluation.papers.trials.recording_trial import closure_claims, run_recording
-from evaluation.papers.trials.touch_trial import collect_session, new_session
+from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
-from evaluation.studies.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from ratslam.core.backend import Backend
 from ratslam.core.session import Session
 from ratslam.methods.recall import RecallBackend

@@ -35,8 +35,7 @@ from evaluation.papers.cells.belief_world import (
     room_closures,
     see,
 )
-from evaluation.papers.cells.figure import CellFigure, CellTask
-from evaluation.papers.cells.panel_grid import head_panel, panel_grid
+from evaluation.papers.cells.figure import CellFigure, CellTask, head_panel, panel_grid
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks

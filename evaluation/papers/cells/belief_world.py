@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 from ratslam.core.session import Session
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend

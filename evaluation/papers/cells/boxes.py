@@ -22,7 +22,7 @@ from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 from ratslam.network.config import PoseCellConfig
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap

@@ -1,10 +1,30 @@
-"""One figure or table of pose cells: what it measures, its lines and its picture."""
+"""One figure or table of pose cells: what it measures, its lines and its picture.
+
+The error of the packet on the torus: decoded minus true pose, the shortest way round.
+
+Panels in rows and columns under a title, in the style of all plots.
+
+Processor and wall time of calls on one core, and the load of the machine meanwhile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from evaluation.cells.decoding import packet_pose, torus_sides, truth_in_sheet
+from evaluation.cells.recording import CellRecording
+from evaluation.plots import style
+from evaluation.studies.machine import one_core, processor_name, watch_load
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class CellTask(NamedTuple):
@@ -37,3 +57,103 @@ class CellFigure(NamedTuple):
     measure: Callable[[CellTask], Any]
     table: Callable[[Any], Sequence[str]]
     draw: Callable[[Any, Path], None] | None
+
+
+def torus_error(recording: CellRecording) -> np.ndarray:
+    """[T, 3] decoded minus true pose along the x and y of the sheet and in heading (m, m, rad), 0 at the
+    first known pose; each at most half a side of the torus."""
+    return shortest(recording, packet_pose(recording) - truth_in_sheet(recording))
+
+
+def shortest(recording: CellRecording, difference: np.ndarray) -> np.ndarray:
+    """Differences [..., 3] of poses (m, m, rad), the shortest way round the torus."""
+    sides = np.array(torus_sides(recording))
+    return difference - sides * np.round(difference / sides)
+
+
+def error_size(error: np.ndarray) -> np.ndarray:
+    """[..., 2] distance (m) and angle (rad, not negative) of errors [..., 3]."""
+    return np.stack([np.hypot(error[..., 0], error[..., 1]), np.abs(error[..., 2])], axis=-1)
+
+
+TOP, BOTTOM = 1.15, 0.85
+"""Margins above and below the panels, inches; the legend is below."""
+GAP_ACROSS, GAP_UP = 0.72, 0.80
+"""Between panels, inches: labels of axes are there."""
+
+
+def panel_grid(
+    title: str, line: str, rows: int, columns: int, height: float = 2.2
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure with axes [rows][columns] from the top left on, with a light grid.
+
+    Args:
+        line: the result in one sentence. height: of a panel, inches.
+    """
+    whole = TOP + rows * height + (rows - 1) * GAP_UP + BOTTOM
+    figure = style.new_figure(whole, title, line)
+    width = (style.WIDTH - style.LEFT - style.RIGHT - (columns - 1) * GAP_ACROSS) / columns
+    axes = [
+        [
+            style.add_axes(
+                figure,
+                style.LEFT + column * (width + GAP_ACROSS),
+                whole - TOP - height - row * (height + GAP_UP),
+                width,
+                height,
+            )
+            for column in range(columns)
+        ]
+        for row in range(rows)
+    ]
+    for line_of_axes in axes:
+        for each in line_of_axes:
+            each.grid(color=style.LINE_GREY, lw=0.7)
+    return figure, axes
+
+
+def head_panel(axes: Axes, title: str) -> None:
+    """Puts a title above a panel."""
+    axes.set_title(title, fontsize=9.5, color=style.INK, loc="left")
+
+
+def spread_dots(axes: Axes, at: Sequence[float], values: Sequence[Sequence[float]], colour: str) -> None:
+    """A dot for each value of each group, at the group's place `at` along x."""
+    for x, group in zip(at, values, strict=True):
+        axes.plot([x] * len(group), group, "o", ms=3.5, mew=0, color=colour, alpha=0.5)
+
+
+class Taken(NamedTuple):
+    """Time of a call, s: of all threads of this process on processors, and on the wall."""
+
+    processor: float
+    wall: float
+
+
+class Circumstances:
+    """Where times are measured; `text` is complete after the block of `on_one_core`."""
+
+    text = ""
+
+
+def time_call(call: Callable[[], object]) -> Taken:
+    """The time of a call."""
+    wall, processor = perf_counter(), process_time()
+    call()
+    return Taken(process_time() - processor, perf_counter() - wall)
+
+
+def median(times: list[Taken]) -> Taken:
+    """The median of each time."""
+    return Taken(*np.median(np.array(times), axis=0).tolist())
+
+
+@contextmanager
+def on_one_core() -> Iterator[Circumstances]:
+    """Keeps the process on its idlest core, and describes the machine and its load afterwards."""
+    found, load = Circumstances(), watch_load()
+    with one_core():
+        yield found
+    others = load()
+    busy = "unknown" if others is None else f"{others:.1f} cores busy with other processes in the mean"
+    found.text = f"On one core of {processor_name()}; load of the machine: {busy}."

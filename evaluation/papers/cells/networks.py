@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from evaluation.papers.cells.figure import CellFigure
-from evaluation.papers.cells.timing import Taken, on_one_core, time_call
+from evaluation.papers.cells.figure import CellFigure, Taken, on_one_core, time_call
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.cell_study import cell_study, score_task, tasks_of
-from evaluation.studies.resources import peak_memory, reset_peak_memory
+from evaluation.studies.machine import peak_memory, reset_peak_memory
 
 SETS, MEASURED, STEPS = 1000, 16, 30_000
 """Sets of the goal, sets measured unless the task says otherwise, and steps."""

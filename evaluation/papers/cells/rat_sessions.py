@@ -8,10 +8,8 @@ import numpy as np
 
 from evaluation.cells.recording import CellRecording
 from ratslam.core.session import Session, Step
-from ratslam.runs.build_session import build_session
-from ratslam.runs.cell_plan import RecordingPlan, plan_recording
-from ratslam.runs.cell_recorder import CellSums
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import build_session, open_observations, read_observations
+from ratslam.runs.cell_recorder import CellSums, RecordingPlan, plan_recording
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Sample, Source

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from evaluation.papers.cells.figure import CellFigure, CellTask
-from tactile.base.atomic_write import write_text_atomically
+from tactile.base.files import write_text_atomically
 
 NAMES: tuple[str, ...] = (
     "drift",

@@ -14,13 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from evaluation.cells.decoding import packet_pose, truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
-from evaluation.cells.packet_drift import packet_pose, truth_in_sheet
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.figure import CellFigure, CellTask
-from evaluation.papers.cells.packet_error import shortest, torus_error
-from evaluation.papers.cells.panel_grid import head_panel, panel_grid, spread_dots
+from evaluation.papers.cells.figure import (
+    CellFigure,
+    CellTask,
+    head_panel,
+    panel_grid,
+    shortest,
+    spread_dots,
+    torus_error,
+)
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style

@@ -7,11 +7,8 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from evaluation.cells.autocorrelogram import autocorrelogram
-from evaluation.cells.border import border_score
-from evaluation.cells.coherence import coherence
-from evaluation.cells.fields import largest_field
-from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
+from evaluation.cells.fields import border_score, largest_field
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_z
 from evaluation.cells.information import (
     conjunctive_information,
@@ -22,6 +19,7 @@ from evaluation.cells.information import (
 )
 from evaluation.cells.rate_map import (
     arena_edges,
+    coherence,
     heading_index,
     place_index,
     sample_seconds,

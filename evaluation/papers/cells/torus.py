@@ -15,13 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.autocorrelogram import autocorrelogram
 from evaluation.cells.fields import count_by_cell, find_fields
 from evaluation.cells.grid_score import (
     HEXAGONAL,
     SQUARE,
     Lattice,
     LatticeShape,
+    autocorrelogram,
     lattice_scores,
     measure_lattice,
 )
@@ -33,7 +33,7 @@ from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
-from ratslam.core.precision import prepare_precision
+from ratslam.core.compilation import prepare_precision
 
 RATE = 10.0
 """Steps per second."""

@@ -13,15 +13,15 @@ from robot.simulation.create.simulated_session import (
     drive_into_wall,
     train_strain_templates,
 )
-from tactile.base.new_file import require_new_file
+from tactile.base.files import require_new_file
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd
 from tactile.wall_estimation.estimators import WallContact, contact_points, fused_wall
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
-from tactile.wall_estimation.sliding_tip import fit_tip_model
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     filter_strain,
+    fit_tip_model,
     match_template,
     write_templates,
 )

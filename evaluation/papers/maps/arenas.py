@@ -18,18 +18,26 @@ import numpy as np
 
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
 from evaluation.papers.maps.localising import Judged, judge
-from evaluation.papers.maps.pictures import Panel, draw_panels
-from evaluation.papers.maps.row import Line, Localised, MapRow, MapTask, count, median, spread
-from evaluation.papers.maps.sessions import draw_seed
+from evaluation.papers.maps.row import (
+    Line,
+    Localised,
+    MapRow,
+    MapTask,
+    Panel,
+    count,
+    draw_panels,
+    median,
+    spread,
+)
+from evaluation.papers.maps.scenarios import draw_seed
 from evaluation.papers.tables.comparison import Record
-from evaluation.papers.trials.arena_trial import simulate_session
+from evaluation.papers.trial_sessions import simulate_session
 from evaluation.studies.machine import code_digest
-from ratslam.core.localisation import Localisation
+from ratslam.core.estimates import Localisation
 from ratslam.core.session import Session
 from ratslam.grid.localiser import GridLocaliser
-from ratslam.runs.build_session import build_session
+from ratslam.runs.build_session import build_session, open_observations
 from ratslam.runs.localise import localising
-from ratslam.runs.open_source import open_observations
 from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig

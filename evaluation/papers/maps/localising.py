@@ -18,19 +18,30 @@ from evaluation.papers.maps.localisation_metrics import (
     is_within,
     localisation_errors,
 )
-from evaluation.papers.maps.pictures import Panel, PathPanel, draw_panels
-from evaluation.papers.maps.row import Line, Localised, MapRow, MapTask, count, median, spread
+from evaluation.papers.maps.row import (
+    Line,
+    Localised,
+    MapRow,
+    MapTask,
+    Panel,
+    PathPanel,
+    count,
+    draw_panels,
+    median,
+    spread,
+)
 from evaluation.papers.maps.scenarios import (
     FOREIGN,
     LOCALISED,
+    Recorded,
     open_world,
     other_maze,
+    record,
     ten_circuits,
     unknown_start,
 )
-from evaluation.papers.maps.sessions import Recorded, record
 from evaluation.papers.tables.comparison import Record
-from evaluation.papers.trials.view_controls import apply_control
+from evaluation.papers.trial_sessions import apply_control
 from tactile.base.se2 import compose, integrate
 
 

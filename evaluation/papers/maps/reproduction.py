@@ -1,15 +1,64 @@
-"""Measures the rows of saved maps and writes them as one page with pictures."""
+"""Measures the rows of saved maps and writes them as one page with pictures.
+
+The rows of saved maps by name. A row's module is loaded when the row is read, the names load nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from evaluation.papers.maps.map_rows import ROWS
 from evaluation.papers.maps.row import MapTask, Methods
 from evaluation.papers.tables.comparison import Files, SessionLog, compare_figures
 from evaluation.studies.executor import run_tasks
-from tactile.base.atomic_write import write_text_atomically
+from tactile.base.files import write_text_atomically
+
+if TYPE_CHECKING:
+    from evaluation.papers.maps.row import MapRow
+
+
+class Rows(Mapping[str, "MapRow"]):
+    """Rows by name.
+
+    Args:
+        places: of each row, its module in this room and its variable there: `module.VARIABLE`.
+    """
+
+    def __init__(self, places: Mapping[str, str]) -> None:
+        self._places = places
+
+    def __getitem__(self, name: str) -> MapRow:
+        module, variable = self._places[name].split(".")
+        return getattr(import_module(f"evaluation.papers.maps.{module}"), variable)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+ROWS = Rows(
+    {
+        "start": "localising.START",
+        "other maze": "localising.FOREIGN_ROW",
+        "carried": "continuing.CARRIED",
+        "kidnaps": "continuing.KIDNAPS_ROW",
+        "merge": "merged_mazes.OVERLAP",
+        "merge mazes": "merged_mazes.DIFFERENT",
+        "ten sessions": "merged_mazes.TEN",
+        "goals": "goals.GOALS",
+        "wall moved": "changing.WALL",
+        "door closed": "changing.DOOR",
+        "buildings": "halves.HALVES",
+        "grid": "arenas.GRID",
+        "grid large": "arenas.GRID_LARGE",
+    }
+)
+"""The rows, in the order of the page."""
+
 
 FIRST = 32000
 """Seed of the first maze. Those used to choose settings are 31000 to 31030, 32700 to 32707 and 33000 to

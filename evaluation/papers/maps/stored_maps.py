@@ -13,11 +13,11 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.map_pieces import energy_within_pieces
+from evaluation.metrics.run_metrics import energy_within_pieces
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.maps.localisation_metrics import MapSteps, known_steps
-from evaluation.papers.maps.sessions import Recipe, Recorded, record
-from evaluation.papers.trials.touch_trial import start_session
+from evaluation.papers.maps.scenarios import Recipe, Recorded, record
+from evaluation.papers.trial_sessions import start_session
 from evaluation.studies.machine import code_digest
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.exm import ExperienceMetric
-from evaluation.metrics.experience_log import creation_rows
+from evaluation.metrics.exm import ExperienceMetric, creation_rows
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
 

@@ -15,17 +15,20 @@ from evaluation.metrics.energy_metric import energy, energy_all_pairs, successiv
 from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import align
-from evaluation.papers.salman2016 import paper_figures
-from evaluation.papers.salman2016.direction_metrics import (
-    DIRECTION_METRICS,
-    clockwise_steps,
-    direction_metrics,
-    lap_of_step,
+from evaluation.papers.paper_sets import (
+    Paper,
+    ResultRow,
+    column,
+    count_sets,
+    run_with_progress,
+    sweep_thresholds,
 )
+from evaluation.papers.salman2016 import paper_figures
 from evaluation.papers.salman2016.paper_figures import DrivenPath, MeasuredQuantity, experience_history
 from evaluation.papers.salman2016.protocols import (
     BY_MAZE,
     COMMON,
+    DIRECTION_METRICS,
     LATER_MAZE_START,
     METHODS,
     PROTOCOLS,
@@ -34,13 +37,13 @@ from evaluation.papers.salman2016.protocols import (
     Claim,
     Condition,
     Protocol,
+    clockwise_steps,
+    direction_metrics,
+    lap_of_step,
 )
-from evaluation.papers.trials.reproduction import Paper, ResultRow, column, count_sets, run_with_progress
-from evaluation.papers.trials.threshold_sweep import sweep_thresholds
-from evaluation.papers.trials.touch_trial import collect_session, run_session
-from evaluation.papers.trials.view_controls import Control, apply_control
+from evaluation.papers.trial_sessions import Control, apply_control, collect_session, run_session
 from evaluation.plots import style
-from evaluation.studies.session_metrics import (
+from evaluation.studies.metrics import (
     SessionResult,
     TouchMetrics,
     experience_metric_if_defined,

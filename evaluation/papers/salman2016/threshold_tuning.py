@@ -16,12 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.exm import base_end, experience_metric
+from evaluation.papers.paper_sets import sweep_thresholds
 from evaluation.papers.salman2016.paper_figures import draw_tuning
-from evaluation.papers.trials.threshold_sweep import sweep_thresholds
-from evaluation.papers.trials.touch_trial import collect_session
+from evaluation.papers.trial_sessions import collect_session
 from evaluation.studies.executor import run_tasks
-from evaluation.studies.session_metrics import lap_ends
-from evaluation.studies.view_separation import ViewDifferences, compare_views
+from evaluation.studies.metrics import ViewDifferences, compare_views, lap_ends
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, override, validate

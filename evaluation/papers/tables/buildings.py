@@ -7,6 +7,12 @@ map, of the live pose (as estimated at the time) and of odometry. A run is worse
 exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if its two true positions are more
 than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by more than `FALSE_TURN`; a closure
 sequence is false if that holds for the medians over its closures.
+
+The table of recordings with laser views, camera-like views or given place ids.
+
+ATE is the RMS position error of the final map after a rigid alignment, in metres. A closure is false if its
+two steps are more than `FALSE_CLOSURE_CELLS` pose cells apart in truth. Perturbed copies have another start,
+noise and dropped frames (`evaluation.studies.perturbation`).
 """
 
 from __future__ import annotations
@@ -22,10 +28,10 @@ from scipy.special import expit
 from evaluation.metrics.statistics import expected_calibration_error
 from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
-from evaluation.papers.tables.recordings import Recording, metres, real_recordings
-from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
+from evaluation.papers.tables.recordings import GOLDEN, Recording, metres, real_recordings
+from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, run_recording
 from evaluation.studies.executor import run_tasks
-from evaluation.studies.perturbation import lose_labels, miscalibrate, mistake_labels, rename_labels
+from evaluation.studies.perturbation import lose_labels, miscalibrate, mistake_labels, perturb, rename_labels
 from ratslam.runs.settings.run_config import RunConfig
 
 FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
@@ -326,3 +332,85 @@ def _sequences(runs: Sequence[RunFigures]) -> str:
     """False ones of the accepted sequences."""
     accepted = np.concatenate([run.sequences[run.sequences[:, 0]] for run in runs])
     return f"{accepted[:, 1].sum()} / {len(accepted)}"
+
+
+FALSE_CLOSURE_CELLS = 2.5
+
+ROWS = {
+    "square": Recording("`configs/square.yaml`, synthetic", "configs/square.yaml"),
+    "figure8": Recording(
+        "`b_figure8_alias`, a third of the places look alike",
+        "configs/square.yaml",
+        (f"recording.file={GOLDEN}/b_figure8_alias.npz",),
+    ),
+    "kidnap": Recording(
+        "`e_kidnap`, carried away once, `keyframes.may_be_carried`",
+        "configs/square.yaml",
+        (f"recording.file={GOLDEN}/e_kidnap.npz", "keyframes.may_be_carried=true"),
+    ),
+    "tuc": Recording(
+        "`configs/tuc_lecture_hall.yaml`, real, given place ids", "configs/tuc_lecture_hall.yaml", real=True
+    ),
+    "intel": Recording(
+        "`configs/intel_laser.yaml`, real, 18-number laser views", "configs/intel_laser.yaml", real=True
+    ),
+}
+LASER_COLUMNS = (
+    "recording", "odometry", "classic (closures, false)", "ratslam (closures, false)",
+    "perturbed: median, maximum",
+)  # fmt: skip
+
+
+class RecordingFigures(NamedTuple):
+    """The figures of one run: ATE of the final map and of dead reckoning, m; closures and false ones."""
+
+    ate: float
+    odometry: float
+    closures: int
+    false_closures: int
+
+
+def laser_table(
+    rows: Sequence[str] = tuple(ROWS), copies: int = 10, workers: int = 0, folder: Path = Path()
+) -> Iterator[str]:
+    """The lines of the table; rows whose recordings are missing are named below it.
+
+    Args:
+        folder: of the repository, which holds `configs` and `tests`.
+    """
+    missing = {row: reason for row in rows if (reason := ROWS[row].missing(folder))}
+    present = [row for row in rows if row not in missing]
+    tasks = []
+    for row in present:
+        tasks.append((ROWS[row].configuration(folder, "backend=classic"), 0))
+        tasks += [(ROWS[row].configuration(folder), seed) for seed in range(copies + 1)]
+    results = run_tasks(measure_recording, tasks, workers=workers)
+    yield markdown_header(LASER_COLUMNS)
+    for row in present:
+        classic, ours, *perturbed_copies = (next(results) for _ in range(copies + 2))
+        errors = [copy.ate for copy in perturbed_copies]
+        spread = f"{metres(np.median(errors))}, {metres(max(errors))}" if errors else "-"
+        yield markdown_row([ROWS[row].label, metres(ours.odometry), _cell(classic), _cell(ours), spread])
+    yield from ["", *(f"Left out: {row}: {reason}" for row, reason in missing.items())] if missing else []
+
+
+def measure_recording(task: tuple[RunConfig, int]) -> RecordingFigures:
+    """Runs and measures one recording, perturbed with a seed (0: not at all).
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    config, seed = task
+    run = run_recording(config, perturb if seed else None, seed)
+    closures = run.session.map.closures()
+    apart = np.hypot(*(run.truth[closures[:, 0]] - run.truth[closures[:, 1]])[:, :2].T)
+    return RecordingFigures(
+        ate=run.ate(run.final),
+        odometry=run.ate(run.odometry),
+        closures=len(closures),
+        false_closures=int((apart > FALSE_CLOSURE_CELLS * run.config.pose_cells.cell_size).sum()),
+    )
+
+
+def _cell(figures: RecordingFigures) -> str:
+    return f"{metres(figures.ate)} ({figures.closures}, {figures.false_closures})"

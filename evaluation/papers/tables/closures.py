@@ -22,7 +22,7 @@ from scipy.special import expit
 from evaluation.metrics.statistics import auc
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
-from evaluation.papers.trials.touch_trial import run_session, start_session
+from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
 from ratslam.core.session import Session
 from ratslam.mapping.closure_judge import (
@@ -36,7 +36,7 @@ from ratslam.mapping.closure_judge import (
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.runs.open_source import open_observations
+from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource, load_into_memory
 from tactile.base.se2 import between, wrap

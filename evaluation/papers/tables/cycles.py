@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
-from ratslam.core.precision import Precision, prepare_precision
+from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session
-from ratslam.mapping import archive_selection, selection_worker
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations
+from ratslam.mapping import archive, selection_worker
+from ratslam.runs.build_session import build_session, open_observations
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
@@ -209,7 +208,7 @@ def own_times(stats: dict[Any, Any]) -> dict[Any, float]:
 @contextmanager
 def selecting_inline() -> Iterator[None]:
     """Lets selections run where they begin."""
-    modules: tuple[Any, ...] = selection_worker, archive_selection
+    modules: tuple[Any, ...] = selection_worker, archive
     threads = [each.THREAD for each in modules]
     for each in modules:
         each.THREAD = _Inline()

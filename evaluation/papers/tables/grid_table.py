@@ -15,18 +15,18 @@ from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.trajectory import position_error
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.trials.arena_trial import session_at_start
+from evaluation.papers.trial_sessions import session_at_start
 from evaluation.studies.executor import run_tasks
-from ratslam.core.precision import prepare_precision
-from ratslam.runs.artifacts import true_grid
-from ratslam.runs.open_source import open_source, read_observations
+from ratslam.core.compilation import prepare_precision
+from ratslam.runs.build_session import open_source, read_observations
+from ratslam.runs.run_directory import true_grid
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.create.wheel_odometry import MEAN_ERRORS
-from robot.sources.odometry_correction import correct_observations
+from robot.sources.odometry import correct_observations
 from robot.touch_source import open_touch_source, report_config_of
 from robot.world.arena import Arena, wall_segments
-from robot.world.polygons import segment_distance
+from robot.world.walls import segment_distance
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import MotionKind, Observation
 

@@ -3,7 +3,7 @@
 Each session is finished once and its map spoilt in many ways (`trials.spoilt_maps`). A map is bad if its
 error exceeds `HARM_FACTOR` times odometry's (recordings: and 0.3 m): whisker sessions by the Energy Metric,
 recordings by ATE, both of keyframes. Even sessions fit the regression, odd ones test it; the weights below
-the table, of all sessions, become those of `ratslam.mapping.map_health`. Only maps with closures count.
+the table, of all sessions, become those of `ratslam.mapping.map_solution`. Only maps with closures count.
 Sessions are of mazes and recordings used for development.
 """
 
@@ -23,14 +23,14 @@ from evaluation.metrics.trajectory import ate
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
+from evaluation.papers.tables.spoilt_maps import spoilt_maps
 from evaluation.papers.tables.touch_table import MAIN, ROWS
-from evaluation.papers.trials.recording_trial import run_recording
-from evaluation.papers.trials.spoilt_maps import spoilt_maps
+from evaluation.papers.trial_sessions import run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_health import DOUBTED, INTERCEPT, WEIGHTS, health_features
+from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.odometry import OdometryConfig
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.exm import ExmConfig
-from evaluation.metrics.map_pieces import energy_within_pieces, unjoined_share
+from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
 from evaluation.metrics.statistics import wilson_interval
 from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.trials.touch_trial import run_session
+from evaluation.papers.trial_sessions import run_session
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.growth import with_new_ground
-from evaluation.studies.session_metrics import (
+from evaluation.studies.metrics import (
     FALSE_CLOSURE_DISTANCE,
     SessionResult,
     TouchMetrics,
@@ -32,7 +32,7 @@ from evaluation.studies.session_metrics import (
     touch_metrics,
 )
 from ratslam.core.session import Session
-from ratslam.runs.open_source import open_observations
+from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.baseline import HALL_BASELINE
 from robot.sources.in_memory import InMemorySource, load_into_memory

@@ -2,6 +2,8 @@
 
 A bumper tells two things: that there is a wall, and that the wheels turn while the robot stands still. Errors
 are ATE, m. The pose is that of the final map and, in brackets, as estimated at the time.
+
+Distance from a robot to the nearest wall when its bumper is pressed.
 """
 
 from __future__ import annotations
@@ -14,19 +16,38 @@ import numpy as np
 from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
-from evaluation.papers.whiskers.wall_distance import wall_distances
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations
+from ratslam.runs.build_session import build_session, open_observations
 from ratslam.runs.settings.run_config import load_config
 from robot.simulation.create.wheel_odometry import HEADING_DRIFT, MEAN_ERRORS
-from robot.sources.odometry_correction import correct_observations
+from robot.sources.odometry import correct_observations
 from robot.touch_source import observation_of
+from robot.world.walls import segment_distance
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation
+
+
+class WallDistances(NamedTuple):
+    """Distances from the robot's true position to the nearest wall, m: [E] at the first reading of each
+    contact, and [T] at all readings."""
+
+    contact: np.ndarray
+    all: np.ndarray
+
+
+def wall_distances(position: np.ndarray, pressed: np.ndarray, walls: np.ndarray) -> WallDistances:
+    """The distances along a true path.
+
+    Args:
+        position: [T, 2], m. pressed: [T] bool, a bumper is pressed. walls: [W, 4] ends x1, y1, x2, y2, m.
+    """
+    distance = segment_distance(walls, position).min(axis=1)
+    begins = pressed & ~np.concatenate([[False], pressed[:-1]])
+    return WallDistances(distance[begins], distance)
+
 
 CONFIG = Path("configs/create_bumps.yaml")
 FILES = ("odometry", "bumps", "truth", "walls")

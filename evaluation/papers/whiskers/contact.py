@@ -16,8 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
-from evaluation.papers.whiskers.spliced_hours import (
+from evaluation.papers.whiskers.drift import (
     Decide,
     Snippet,
     StreamScore,
@@ -26,11 +25,13 @@ from evaluation.papers.whiskers.spliced_hours import (
     score_stream,
     simulate_stream,
 )
+from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
 from evaluation.plots import style
-from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, ReachRecord, read_reach
+from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
 from tactile.base.errors import InputError
 from tactile.base.samples import true_runs
-from tactile.features.contact_stream import (
+from tactile.calibration import FreeBaseline, calibrate_free
+from tactile.contact_stream import (
     StreamState,
     Touch,
     date_back,
@@ -38,7 +39,6 @@ from tactile.features.contact_stream import (
     find_fixed_contacts,
     start_stream,
 )
-from tactile.features.free_record import FreeBaseline, calibrate_free
 
 CONTACT_SDS = 20.0
 """Departure that makes a contact of the record one to find in the spliced hours: the paper's."""

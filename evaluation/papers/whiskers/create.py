@@ -17,15 +17,14 @@ from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.tables.buildings import BuildingsRow, buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import metres
-from evaluation.papers.trials.recording_trial import RecordingRun, closure_claims, run_recording
+from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
+from evaluation.papers.whiskers.bumps import WallDistances, wall_distances
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
-from evaluation.papers.whiskers.wall_distance import WallDistances, wall_distances
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_health import DOUBTED
-from ratslam.mapping.map_solution import cheapest_map
+from ratslam.mapping.map_solution import DOUBTED, cheapest_map
 from tactile.base.se2 import between, compose, integrate, wrap
 
 FILES = tuple(f"data/create_lab_{name}.csv" for name in ("truth", "bumps", "walls", "depth"))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from tactile.base.errors import InputError
 
 REACH = "real_touch/whiskersensing_stanford/derived/reaching_take20_in_clutter.csv"
-"""The arm in clutter (`robot/recordings/whiskers/reach.py`), below the folder of the real recordings."""
+"""The arm in clutter (`robot/recordings/real_whiskers.py`), below the folder of the real recordings."""
 
 
 class RealFigure(NamedTuple):

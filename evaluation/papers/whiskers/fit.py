@@ -10,16 +10,15 @@ import numpy as np
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
 from evaluation.plots import style
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.fit.record import RevisitFit, fit_revisits
-from ratslam.service.fit.wheel_fit import WheelFit, fit_wheels
-from ratslam.service.fit.whisker_fit import read_signals_of_reach
+from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
+from ratslam.service.rig_fit import WheelFit, fit_wheels
 from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
-from robot.sources.odometry_correction import UNCORRECTED, OdometryCorrection, correct_motions
+from robot.sources.odometry import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
-from tactile.fit.signals import SignalFit, SignalRecord, fit_signals
+from tactile.rig_signals import SignalFit, SignalRecord, fit_signals
 
 RECORDS = {
     "real Create": ("create_lab", "data/create_lab_odometry.csv"),
@@ -203,7 +202,7 @@ def _whisker_lines(result: FitResult) -> list[str]:
         "",
         "The drift of a whisker that touches is unknown: its contacts change its signal more. No recording "
         "of real whiskers has arm poses and walls: rest angle and radii are shown on simulated heads only "
-        "(tactile/fit/README.md).",
+        "(tactile/README.md).",
     ]
     return lines
 

@@ -18,8 +18,7 @@ from scipy.special import expit, logit
 from evaluation.metrics.statistics import auc, expected_calibration_error
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
-from robot.recordings.whiskers.objects import read_object
-from robot.recordings.whiskers.taxels import read_contacts
+from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream
 
 OBJECTS = "real_touch/actuated_whisker_purdue/data/objCls"

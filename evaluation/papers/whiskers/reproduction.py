@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from evaluation.papers.whiskers.figure import RealFigure
-from tactile.base.atomic_write import write_text_atomically
+from tactile.base.files import write_text_atomically
 
 NAMES: tuple[str, ...] = ("contact", "drift", "fit", "tangent", "likeness", "walk", "create", "bumps")
 """The figures: names of modules of this room."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
-from evaluation.papers.trials.touch_trial import collect_session, run_session
+from evaluation.papers.trial_sessions import collect_session, run_session
 from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from evaluation.papers.whiskers.likeness import OBJECTS
 from evaluation.papers.whiskers.walk_source import (
@@ -27,7 +27,7 @@ from evaluation.papers.whiskers.walk_source import (
     plan_visits,
     walk_simulation,
 )
-from evaluation.studies.session_metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.simulated_session import HeadSimulation

@@ -1,7 +1,7 @@
 """A simulated walk through a maze on which every whisker image is a real one.
 
 Poses and odometry are those of a session of the touch table; what the whiskers feel is recorded
-(`robot.recordings.whiskers.objects`). Each place, a cell and one of four facings, holds one of the recorded
+(`robot.recordings.real_whiskers`). Each place, a cell and one of four facings, holds one of the recorded
 objects, so that several places feel alike. The first visit to a place gives rows of the first half of its
 object's recording, later visits give rows of the second half, and no row is given twice in a session.
 """
@@ -15,12 +15,11 @@ import numpy as np
 from pydantic import NonNegativeInt
 
 from evaluation.papers.tables.touch_table import TouchTask, task_config
-from robot.recordings.whiskers.objects import WHISKERS, ObjectRecord, read_object
+from robot.recordings.real_whiskers import OBJECTS_WHISKERS, ObjectRecord, read_object
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of
-from robot.sources.source_info import SourceInfo
-from robot.sources.source_registry import SourceEntry
+from robot.sources.source import SourceEntry, SourceInfo
 from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -84,7 +83,7 @@ def open_walk(config: WalkConfig) -> InMemorySource:
         label=np.full(count, -1, np.int32),
         truth=session.truth,
         info=SourceInfo(signed_views=True, cell_size=session.info.cell_size),
-        alive=np.ones(WHISKERS, bool),
+        alive=np.ones(OBJECTS_WHISKERS, bool),
     )
 
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import validate
-from ratslam.runs.settings.strict_yaml.document import Document, KeyPath, Place
-from robot.recordings.camera.video import SUFFIXES as VIDEO_SUFFIXES
+from ratslam.runs.settings.yaml_document import Document, KeyPath, Place
+from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.input_files import raise_errors, read_bytes
 from tactile.base.errors import InputError
 

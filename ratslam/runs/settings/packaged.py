@@ -103,7 +103,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         }
     },
     # Distances from images vary with what is near: in a rendered corridor by a third from frame to frame
-    # (robot/recordings/camera/README.md). Patch normalisation is that of RatSLAM (Ball et al. 2013).
+    # (robot/recordings/README.md). Patch normalisation is that of RatSLAM (Ball et al. 2013).
     "visual_odometry": {
         "templates": {"patch": 2},
         "keyframes": {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 
-from ratslam.runs.settings.strict_yaml.document import Document
+from ratslam.runs.settings.yaml_document import Document
 
 MOVED: dict[str, str] = {
     "pose_cells.excite_width": "attractor.excite_width",

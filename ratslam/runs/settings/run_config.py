@@ -12,19 +12,18 @@ from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
 from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.metric_registry import METRICS
-from ratslam.classic.cells_config import CellsConfig
+from ratslam.classic.config import CellsConfig
 from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
-from ratslam.runs.settings.includes import merge_includes
 from ratslam.runs.settings.packaged import PresetName, find_config
 from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
-from ratslam.runs.settings.strict_yaml import load, validate
-from ratslam.runs.settings.strict_yaml.document import Document, KeyPath
+from ratslam.runs.settings.strict_yaml import load, merge_includes, validate
+from ratslam.runs.settings.yaml_document import Document, KeyPath
 from robot.live.live_config import LiveConfig
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.create.simulated_session import CreateSimulationConfig
 from robot.simulation.head.simulated_session import SimulationConfig
 from robot.simulation.rat.simulated_session import RatSimulationConfig
-from robot.sources.source_registry import SOURCES
+from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.plugins import PluginConfig, Registry, read_settings

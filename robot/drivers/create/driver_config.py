@@ -1,12 +1,17 @@
-"""Settings of a Create: port, speed and time limits."""
+"""Settings of a Create: port, speed and time limits.
+
+Reasons that stop a Create, each with its cure; the speed limit.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from enum import Enum
+from typing import Annotated, NamedTuple
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from robot.drivers.create.protocol import TOP_SPEED, WHEEL_BASE
+from robot.drivers.create.protocol import TOP_SPEED, WHEEL_BASE, Bumps, Mode, SensorReply, describe_bumps
 from tactile.base.settings import Settings
 
 
@@ -34,3 +39,67 @@ class CreateConfig(Settings):
         if self.silence < 2 / self.rate:
             raise ValueError(f"silence of {self.silence:g} s is less than two readings at {self.rate:g} Hz")
         return self
+
+
+class StopReason(Enum):
+    """Reason of a stop of the wheels; the value is its cure."""
+
+    BUMPED = "`release` it and drive back"
+    WHEEL_DROP = "set it on its wheels, then `release` it"
+    LEFT_SAFE_MODE = "a cliff, the charger or a button ended safe mode: check the robot, then `release` it"
+    SILENT = "no replies: check battery and cable; the robot may still drive"
+    GARBLED = "invalid replies: check the cable, and whether another program reads the port"
+    UNPLUGGED = "the robot may still roll: lift it or plug it in, which stops it, then start again"
+    UNGUARDED = "the watchdog process hangs or has ended, or the control thread has: start again"
+
+
+class StopEvent(NamedTuple):
+    """A stop of the robot.
+
+    Attributes:
+        reason: of the stop. detail: the finding. time: host's monotonic clock, s.
+    """
+
+    reason: StopReason
+    detail: str
+    time: float
+
+    def __str__(self) -> str:
+        return f"{self.reason.name.lower()}: {self.detail}; {self.reason.value}"
+
+
+class CommandRefused(ValueError):
+    """A rejected command."""
+
+
+def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
+    """Speeds of right and left wheel, mm/s.
+
+    Args:
+        forward: m/s. turn: rad/s, counter-clockwise.
+
+    Raises:
+        CommandRefused: not finite, or a wheel faster than `config.speed`.
+    """
+    if not (math.isfinite(forward) and math.isfinite(turn)):
+        raise CommandRefused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
+    apart = turn * config.wheel_base / 2
+    right, left = (1000 * speed for speed in (forward + apart, forward - apart))
+    if max(abs(right), abs(left)) > 1000 * config.speed + 1e-6:
+        raise CommandRefused(
+            f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
+            f" {max(abs(right), abs(left)) / 1000:g} m/s; the limit is {config.speed:g} (`speed`)"
+        )
+    cap = math.floor(1000 * config.speed + 1e-6)  # rounding must not exceed the limit
+    return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
+
+
+def stop_reason(reply: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
+    """Reason and detail for a stop after a reading, or None. After a bump, driving back is allowed."""
+    if reply.bumps & Bumps.DROPPED:
+        return StopReason.WHEEL_DROP, describe_bumps(reply.bumps & Bumps.DROPPED)
+    if reply.mode != Mode.SAFE:
+        return StopReason.LEFT_SAFE_MODE, f"the robot is in {reply.mode.name.lower()} mode"
+    if reply.bumps & Bumps.BUMPED and right + left > 0:
+        return StopReason.BUMPED, describe_bumps(reply.bumps & Bumps.BUMPED)
+    return None

@@ -18,8 +18,7 @@ import time
 
 from robot.drivers.create import protocol
 from robot.drivers.create.serial_link import NoPort, PortBusy, SerialPort, open_port
-from robot.drivers.process_priority import become_urgent
-from robot.drivers.withheld_signals import withheld_signals
+from robot.drivers.processes import become_urgent, withheld_signals
 from tactile.base.errors import InputError
 
 START_LIMIT = 10.0

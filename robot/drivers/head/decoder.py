@@ -5,17 +5,117 @@ after an invalid one the search continues at the next byte. A damaged frame ther
 the result does not depend on the pieces in which the stream arrives, and
 
     bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending` (bytes not decided yet)
+
+Unwraps 32-bit sequence numbers; finds new, missing and repeated frames and restarts of the stream.
+
+Assembles the frames of one whisk into a cycle: the same function live and in replay.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections import deque
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.head.sequence_numbers import HALF, SequenceUnwrapper
-from robot.drivers.head.usb_protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFlag, frame_dtype
+from robot.drivers.head.usb_protocol import CHANNELS, MAGIC, VERSION, WRAP, FrameFlag, frame_dtype, to_radians
+from tactile.base.types import Cycle, Odometry
+
+LATE = 4096
+"""Largest distance of a late frame behind the newest; a head buffers no more frames."""
+HALF = WRAP // 2
+SEQUENCE_NUMBERS_BATCH = 1024
+"""Numbers processed at once."""
+
+
+class SequenceUnwrapper:
+    """The numbers of the frames accepted so far.
+
+    A number less than `HALF` above the highest is ahead; one less than `LATE` below it is late; a lower one
+    means that the head has restarted its count, and a new stream begins. Its numbers continue in the next
+    2^32, so that all numbers are unique.
+    """
+
+    def __init__(self) -> None:
+        self.streams = 0
+        """Number of streams."""
+        self._begun = False
+        self._first = self._highest = self._held = 0
+        self._before = 0
+        self._seen = np.zeros(LATE, bool)
+
+    @property
+    def missing(self) -> int:
+        """Numbers between the first and the highest accepted of a stream that were not accepted."""
+        return self._before + self._lacking()
+
+    def restart(self) -> None:
+        """Starts a new stream with the next frame."""
+        self._before += self._lacking()
+        self._begun = False
+
+    def take(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unwraps raw numbers [N], in order of arrival.
+
+        Returns:
+            [N] int64 unwrapped numbers, and [N] bool, those to accept: new, and not before the first of the
+            stream.
+        """
+        raw = raw.astype(np.int64)
+        number, new = np.empty_like(raw), np.ones(len(raw), bool)
+        place = 0
+        while place < len(raw):
+            some = slice(place, place + self._rising(raw[place : place + SEQUENCE_NUMBERS_BATCH]))
+            if some.stop > place:
+                number[some] = self._highest + (raw[some] - self._highest) % WRAP
+                self._ahead(number[some])
+                place = some.stop
+            else:
+                number[place], new[place] = self._other(int(raw[place]))
+                place += 1
+        return number, new
+
+    def _rising(self, raw: np.ndarray) -> int:
+        """Length of the leading part of numbers [N] in which each is ahead of the previous one."""
+        if not self._begun:
+            return 0
+        ahead = (raw - self._highest) % WRAP
+        rising = ahead < HALF
+        rising[0] &= ahead[0] > 0
+        rising[1:] &= ahead[1:] > ahead[:-1]
+        return len(raw) if rising.all() else int(rising.argmin())
+
+    def _other(self, raw: int) -> tuple[int, bool]:
+        """Unwraps a number that is not ahead; returns it and whether to accept it."""
+        number = self._highest - (self._highest - raw) % WRAP
+        if not self._begun or number <= self._highest - LATE:
+            self.restart()
+            return self._begin(raw), True
+        new = number > self._first and not self._seen[number % LATE]
+        self._seen[number % LATE] |= new
+        self._held += new
+        return number, bool(new)
+
+    def _begin(self, raw: int) -> int:
+        number = raw + (WRAP * (self._highest // WRAP + 1) if self.streams else 0)
+        self._seen[number % LATE] = True
+        self._first = self._highest = number
+        self._held, self._begun = 1, True
+        self.streams += 1
+        return number
+
+    def _ahead(self, number: np.ndarray) -> None:
+        """Accepts increasing numbers, all above the highest."""
+        last = int(number[-1])
+        self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
+        self._seen[number[number > last - LATE] % LATE] = True
+        self._highest = last
+        self._held += len(number)
+
+    def _lacking(self) -> int:
+        return self._highest - self._first + 1 - self._held if self._begun else 0
+
 
 BATCH, MAX_BATCH = 32, 1024
 """Frames checked at once: the first number after a fault, doubled after every batch without one."""
@@ -186,3 +286,105 @@ class Decoder:
 def _partial_magic(tail: bytes) -> int:
     """Number of bytes at the end that may be the start of the magic."""
     return next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)
+
+
+MAX_FRAMES = 1 << 16
+"""Number of frames kept for later whisks: half a minute at 2 kHz."""
+
+
+class Cut(NamedTuple):
+    """The frames of a whisk, with its times and odometry.
+
+    Attributes:
+        number: of the whisk. time: of its sample, s. start: of the whisk, s, on the same clock.
+        first, last: sequence numbers of its first and last frame. frames: number of these that arrived.
+        odometry: motion since the previous whisk.
+        seen: whether its frames become a reading; False where its image was dropped, which does not affect
+            the motion.
+    """
+
+    number: int
+    time: float
+    start: float
+    first: int
+    last: int
+    frames: int
+    odometry: Odometry
+    seen: bool
+
+
+def make_cut(
+    number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
+) -> Cut:
+    """The cut of exactly these frames; not `seen` without frames."""
+    count = len(frames.sequence)
+    first, last = (int(frames.sequence.min()), int(frames.sequence.max())) if count else (0, -1)
+    return Cut(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
+
+
+def select_frames(frames: Frames, first: int, last: int) -> Frames:
+    """The frames from first to last, both included, ordered by sequence number."""
+    rows = np.flatnonzero((frames.sequence >= first) & (frames.sequence <= last))
+    rows = rows[np.argsort(frames.sequence[rows], kind="stable")]
+    return Frames(*(np.ascontiguousarray(column[rows]) for column in frames))
+
+
+def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
+    """The whisk as a cycle; without samples if the cut is not `seen`.
+
+    Args:
+        frames: the frames of the cut, in any order; others are ignored.
+
+    Raises:
+        ValueError: frames of the cut are missing.
+    """
+    if not cut.seen:
+        frames = select_frames(frames, 0, -1)
+        return Cycle(np.zeros(0), *to_radians(frames.values), cut.odometry)
+    mine = select_frames(frames, cut.first, cut.last)
+    if len(mine.sequence) != cut.frames:
+        raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are present")
+    # The memory layout matters: it decides the order of summation.
+    angle, deflection = (np.ascontiguousarray(part) for part in to_radians(mine.values))
+    time = cut.start + (mine.time - mine.time[0]) * 1e-6
+    return Cycle(time, angle, deflection, cut.odometry)
+
+
+def empty_frames(whiskers: int) -> Frames:
+    """A block without frames, of a head with this number of whiskers."""
+    return Frames(
+        np.zeros(0, np.int64),
+        np.zeros(0, np.int64),
+        np.zeros(0, np.uint8),
+        np.zeros((0, whiskers, CHANNELS), np.int16),
+    )
+
+
+class FrameWindow:
+    """The most recent frames, in blocks as they arrived.
+
+    Args:
+        empty: a block without frames, which gives the shape.
+    """
+
+    def __init__(self, empty: Frames) -> None:
+        self._empty = empty
+        self._blocks: deque[Frames] = deque()
+        self._count = 0
+
+    def add(self, block: Frames) -> None:
+        """Adds a block; drops the oldest ones beyond the last `MAX_FRAMES` frames."""
+        if not len(block.sequence):
+            return
+        self._blocks.append(block)
+        self._count += len(block.sequence)
+        while self._count - len(self._blocks[0].sequence) >= MAX_FRAMES:
+            self._count -= len(self._blocks.popleft().sequence)
+
+    def between(self, first: int, last: int) -> Frames:
+        """The present frames from first to last, both included, ordered by sequence number."""
+        blocks = [
+            block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
+        ]
+        parts = zip(*(blocks or [self._empty]), strict=True)
+        return select_frames(Frames(*(np.concatenate(part) for part in parts)), first, last)

@@ -81,7 +81,7 @@ class FeedbackMode(IntEnum):
     OPEN = 0
     """On the host, if at all, by `CommandKind.AMPLITUDES`."""
     RCP = 1
-    """In the head, by the law of `tactile.whiskers.whisking`."""
+    """In the head, by the law of `tactile.whisking`."""
 
 
 class Request(IntEnum):

@@ -19,8 +19,8 @@ from robot.drivers.head.usb_protocol import (
     to_counts,
 )
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import (
+from tactile.whisker_geometry import Head
+from tactile.whisking import (
     WhiskingConfig,
     check_amplitude,
     initial_drive,
@@ -63,7 +63,7 @@ def whisk_commands(
 
 
 class HostRcp:
-    """Feedback on the host: the whisking law of `tactile.whiskers.whisking`, a block of samples at a time.
+    """Feedback on the host: the whisking law of `tactile.whisking`, a block of samples at a time.
 
     Args:
         shape: rows and columns of the head. threshold, centre: [W] of y, rad.
@@ -129,7 +129,7 @@ class HeadDriver:
 
         Args:
             threshold, centre: [W] of y, rad: column 1 of `threshold` and `mean` of
-            `tactile.features.calibration.Calibration`.
+            `tactile.calibration.Calibration`.
 
         Raises:
             InputError: the amplitude exceeds the drives' limit, or the head does not support the mode.

@@ -18,11 +18,17 @@ import numpy as np
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.driver_config import ArmConfig
-from robot.drivers.ur10.process_handle import ArmProcess
-from robot.drivers.ur10.safety import Finding, Move, TargetRefused, plan_move
+from robot.drivers.ur10.safety import (
+    Finding,
+    Move,
+    StartupRefused,
+    TargetRefused,
+    check_controller,
+    check_states,
+    plan_move,
+)
 from robot.drivers.ur10.shared_state import SharedState
-from robot.drivers.ur10.startup_checks import StartupRefused, check_controller, check_states
-from robot.drivers.ur10.supervisor import TICK, Supervisor
+from robot.drivers.ur10.supervisor import TICK, ArmProcess, Supervisor
 
 __all__ = ["Arm", "StartupRefused", "TargetRefused"]
 

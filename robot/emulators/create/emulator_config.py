@@ -8,7 +8,7 @@ from robot.drivers.create.protocol import WHEEL_BASE
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.simulation.create.strain_sensors import WhiskersConfig
 from robot.simulation.create.wheel_odometry import WheelsConfig
-from robot.world.random_arena import ArenaConfig
+from robot.world.arena import ArenaConfig
 from tactile.base.settings import Settings
 
 

@@ -11,7 +11,7 @@ from robot.drivers.create.protocol import TOP_SPEED, Bumps, Mode
 from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.simulation.create.wheel_odometry import simulate_wheel_odometry
 from robot.world.arena import Arena, wall_segments
-from robot.world.polygons import segment_distance
+from robot.world.walls import segment_distance
 from tactile.base.random_streams import stream
 
 DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's first byte gives its length

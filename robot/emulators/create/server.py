@@ -2,6 +2,8 @@
 
 Fault requests are lines of JSON, answered by a line: on standard input, or on the bridge's fault port with
 `"device": "create"`; without that the port takes those of the bridge.
+
+The emulated serial line: a pseudo-terminal, and its faults.
 """
 
 from __future__ import annotations
@@ -14,28 +16,117 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robot.drivers.create.protocol import Bumps
+from robot.drivers.create.protocol import BAUD, Bumps
 from robot.drivers.head.usb_protocol import Command
-from robot.drivers.process_priority import urgent
+from robot.drivers.processes import urgent
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
-from robot.emulators.create.serial_line import LineFaults, Terminal
 from robot.emulators.head.emulated_device import EmulatedHead
-from robot.emulators.head.sensor_array import Block, block_samples
 from robot.emulators.head.server import open_server
+from robot.emulators.head.whiskers import Block, block_samples
 from robot.simulation.create.strain_sensors import (
     BodyVibration,
     base_strains,
     bend_whiskers,
     fixed_whiskers,
 )
-from robot.world.polygons import segment_distance
-from robot.world.random_arena import make_arena
+from robot.world.arena import make_arena
+from robot.world.walls import segment_distance
+from tactile.base.errors import InputError, os_errors_of
+from tactile.base.files import temporary_path
 from tactile.base.random_streams import stream
+
+
+class LineFaults:
+    """Faults of the serial line."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = stream(seed, "create garbage")
+        self.garbage, self.lose, self.scramble, self.trickle = 0, 0, 0, 0.0
+        self.cut: int | None = None
+
+    def disturb(self, reply: bytes) -> bytes:
+        """The reply after the pending faults."""
+        if self.lose:
+            self.lose -= 1
+            return b""
+        if self.scramble:
+            self.scramble -= 1
+            return self.noise(reply)
+        if self.cut is not None:
+            reply, self.cut = reply[: self.cut], None
+        before, self.garbage = self._random.bytes(self.garbage), 0
+        return before + reply
+
+    def noise(self, reply: bytes) -> bytes:
+        """The reply as received at another baud rate."""
+        return self._random.bytes(len(reply))
+
+
+class Terminal:
+    """A pseudo-terminal that looks like a serial port to the program at its other end.
+
+    Args:
+        link: name of a link to it, which stays the same when it is plugged in again; None for no link.
+
+    Attributes:
+        master: descriptor of this end. path: name of the other end. plugged: whether it exists.
+
+    Raises:
+        InputError: the system has no pseudo-terminals, or the link's name is taken.
+    """
+
+    def __init__(self, link: str | None = None) -> None:
+        try:
+            import termios
+            import tty
+        except ImportError:
+            raise InputError(sys.platform, "has no pseudo-terminals", "Linux or macOS") from None
+        self._termios, self._tty = termios, tty
+        self._link = None if link is None else Path(link)
+        self.plugged = False
+        self.plug()
+
+    def plug(self) -> None:
+        """Makes the terminal, or a new one after `unplug`."""
+        if self.plugged:
+            return
+        self.master, self._slave = os.openpty()  # the slave stays open: without one, reads fail
+        self._tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        self.path = os.ttyname(self._slave)
+        if self._link is not None and os.path.lexists(self._link):
+            left = self._link.is_symlink() and Path(os.readlink(self._link)).parent == Path(self.path).parent
+            if not left:  # by an emulator that was killed
+                cure = "choose another name for the emulated port (`live.create.port`)"
+                expected = "a new name for the emulated port"
+                raise InputError(str(self._link), "exists and is no emulated port", expected, cure)
+        self.plugged = True
+        if self._link is not None:
+            new = temporary_path(self._link)
+            with os_errors_of(self._link, "cannot be made", "a link"):
+                new.symlink_to(self.path)
+                new.replace(self._link)
+            self.path = str(self._link)
+
+    def has_create_baud_rate(self) -> bool:
+        """Whether the client has set the Create's baud rate."""
+        return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{BAUD}"))
+
+    def unplug(self) -> None:
+        """Closes the terminal, as an unplugged cable would."""
+        if self.plugged:
+            self.plugged = False
+            os.close(self.master)
+            os.close(self._slave)
+            if self._link is not None:
+                self._link.unlink(missing_ok=True)
+
 
 TICK = 0.005
 """Longest time between two moments at which the robot's motion is computed, s."""

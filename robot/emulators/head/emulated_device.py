@@ -1,6 +1,8 @@
 """An emulated head at its USB interface: transfers, and frames over time.
 
 Times are arguments: no function waits or reads a clock.
+
+USB descriptors of the emulated bridge.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import struct
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,7 +19,12 @@ import numpy as np
 
 from robot.drivers.head.usb_protocol import (
     CHANNELS,
+    ENDPOINT_IN,
+    ENDPOINT_OUT,
+    INTERFACE,
+    PRODUCT,
     REQUEST_IN,
+    VENDOR,
     VERSION,
     FrameFlag,
     Request,
@@ -25,10 +33,38 @@ from robot.drivers.head.usb_protocol import (
     to_counts,
     unpack_command,
 )
-from robot.emulators.head import usb_descriptors
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
-from robot.emulators.head.sensor_array import Block, SensorArray, block_samples
+from robot.emulators.head.whiskers import Block, SensorArray, block_samples
 from tactile.base.random_streams import stream
+
+STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
+"""String descriptors by index: none, manufacturer, product, serial."""
+LANGUAGE = 0x0409
+"""Language of the strings: English."""
+PACKET = 512
+"""Size of a high-speed bulk packet, bytes."""
+
+
+def device() -> bytes:
+    """The device descriptor: USB 2.0, vendor-specific class."""
+    return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
+
+
+def configuration() -> bytes:
+    """The only configuration descriptor: self-powered, one interface, bulk endpoints in and out."""
+    interface = struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
+    ends = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
+    size = 9 + len(interface) + len(ends)
+    return struct.pack("<BBHBBBBB", 9, 2, size, 1, 1, 0, 0xC0, 0) + interface + ends
+
+
+def string(number: int) -> bytes | None:
+    """The string descriptor with an index; index 0 gives the language. None if it does not exist."""
+    if not 0 <= number < len(STRINGS):
+        return None
+    text = STRINGS[number].encode("utf-16-le") if number else struct.pack("<H", LANGUAGE)
+    return struct.pack("<BB", 2 + len(text), 3) + text
+
 
 STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
 """Supported standard requests, by bmRequestType and bRequest."""
@@ -99,7 +135,7 @@ class EmulatedHead:
             OSError: EPIPE for an unsupported request.
         """
         if (kind, request) == STRING and value >> 8 == 3:
-            answer = usb_descriptors.string(value & 0xFF)
+            answer = string(value & 0xFF)
         elif (kind, request) == CONFIGURED:
             answer = b"\1"
         elif (kind, request) in (CONFIGURE, ALTERNATE):

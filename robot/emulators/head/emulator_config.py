@@ -6,14 +6,13 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from robot.drivers.head.emulated_cable_protocol import PORT
-from robot.drivers.ur10.base_transform import BaseTransformConfig
+from robot.drivers.head.emulated_cable import PORT
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.world.head_trajectory import MotionConfig
-from robot.world.scene import MazeConfig, PathConfig
+from robot.world.scene import MazeConfig, MotionConfig, PathConfig
 from tactile.base.settings import Settings
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 CONTROL_PORT = 30099
 """Port for fault requests."""

@@ -15,18 +15,17 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-from robot.drivers.head.emulated_cable_protocol import ANSWER, IN, REQUEST, Op
+from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op
 from robot.drivers.head.usb_protocol import ENDPOINT_IN
-from robot.drivers.process_priority import urgent
-from robot.drivers.ur10.pose_listener import PoseListener
-from robot.emulators.head import usb_descriptors
+from robot.drivers.processes import urgent
+from robot.drivers.ur10.rtde_protocol import PoseListener
+from robot.emulators.head import emulated_device
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, maze_whiskers
 from robot.emulators.listening import listening
-from robot.world.head_trajectory import HeadPath
-from robot.world.scene import KidnapConfig, make_scene
-from tactile.whiskers.head_geometry import ur10_head
+from robot.world.scene import HeadPath, KidnapConfig, make_scene
+from tactile.whisker_geometry import ur10_head
 
 Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FaultHandler = Callable[[dict[str, Any], float], dict[str, Any]]
@@ -113,7 +112,7 @@ class HeadServer:
                 await asyncio.sleep(self.bridge.due - time.monotonic())
 
     async def usb(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serves a connection of `robot.drivers.head.emulated_cable_protocol` until the head is unplugged."""
+        """Serves a connection of `robot.drivers.head.emulated_cable` until the head is unplugged."""
         plugs = self.bridge.faults.plugs
         try:
             while True:
@@ -146,7 +145,7 @@ class HeadServer:
         bridge, now = self.bridge, time.monotonic()
         self._present(plugs)
         if op == Op.DESCRIBE:
-            return usb_descriptors.device() + usb_descriptors.configuration()
+            return emulated_device.device() + emulated_device.configuration()
         if op == Op.CLAIM:
             if self._owner is not None and self._owner[0] is not connection and self._owner[1] == plugs:
                 raise _error(errno.EBUSY)

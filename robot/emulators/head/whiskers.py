@@ -3,6 +3,8 @@
 Drives of an emulated head: they whisk, rest, and retract if no commands arrive.
 
 A whisk starts at the start of a block of samples or at the end of the previous whisk.
+
+The whiskers behind an emulated bridge: what it asks of them.
 """
 
 from __future__ import annotations
@@ -20,20 +22,87 @@ from robot.drivers.head.usb_protocol import (
     CommandKind,
     FeedbackMode,
 )
-from robot.drivers.ur10.base_transform import BaseTransformConfig, pose_from_tcp
-from robot.drivers.ur10.pose_listener import PoseListener
+from robot.drivers.ur10.driver_config import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
-from robot.emulators.head.sensor_array import Block, block_samples
 from robot.simulation.head.baseline import Baseline, make_baseline
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig
-from robot.simulation.head.quasistatic import WhiskerBalance, advance_balance, whiskers_at_rest
-from robot.simulation.head.whisk_stream import WallSweep, draw_noise, sensor_readings, sweep_walls
-from robot.world.head_trajectory import HeadPath, poses_at
+from robot.simulation.head.whisk_stream import (
+    WallSweep,
+    WhiskerBalance,
+    advance_balance,
+    draw_noise,
+    sensor_readings,
+    sweep_walls,
+    whiskers_at_rest,
+)
+from robot.world.scene import HeadPath, poses_at
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import Head, ur10_head
-from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
+from tactile.whisker_geometry import Head, ur10_head
+from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
+
+BLOCK = 0.01
+"""Samples are made and sent in blocks of this duration, s."""
+
+
+def block_samples(rate: float) -> int:
+    """Samples of a block at a rate, Hz."""
+    return max(round(BLOCK * rate), 2)
+
+
+class Block(NamedTuple):
+    """T samples.
+
+    Attributes:
+        angle: [T, W] rad. deflection: [T, W, 2] rad. begins: [T] bool, the first sample of a whisk.
+        fed_back: whether feedback has lowered an amplitude.
+    """
+
+    angle: np.ndarray
+    deflection: np.ndarray
+    begins: np.ndarray
+    fed_back: bool
+
+
+class SensorArray(Protocol):
+    """Simulated whiskers, moved by drives or fixed. Times are the host's monotonic clock, s."""
+
+    @property
+    def count(self) -> int:
+        """Number of whiskers."""
+        ...
+
+    @property
+    def resting(self) -> bool:
+        """Whether all drives rest, so that blocks nobody reads need not be made."""
+        ...
+
+    def begin(self, time: float) -> None:
+        """The stream of samples starts."""
+        ...
+
+    def block(self, start: float, end: float) -> Block:
+        """The samples between two times."""
+        ...
+
+    def skip_block(self) -> None:
+        """Skips a block without samples or motion."""
+        ...
+
+    def receive(self, command: Command, now: float) -> None:
+        """Executes a command."""
+        ...
+
+    def stop(self) -> None:
+        """Retracts the whiskers and stops the drives."""
+        ...
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Pose and activity, as JSON values."""
+        ...
+
 
 STEP = 1e-4
 """Resolution of lifts, m; an arm at working height stays within it."""
@@ -266,7 +335,7 @@ class ServoDrives:
         return balance
 
     def law(self, drive: WhiskDrive, time: float, deflection: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
-        """A `robot.simulation.head.quasistatic.WhiskingLaw`; `time` counts from the start of the whisk."""
+        """A `robot.simulation.head.whisk_stream.WhiskingLaw`; `time` counts from the start of the whisk."""
         if self.whisk is None:
             share = 0.0 if self._from is None else max(1 - time / RETRACTION, 0.0)
             return np.zeros_like(deflection) + (0.0 if self._from is None else self._from * share), drive

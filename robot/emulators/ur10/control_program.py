@@ -23,7 +23,7 @@ import sys
 from enum import IntEnum
 
 from robot.emulators.ur10.controller import EmulatedController, Program
-from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, parse_moves
+from robot.emulators.ur10.motion import MoveL, MoveOrder, StopL, parse_moves
 
 READY, DONE = 1, 2
 RUNNING_BIT = 1 << 15

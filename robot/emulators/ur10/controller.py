@@ -9,10 +9,9 @@ from typing import Any, Protocol
 
 from robot.emulators.ur10.emulated_arm import EmulatedArm, force_magnitude
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.motion import Unreachable
+from robot.emulators.ur10.kinematics import Vector6
+from robot.emulators.ur10.motion import MoveL, MoveOrder, Unreachable
 from robot.emulators.ur10.registers import Registers
-from robot.emulators.ur10.rotations import Vector6
-from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder
 
 MAX_TARGETS = 10_000  # orders kept for the fault request "state"
 

@@ -8,18 +8,20 @@ from collections.abc import Iterable
 
 from robot.emulators.ur10 import motion as motions
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig, WallConfig
-from robot.emulators.ur10.kinematics import UR10, UR10E
+from robot.emulators.ur10.kinematics import UR10, UR10E, Vector6
 from robot.emulators.ur10.motion import (
     ZERO,
     ArmModel,
     LinearMotion,
     Motion,
     MotionState,
+    MoveL,
+    MoveOrder,
+    StopL,
     ToolSpeedMotion,
     Unreachable,
+    start_motion,
 )
-from robot.emulators.ur10.rotations import Vector6
-from robot.emulators.ur10.urscript_moves import MoveL, MoveOrder, StopL, start_motion
 
 NEAR: Vector6 = (0.0, -1.6, -1.6, -1.6, 1.57, 0.0)  # posture at the start, rad: elbow up, tool down
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from robot.emulators.ur10.rotations import Vector6
+from robot.emulators.ur10.kinematics import Vector6
 from tactile.base.settings import Settings
 
 SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed in the client library

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from robot.drivers.process_priority import urgent
+from robot.drivers.processes import urgent
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.listening import listening

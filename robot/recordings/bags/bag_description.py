@@ -8,21 +8,32 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import Bag, Topic
-from robot.recordings.bags.bag_touch import ARRAYS, JOINTS
-from robot.recordings.bags.images import IMAGES, RAW, grey_image
-from robot.recordings.bags.motions import POSES, TWISTS, frames_of, pose_in_plane, twist_in_plane
-from robot.recordings.bags.scans import (
+from robot.recordings.bags.bag import Bag, Topic, leaps, nanoseconds
+from robot.recordings.bags.bag_reader import ARRAYS, JOINTS
+from robot.recordings.bags.transforms import (
+    FORWARD,
+    MOVING,
+    POSES,
+    STATIC,
+    TWISTS,
+    frames_of,
+    mount_of,
+    pose_in_plane,
+    read_links,
+    twist_in_plane,
+)
+from robot.recordings.bags.views import (
     CLOUD,
+    IMAGES,
+    RAW,
     SCAN,
     Extent,
     cloud_points,
     extent_of,
+    grey_image,
     scan_limits,
     wider_extent,
 )
-from robot.recordings.bags.stamps import leaps, nanoseconds
-from robot.recordings.bags.transforms import FORWARD, MOVING, STATIC, mount_of, read_links
 from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.recordings.sanity_checks import SPOILT
 from robot.sources.odometry import from_poses, from_velocities

@@ -8,18 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import Bag
-from robot.recordings.bags.motions import (
+from robot.recordings.bags.bag import OTHER_CLOCK, Bag, Clock, Report, Series, as_series, stamp_of
+from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
+from robot.recordings.bags.transforms import (
     POSES,
     TWISTS,
     frames_of,
     plane_errors,
     pose_in_plane,
+    poses_between,
     twist_in_plane,
 )
-from robot.recordings.bags.stamps import OTHER_CLOCK, Clock, Report, Series, as_series, stamp_of
-from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
-from robot.recordings.bags.transforms import poses_between
 from robot.recordings.sanity_checks import nonfinite_errors
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError

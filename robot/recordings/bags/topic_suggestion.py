@@ -16,11 +16,9 @@ from robot.recordings.bags.bag_description import (
     TopicDescription,
     ValueShape,
 )
-from robot.recordings.bags.bag_touch import JOINTS
-from robot.recordings.bags.images import IMAGES
-from robot.recordings.bags.motions import ODOMETRY
-from robot.recordings.bags.scans import CLOUD, SCAN
-from robot.recordings.bags.transforms import BODIES
+from robot.recordings.bags.bag_reader import JOINTS
+from robot.recordings.bags.transforms import BODIES, ODOMETRY
+from robot.recordings.bags.views import CLOUD, IMAGES, SCAN
 
 TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
 """Names of topics and frames with true poses."""

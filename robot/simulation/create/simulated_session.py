@@ -33,12 +33,10 @@ from robot.simulation.create.strain_sensors import (
     sample_strain,
 )
 from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
-from robot.sources.simulated import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
-from robot.sources.source import rate_of
-from robot.sources.source_info import PlanarWhiskersInfo, SourceInfo
-from robot.world.arena import Arena, arena_text, wall_segments
-from robot.world.polygons import segment_distance
-from robot.world.random_arena import ArenaConfig, make_arena
+from robot.sources.in_memory import NO_ODOMETRY, SimulatedSource, digest_of_document, wrap_headings
+from robot.sources.source import PlanarWhiskersInfo, SourceInfo, rate_of
+from robot.world.arena import Arena, ArenaConfig, arena_text, make_arena, wall_segments
+from robot.world.walls import segment_distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat
 
-from robot.sources.odometry_correction import OdometryCorrection
+from robot.sources.odometry import OdometryCorrection
 from tactile.base.settings import Settings
 
 BIAS_WHITE_SHARE = 0.2

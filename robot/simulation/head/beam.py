@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from tactile.base.settings import Settings
-from tactile.features.contact_threshold import ShaftConfig
+from tactile.contact_threshold import ShaftConfig
 
 SHAFT_SHARES = np.linspace(0.0, 1.0, 401)
 """Positions along a whisker for integration, as fractions of its length."""

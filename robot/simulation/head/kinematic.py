@@ -14,12 +14,12 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from robot.simulation.head.baseline import BaselineConfig
 from robot.simulation.head.beam import StreamConfig
-from robot.world.head_trajectory import HeadPath, poses_at
+from robot.world.scene import HeadPath, poses_at
 from robot.world.walls import Surroundings
 from tactile.base.settings import Settings
-from tactile.features.contact_threshold import ShaftConfig, stiffness
-from tactile.whiskers.head_geometry import Head
-from tactile.whiskers.whisking import WhiskingConfig, neighbour_max, whisk_phase
+from tactile.contact_threshold import ShaftConfig, stiffness
+from tactile.whisker_geometry import Head
+from tactile.whisking import WhiskingConfig, neighbour_max, whisk_phase
 
 SHAFT = ShaftConfig()
 """Shaft of all whiskers."""

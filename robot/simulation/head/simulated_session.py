@@ -26,29 +26,41 @@ from scipy.linalg import expm
 from robot.simulation.head.baseline import has_baseline, make_baseline
 from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
-from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import WallSweep, simulate_cycles, simulate_free_cycles
-from robot.sources.odometry import OdometryConfig, simulate_odometry
-from robot.sources.simulated import (
+from robot.simulation.head.whisk_stream import (
+    WallSweep,
+    simulate_cycles,
+    simulate_free_cycles,
+    simulate_quasistatic,
+)
+from robot.sources.in_memory import (
     NO_ODOMETRY,
     SimulatedSource,
     check_steps,
     digest_of_document,
     wrap_headings,
 )
-from robot.sources.source_info import SimulationInfo, SourceInfo
-from robot.world.head_trajectory import MotionConfig, poses_at
+from robot.sources.odometry import OdometryConfig, simulate_odometry
+from robot.sources.source import SimulationInfo, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE, maze_text
-from robot.world.scene import KidnapConfig, MazeConfig, PathConfig, make_scene, maze_info, other_surroundings
+from robot.world.scene import (
+    KidnapConfig,
+    MazeConfig,
+    MotionConfig,
+    PathConfig,
+    make_scene,
+    maze_info,
+    other_surroundings,
+    poses_at,
+)
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Whisk
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrate
-from tactile.features.contact_threshold import stiffness
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import (
+from tactile.calibration import Calibration, CalibrationConfig, calibrate
+from tactile.contact_threshold import stiffness
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import (
     MID_PROTRACTION,
     WhiskingConfig,
     check_amplitude,

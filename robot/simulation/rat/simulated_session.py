@@ -19,19 +19,25 @@ from robot.recordings.csv_file import read_csv
 from robot.recordings.sanity_checks import RowName
 from robot.simulation.rat.box import BoxConfig, ViewConfig, panoramic_views
 from robot.simulation.rat.phases import PhaseConfig, boxes_of, lay_out_phases
-from robot.simulation.rat.rat_odometry import RatOdometryConfig, measure_motion
-from robot.simulation.rat.rat_path import MotionConfig, RatPath, check_path, sample_path
-from robot.sources.input_files import digest_of, raise_errors, require_file
-from robot.sources.simulated import (
+from robot.simulation.rat.rat_path import (
+    MotionConfig,
+    RatOdometryConfig,
+    RatPath,
+    check_path,
+    measure_motion,
+    sample_path,
+)
+from robot.sources.in_memory import (
     NO_ODOMETRY,
     SimulatedSource,
     check_steps,
     digest_of_document,
     wrap_headings,
 )
-from robot.sources.source_info import SourceInfo
+from robot.sources.input_files import digest_of, raise_errors, require_file
+from robot.sources.source import SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.npz import read_npz
+from tactile.base.files import read_npz
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 from tactile.base.settings import Settings

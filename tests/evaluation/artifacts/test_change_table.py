@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.artifacts.change_table import NAME, ChangeRow, read_changes, write_changes
+from evaluation.artifacts.closure_table import NAME, ChangeRow, read_changes, write_changes
 from tactile.base.errors import InputError
 
 ROW = ChangeRow(0.1, 0.2, 0.15, "new", 240.5, 1e-12, 7, 76, 402)

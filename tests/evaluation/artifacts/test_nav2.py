@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.artifacts.grid_npz import read_grid
-from evaluation.artifacts.nav2 import FREE_THRESH, OCCUPIED_THRESH, read_nav2, write_nav2
+from evaluation.artifacts.grid_files import FREE_THRESH, OCCUPIED_THRESH, read_grid, read_nav2, write_nav2
 from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, OccupancyGrid
 from tactile.base.errors import InputError
 

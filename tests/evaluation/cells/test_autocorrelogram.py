@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.cells.autocorrelogram import autocorrelogram
+from evaluation.cells.grid_score import autocorrelogram
 from tactile.base.errors import InputError
 from tests.evaluation.cells.lattice_maps import mixed_maps
 

@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from evaluation.cells.border import border_score, score_borders, wall_coverage, wall_distance
-from evaluation.cells.fields import bin_area, count_by_cell, find_fields, largest_by_cell, largest_field
+from evaluation.cells.fields import (
+    bin_area,
+    border_score,
+    count_by_cell,
+    find_fields,
+    largest_by_cell,
+    largest_field,
+    score_borders,
+    wall_coverage,
+    wall_distance,
+)
 from evaluation.cells.rate_map import rate_maps
 from tactile.base.errors import InputError
 from tests.evaluation.cells.box_walk import EDGES, mixed_sums, random_walk

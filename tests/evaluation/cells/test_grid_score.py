@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.cells.autocorrelogram import autocorrelogram, centre_radii
-from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, centre_radii, lattice_scores
 from evaluation.papers.cells.agreement import grid_score, quiet
 from tactile.base.errors import InputError
 from tests.evaluation.cells.lattice_maps import lattice_map, mixed_maps

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.cells.autocorrelogram import autocorrelogram
-from evaluation.cells.grid_score import HEXAGONAL, SQUARE, measure_lattice
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, measure_lattice
 from tactile.base.errors import InputError
 from tests.evaluation.cells.lattice_maps import lattice_map
 

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from evaluation.cells.border import score_borders
-from evaluation.cells.coherence import correlate, neighbour_means
-from evaluation.cells.fields import find_fields
+from evaluation.cells.fields import find_fields, score_borders
 from evaluation.cells.head_direction import mean_vector_length, peak_rate, preferred_direction
 from evaluation.cells.information import (
     information,
@@ -21,7 +19,15 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import bin_activity, rate_maps, smooth_plane, smooth_rates, tuning_curves
+from evaluation.cells.rate_map import (
+    bin_activity,
+    correlate,
+    neighbour_means,
+    rate_maps,
+    smooth_plane,
+    smooth_rates,
+    tuning_curves,
+)
 from evaluation.cells.recording import BinnedSums
 from evaluation.papers.cells.agreement import border_score, mutual_information, quiet
 from tactile.base.random_streams import stream

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evaluation.cells.coherence import coherence, correlate, neighbour_means
 from evaluation.cells.information import (
     conjunctive_information,
     exceeds_both,
@@ -18,7 +17,7 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import box_samples, rate_maps, sum_into
+from evaluation.cells.rate_map import box_samples, coherence, correlate, neighbour_means, rate_maps, sum_into
 from tactile.base.random_streams import stream
 from tests.evaluation.cells.box_walk import direction_cells, mixed_sums, place_cells, random_walk
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evaluation.cells.packet_drift import packet_drift, packet_pose, torus_sides, truth_in_sheet
+from evaluation.cells.decoding import packet_drift, packet_pose, torus_sides, truth_in_sheet
 from evaluation.cells.sheet_phase import (
     circular_correlation,
     compare_phases,

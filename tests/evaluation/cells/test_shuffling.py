@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from evaluation.cells.autocorrelogram import autocorrelogram
-from evaluation.cells.grid_score import HEXAGONAL, SQUARE, lattice_scores
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, lattice_scores
 from evaluation.cells.shuffling import PathBins, Score, ShuffledScores, calibrate, shuffled_scores
 from tactile.base.errors import InputError
 

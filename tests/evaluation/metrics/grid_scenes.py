@@ -6,7 +6,6 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.grid_error import Convention, grid_error
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,
@@ -14,6 +13,7 @@ from evaluation.metrics.occupancy_grid import (
     touchable_surface,
     truth_occupancy,
 )
+from evaluation.metrics.occupancy_score import Convention, grid_error
 
 law = settings(max_examples=25)
 CELL = 0.05

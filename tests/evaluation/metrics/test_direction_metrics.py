@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.salman2016.direction_metrics import direction_metrics, lap_of_step
-from evaluation.studies.session_metrics import lap_ends
+from evaluation.papers.salman2016.protocols import direction_metrics, lap_of_step
+from evaluation.studies.metrics import lap_ends
 from tests.helpers.laps import session, square
 
 CHANGE = 0.3

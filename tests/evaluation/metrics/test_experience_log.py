@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaluation.metrics.experience_log import read_experience_log
+from evaluation.metrics.exm import read_experience_log
 from evaluation.metrics.scorecard import render_scorecard, score_log
 from tactile.base.errors import InputError
 

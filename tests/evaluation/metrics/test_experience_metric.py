@@ -13,10 +13,10 @@ from evaluation.metrics.exm import (
     NO_RELOCALISATION,
     ExmConfig,
     base_end,
+    change_rows,
     experience_metric,
     relocalisations,
 )
-from evaluation.metrics.experience_log import change_rows
 from evaluation.metrics.statistics import bootstrap
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap

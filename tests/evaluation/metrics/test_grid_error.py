@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.metrics.grid_error import CONVENTIONS, MAIN_CONVENTION, grid_error, pool_errors, smooth_truth
-from evaluation.metrics.grid_metrics import CLAMP
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,
@@ -18,7 +16,15 @@ from evaluation.metrics.occupancy_grid import (
     touchable_surface,
     truth_occupancy,
 )
-from evaluation.metrics.occupancy_score import score_grid
+from evaluation.metrics.occupancy_score import (
+    CLAMP,
+    CONVENTIONS,
+    MAIN_CONVENTION,
+    grid_error,
+    pool_errors,
+    score_grid,
+    smooth_truth,
+)
 from tests.evaluation.metrics.grid_scenes import (
     ARENA,
     CELL,

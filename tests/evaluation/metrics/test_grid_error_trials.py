@@ -10,9 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.metrics.grid_error import MAIN_CONVENTION
 from evaluation.metrics.occupancy_grid import GridTruth, mean_grid
-from evaluation.metrics.occupancy_score import GridScore, pool_grids, render_grid_scores, score_grid
+from evaluation.metrics.occupancy_score import (
+    MAIN_CONVENTION,
+    GridScore,
+    pool_grids,
+    render_grid_scores,
+    score_grid,
+)
 from tests.evaluation.metrics.grid_scenes import error, law, noisy, scene, scenes, seeds, true_grid, values
 
 

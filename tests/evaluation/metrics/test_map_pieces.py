@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.metrics.energy_metric import energy, energy_all_pairs
-from evaluation.metrics.map_pieces import energy_within_pieces, tie_jump, unjoined_share
+from evaluation.metrics.run_metrics import energy_within_pieces, tie_jump, unjoined_share
 from tactile.base.se2 import compose, integrate
 
 law = settings(derandomize=True, deadline=None, max_examples=60)

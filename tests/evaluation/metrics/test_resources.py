@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.studies.resources import one_core, peak_memory, reset_peak_memory, watch_load
+from evaluation.studies.machine import one_core, peak_memory, reset_peak_memory, watch_load
 
 
 def test_memory_is_measured_for_one_piece_of_work():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.fox2012.revisits import LEAVE_DISTANCE, find_revisits, path_metrics
+from evaluation.papers.fox2012.reproduction import LEAVE_DISTANCE, find_revisits, path_metrics
 
 
 def there_and_back(count: int = 40, far: float = 1.0) -> np.ndarray:

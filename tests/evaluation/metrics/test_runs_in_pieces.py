@@ -7,16 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.artifacts.pieces_table import read_pieces, write_pieces
-from evaluation.artifacts.run_reader import read_run
-from evaluation.metrics.map_pieces import arrange_pieces, ate_within_pieces
-from evaluation.metrics.run_metrics import PIECES
+from evaluation.artifacts.run_reader import read_pieces, read_run, write_pieces
+from evaluation.metrics.run_metrics import PIECES, arrange_pieces, ate_within_pieces
 from evaluation.metrics.scorecard import score_run, scorecard_lines
 from evaluation.metrics.trajectory import ate, write_tum
-from evaluation.plots.change_plot import draw_changes
-from evaluation.plots.map_plot import align_layers, draw_map, map_headline
+from evaluation.plots.map_plot import align_layers, draw_changes, draw_map, map_headline
 from evaluation.report.verdict import describe_score
-from ratslam.core.localisation import Localisation, pieces_of, write_course
+from ratslam.core.estimates import Localisation, pieces_of, write_course
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.studies.session_metrics import lap_ends, touch_metrics
+from evaluation.studies.metrics import lap_ends, touch_metrics
 from tactile.base.se2 import compose
 from tests.helpers.laps import session, square
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from evaluation.metrics.statistics import auc
-from evaluation.studies.view_separation import ViewDifferences, compare_views, image_difference
+from evaluation.studies.metrics import ViewDifferences, compare_views, image_difference
 from tactile.base.errors import InputError
 
 VIEWS = arrays.arrays(float, (5, 3, 6, 1), elements=st.sampled_from([0.0, 0.02, 0.5, 1.0]))

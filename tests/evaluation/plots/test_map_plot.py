@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.artifacts.recorded_views import read_whisker_views
 from evaluation.artifacts.run_reader import read_walls
-from evaluation.artifacts.whisker_views import read_whisker_views
 from evaluation.plots.run_plots import plot_writers
 from ratslam.cli import main
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import load, validate
 from robot.touch_source import open_touch_source

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.studies.pareto_plot import ParetoPoint, draw_pareto, place_labels
+from evaluation.studies.study_report import ParetoPoint, draw_pareto, place_labels
 
 
 @given(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.collections import PatchCollection
 
-from evaluation.artifacts.whisker_views import WhiskerViews, read_whisker_views, write_whisker_views
+from evaluation.artifacts.recorded_views import WhiskerViews, read_whisker_views, write_whisker_views
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.whisker_plot import MAX_HEADS, draw_whiskers
 from tactile.base.errors import InputError

@@ -16,21 +16,21 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from evaluation.artifacts.closure_table import ClosureTable, read_closure_table, write_closure_pairs
-from evaluation.artifacts.closure_views import (
+from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.recorded_views import (
     NAME,
     ClosureViews,
     eight_bit,
     read_closure_views,
     write_closure_views,
 )
-from evaluation.artifacts.manifest import read_manifest
 from evaluation.metrics.run_arrays import UNFINISHED
 from evaluation.metrics.scorecard import score_run
 from evaluation.plots.map_plot import align_layers
 from evaluation.report.charts import PALETTE, overlay_chart
-from evaluation.report.closure_records import VIEW_BYTES, closure_records, halve, view_records
 from evaluation.report.page import content_policy, embedded_json, read_citations
 from evaluation.report.run_files import FILES, OTHER, list_run_files
+from evaluation.report.run_report import VIEW_BYTES, closure_records, halve, view_records
 from evaluation.report.verdict import describe_score, judge_map
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose

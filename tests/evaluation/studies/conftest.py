@@ -11,7 +11,7 @@ import pytest
 
 from evaluation.metrics.metric import Quantity
 from evaluation.studies.machine import machine
-from evaluation.studies.records import RunRecord
+from evaluation.studies.run_job import RunRecord
 from evaluation.studies.study import Job
 
 TINY = {
@@ -75,5 +75,5 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         found = record(time=1000 / score, error=failed, **({} if failed else values))
         return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})
 
-    monkeypatch.setattr("evaluation.studies.study_runner.run_job", run_job)
+    monkeypatch.setattr("evaluation.studies.run_job.run_job", run_job)
     return keys

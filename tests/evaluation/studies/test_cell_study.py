@@ -21,15 +21,13 @@ from evaluation.studies.cell_study import (
     cell_study,
     parameter_sets,
     run_cell_study,
+    score_sets,
 )
 from evaluation.studies.executor import Executor
-from evaluation.studies.set_scores import score_sets
 from evaluation.studies.study_course import expected_poses, place_bins, read_course
-from ratslam.classic.batch import Network
-from ratslam.classic.cell_batch import CellSets, walk
+from ratslam.classic.batch import CellSets, Network, walk
 from ratslam.cli import main
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations, read_observations
+from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import load_config
 
 ROOT = Path(__file__).parents[3]

@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.studies.growth import GrowthPlan, GrowthTask, growth_study
-from evaluation.studies.growth_report import FILE, read_rows
-from evaluation.studies.growth_session import measure_growth
+from evaluation.studies.growth import FILE, GrowthPlan, GrowthTask, growth_study, measure_growth, read_rows
 from ratslam.cli import main
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze import CELL_SIDE

@@ -9,8 +9,8 @@ import pytest
 
 from evaluation.studies.commands import PRESETS
 from evaluation.studies.presets import METHODS, PARTS, TIERS, preset_study, variations
-from evaluation.studies.records import RunLog
-from evaluation.studies.tiers import shortened
+from evaluation.studies.run_job import RunLog
+from evaluation.studies.scene_statistics import shortened
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load, override

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaluation.studies.records import FILE, RunLog
+from evaluation.studies.run_job import FILE, RunLog
 from tactile.base.errors import InputError
 from tests.evaluation.studies.conftest import record
 

@@ -14,9 +14,17 @@ from hypothesis import strategies as st
 from evaluation.metrics.run_metrics import recognition_error
 from evaluation.metrics.statistics import pareto_optimal
 from evaluation.studies.metrics import COLUMNS, METRICS, find_error
-from evaluation.studies.schema import StudyPlan
-from evaluation.studies.study_report import make_report, render, save_report
-from evaluation.studies.study_summary import default_error, label, mark_optimal, spread, summarise
+from evaluation.studies.study import StudyPlan
+from evaluation.studies.study_report import (
+    default_error,
+    label,
+    make_report,
+    mark_optimal,
+    render,
+    save_report,
+    spread,
+    summarise,
+)
 from tactile.base.errors import InputError
 from tests.evaluation.studies.conftest import record
 

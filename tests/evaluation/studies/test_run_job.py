@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from evaluation.artifacts.run_reader import read_scorecard
-from evaluation.metrics.grid_metrics import GRID_METRICS
+from evaluation.metrics.occupancy_score import GRID_METRICS
 from evaluation.studies.machine import COMPILED, Stopwatch
 from evaluation.studies.metrics import MEASURED, METRICS
 from evaluation.studies.run_job import run_job

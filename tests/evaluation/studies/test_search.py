@@ -12,7 +12,7 @@ import pytest
 from evaluation.studies.executor import Executor
 from evaluation.studies.metrics import MEASURED
 from evaluation.studies.parameter_search import search
-from evaluation.studies.records import FILE, RunLog
+from evaluation.studies.run_job import FILE, RunLog
 from evaluation.studies.study import read_study
 from evaluation.studies.study_report import make_report
 from ratslam.cli import main

@@ -20,18 +20,17 @@ from evaluation.studies.recommendation import (
     SLOW,
     cells_to_cover,
     changed_settings_yaml,
+    cheaper_steps,
     recommend,
     round_number,
 )
-from evaluation.studies.records import RunRecord
-from evaluation.studies.scene_statistics import Scene, scene_of, short_session
+from evaluation.studies.run_job import RunRecord
+from evaluation.studies.scene_statistics import Scene, scene_of, short_session, with_tier
 from evaluation.studies.study import with_settings
-from evaluation.studies.tiers import with_tier
-from evaluation.studies.trial_runs import cheaper_steps
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
 from ratslam.cli import main
-from ratslam.grid.particle_maps import LAYERS
-from ratslam.runs.open_source import open_source
+from ratslam.grid.particles import LAYERS
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import override, parse, validate
 
@@ -168,7 +167,7 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
 @pytest.mark.soak
 def test_a_small_arena_is_sized(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "evaluation.studies.trial_runs.cheaper_steps",
+        "evaluation.studies.recommendation.cheaper_steps",
         lambda config: dict(islice(cheaper_steps(config).items(), 1)),
     )  # less to compile
     path = tmp_path / "arena.yaml"
@@ -195,7 +194,7 @@ def stubbed(monkeypatch):
         em = Quantity(label="EM", value=float(job.config.pose_cells.cell_size), unit="")
         return RunRecord(hash="", seed=0, steps=9, quantities={"energy_all": em})
 
-    monkeypatch.setattr("evaluation.studies.trial_runs.run_job", run_job)
+    monkeypatch.setattr("evaluation.studies.recommendation.run_job", run_job)
     return configurations
 
 

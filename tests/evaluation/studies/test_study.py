@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.studies.schema import StudyPlan
-from evaluation.studies.study import Study, read_study
+from evaluation.studies.study import Study, StudyPlan, read_study
 from ratslam.cli import main
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.runs.settings.run_config import RunConfig

@@ -15,9 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.studies.executor import Executor
-from evaluation.studies.records import FILE, RunLog
+from evaluation.studies.run_job import FILE, KILLED, RunLog, measure_jobs, run_jobs
 from evaluation.studies.study import read_study
-from evaluation.studies.study_runner import KILLED, measure_jobs, run_jobs
 from ratslam.cli import main
 from tests.evaluation.studies.conftest import record
 
@@ -125,7 +124,7 @@ def test_lost_records_are_run_again_and_nothing_else(data, scores, tmp_path_fact
             calls.append(job.key)
             return record(seed=job.seed, hash=job.hash, energy_all=job.config.keyframes.min_score)
 
-        patch.setattr("evaluation.studies.study_runner.run_job", run_job)
+        patch.setattr("evaluation.studies.run_job.run_job", run_job)
         whole = run(jobs, folder)
         assert len(calls) == 2 * len(scores)  # equal configurations run once
         assert [each.row for each in whole] == [job.row for job in jobs]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from ratslam.classic.config import NetworkConfig
 from ratslam.classic.levels import Activity, Block, activity_sums, to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig
 
 LEVELS = window_levels(NetworkConfig(cells_xy=45, cells_heading=72), np.dtype(np.float64))
 

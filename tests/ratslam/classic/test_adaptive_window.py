@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from ratslam.classic import excitation_inhibition as window
 from ratslam.classic import levels, pose_cells
-from ratslam.classic.level_step import StepInput, step_at
-from ratslam.classic.levels import to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.config import NetworkConfig, rings, units
+from ratslam.classic.levels import StepInput, step_at, to_full_torus, window_levels
 from tactile.base.types import Odometry
 
 CELLS = {11: 2, 21: 2, 41: 3, 61: 4}

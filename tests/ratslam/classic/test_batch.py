@@ -9,9 +9,9 @@ import pytest
 
 from ratslam.classic import pose_cells
 from ratslam.classic.batch import Course, Network, networks, trials
+from ratslam.classic.config import NetworkConfig, units
 from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.levels import window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig, units
 from ratslam.methods.grid import GridOutcome
 from tactile.base.types import Odometry, stack
 from tests.helpers.grid_world import drive, initial, report

@@ -9,11 +9,10 @@ import pytest
 
 from evaluation.studies.machine import compilations
 from ratslam.classic import pose_cells
-from ratslam.classic.batch import Network
-from ratslam.classic.cell_batch import SEGMENT, CellCourse, CellSets, walk
+from ratslam.classic.batch import SEGMENT, CellCourse, CellSets, Network, walk
+from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.levels import to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
 from tactile.base.types import Odometry
 
 CONFIG = NetworkConfig(cells_xy=21)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ratslam.classic.cell_probe import active_cells, activity_of, choose_cells, hold_cells
+from ratslam.classic.config import NetworkConfig
 from ratslam.classic.levels import Activity, Block, to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig
 from tactile.base.errors import InputError
 
 CONFIG = NetworkConfig(cells_xy=45, cells_heading=72)

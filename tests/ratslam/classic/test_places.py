@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.classic.places import PlaceConfig, decide, distance, start
+from ratslam.classic.experience_map import PlaceConfig, decide, distance, start
 from ratslam.core.estimates import Action
 
 CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)

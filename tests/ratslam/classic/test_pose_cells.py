@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from ratslam.classic import excitation_inhibition as window
 from ratslam.classic import pose_cells
+from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import ring_difference
-from ratslam.classic.level_step import StepInput, step_at
-from ratslam.classic.levels import from_full_torus, to_full_torus, window_levels
-from ratslam.classic.pose_cell_config import NetworkConfig, rings, units
+from ratslam.classic.levels import StepInput, from_full_torus, step_at, to_full_torus, window_levels
 from ratslam.classic.pose_cells import Outcome
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry

@@ -11,7 +11,7 @@ import yaml
 
 from evaluation.metrics.trajectory import read_tum
 from ratslam.cli import main
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.se2 import integrate
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_csv, write_video

@@ -10,13 +10,13 @@ import pytest
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data
-from ratslam.service.fit.record import walls_of
-from ratslam.service.fit.rig_fit import Quantity, Rig, rig_file, rig_settings
+from ratslam.service.record_fit import walls_of
+from ratslam.service.rig_fit import Quantity, Rig, rig_file, rig_settings
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions
 from tactile.base.se2 import integrate
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 ROWS = 900
 

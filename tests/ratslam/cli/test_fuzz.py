@@ -20,7 +20,7 @@ import yaml
 
 from evaluation.metrics.trajectory import ate, read_tum
 from ratslam.runs.settings.run_config import load_config
-from robot.recordings.recorder import Recorder
+from robot.recordings.mcap_writer import Recorder
 from tactile.base.se2 import integrate
 from tests.helpers import scenes
 from tests.helpers.command_worker import CommandWorker, Outcome

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.papers.maps.map_rows import ROWS
+from evaluation.papers.maps.reproduction import ROWS
 from ratslam.cli import GROUPS, build_parser, main
 from ratslam.cli.common import Commands
 

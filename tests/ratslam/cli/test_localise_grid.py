@@ -10,7 +10,7 @@ import pytest
 
 import ratslam
 from ratslam.cli import main
-from ratslam.core.localisation import Localisation
+from ratslam.core.estimates import Localisation
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.runs.build_session import build_session
 from ratslam.runs.localise import localising

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.cli import build_parser, main
-from ratslam.cli.path import read_place
-from ratslam.runs.goal_planner import experience_at
-from ratslam.runs.map_way import TOLERANCE
+from ratslam.cli.maps import read_place
+from ratslam.runs.goal_planner import TOLERANCE, experience_at
 from ratslam.runs.saved_map import read_map
 from tactile.base.errors import InputError
 from tests.ratslam.places.test_route import TRAVEL, line_map, travel_graph

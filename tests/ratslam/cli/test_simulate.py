@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.run import simulate
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config

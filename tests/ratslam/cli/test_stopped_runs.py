@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from ratslam.runs.open_source import open_observations
+from ratslam.runs.build_session import open_observations
 from ratslam.runs.run import catch_interrupt, process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.settings.run_config import load_config

@@ -20,12 +20,11 @@ from hypothesis import strategies as st
 
 from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
 from evaluation.artifacts.run_reader import read_run, read_walls
-from evaluation.monitor.run_progress import RunMonitor, RunProgress
-from evaluation.monitor.watch import draw_watch, path_length, status_line, watch_run
+from evaluation.monitor import RunMonitor, RunProgress, draw_watch, path_length, status_line, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor
 from ratslam.core.session import CHUNK
-from ratslam.runs.open_source import open_observations
+from ratslam.runs.build_session import open_observations
 from ratslam.runs.runner import open_runner
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.arrays import GrowableArray
 
 
 @given(st.lists(st.integers(0, 40), max_size=12))

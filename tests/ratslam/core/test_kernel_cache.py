@@ -10,8 +10,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from ratslam.core import kernel_cache
-from ratslam.core.kernel_cache import FOLDER, cache_settings, keep_kernels, processor_name
+from ratslam.core import compilation
+from ratslam.core.compilation import FOLDER, cache_settings, keep_kernels, processor_name
 
 ROOT = Path(__file__).parents[3]
 
@@ -28,12 +28,12 @@ def settings():
 def test_another_processor_has_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = [processor_name()]
     for text in ("flags : sse avx\n", "flags : sse\n", "Features : neon\n", ""):
-        monkeypatch.setattr(kernel_cache, "CPUINFO", tmp_path / f"cpuinfo{len(names)}")
-        kernel_cache.CPUINFO.write_text(f"model : one\n{text}processor : 1\n")
+        monkeypatch.setattr(compilation, "CPUINFO", tmp_path / f"cpuinfo{len(names)}")
+        compilation.CPUINFO.write_text(f"model : one\n{text}processor : 1\n")
         names.append(processor_name())
         assert processor_name() == names[-1]
     assert len(set(names)) == len(names)
-    monkeypatch.setattr(kernel_cache, "CPUINFO", tmp_path / "none")
+    monkeypatch.setattr(compilation, "CPUINFO", tmp_path / "none")
     assert processor_name() == names[-1]  # where the system does not tell
 
 

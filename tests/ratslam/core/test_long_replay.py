@@ -21,8 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pytest
 
-from robot.sources.source import Sample
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import Sample, SourceInfo
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation

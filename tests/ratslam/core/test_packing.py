@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.packing import PackedRecords, allocate, layout_of
+from ratslam.core.arrays import PackedRecords, allocate, layout_of
 
 DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
 

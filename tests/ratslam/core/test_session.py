@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.core.path_map import PathMap
+from ratslam.core.backend import PathMap
 from ratslam.core.session import CHUNK, Session, capacity_at
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import Sensors

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ratslam.core.xla_flags import FLAGS, add_xla_flags
+from ratslam.core.compilation import FLAGS, add_xla_flags
 
 
 @pytest.mark.parametrize("given", ["", FLAGS[0], " ".join(FLAGS)])

@@ -17,7 +17,7 @@ import ratslam.examples
 from evaluation.metrics.metric_registry import METRICS
 from ratslam.examples import own_arrays, taxel_array
 from ratslam.methods.method_registry import BACKENDS
-from robot.sources.source_registry import SOURCES
+from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH
 
 NAMES = ("dead_reckoning", "own_arrays", "own_loop", "own_metric", "taxel_array")

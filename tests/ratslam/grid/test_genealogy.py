@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.grid import genealogy
-from ratslam.grid.genealogy import Genealogy
+from ratslam.grid import particles
+from ratslam.grid.particles import Genealogy
 from tactile.base.se2 import wrap
 
 COUNT = 6
@@ -82,7 +82,7 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
     for pose, share, _ in reports(200):
         rows.append((pose, share, np.full(COUNT, stream.integers(0, COUNT))))
     whole = genealogy_of(rows).path()
-    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
+    monkeypatch.setattr(particles, "MAX_POSES", levels)
     tree = genealogy_of(rows)
     assert len(tree) == 200
     assert tree.arrays()["pose"].size // 3 <= max(levels, COUNT)
@@ -91,7 +91,7 @@ def test_memory_is_bounded_and_settled_paths_stay(monkeypatch, levels):
 
 
 def test_poses_beyond_the_bound_are_weighted_means(monkeypatch):
-    monkeypatch.setattr(genealogy, "MAX_POSES", 20 * COUNT)
+    monkeypatch.setattr(particles, "MAX_POSES", 20 * COUNT)
     rows = list(reports(60, every=9))
     assert np.abs(genealogy_of(rows).path() - by_copying(rows)).max() < 2
 
@@ -110,7 +110,7 @@ def test_headings_are_averaged_on_the_circle():
 
 @pytest.mark.parametrize("levels", [5 * COUNT, 10**6])
 def test_a_restored_genealogy_continues_bit_for_bit(monkeypatch, levels):
-    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
+    monkeypatch.setattr(particles, "MAX_POSES", levels)
     rows = list(reports(80, every=3))
     whole = genealogy_of(rows)
     for stop in (0, 1, 16, 43):

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ratslam.core.estimates import Action, Estimate, GridDrawing
-from ratslam.core.localisation import Localisation
+from ratslam.core.estimates import Action, Estimate, GridDrawing, Localisation
 from ratslam.grid.localiser import UNEXPLAINED, GridLocaliser, SavedGrid
 from tests.helpers.grid_world import report
 

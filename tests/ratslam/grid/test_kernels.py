@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.grid import blob_kernels as kernels
+from ratslam.grid import likelihoods as kernels
 from tactile.base.se2 import wrap
 
 SIZE = 31

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.core.estimates import Estimate
-from ratslam.grid import genealogy
+from ratslam.grid import particles
 from ratslam.methods.grid import GridEvidence
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, filter_of, report, settings
@@ -129,7 +129,7 @@ def test_files_hold_the_map_and_its_origin(tmp_path):
 @pytest.mark.parametrize("levels", [8 * COUNT, 10**6])
 @pytest.mark.parametrize("stop", [0, 1, 30])
 def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
-    monkeypatch.setattr(genealogy, "MAX_POSES", levels)
+    monkeypatch.setattr(particles, "MAX_POSES", levels)
     steps = list(random_steps(50))
     whole, second = map_of_steps(steps), map_of_steps(random_steps(3, seed=7))
     second.restore({name: value.copy() for name, value in map_of_steps(steps[:stop]).arrays().items()})

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import expit, logit
 
 from ratslam.grid.config import DrawingConfig, GridConfig
-from ratslam.grid.map_drawing import ContactLog, draw_occupancy
+from ratslam.grid.map import ContactLog, draw_occupancy
 from tactile.base.se2 import compose
 from tests.helpers.grid_world import TIPS, create
 

@@ -9,23 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from ratslam.grid import particle_maps
-from ratslam.grid.particle_maps import LAYERS, Windows
+from ratslam.grid import particles
+from ratslam.grid.particles import LAYERS, Windows
 
 COUNT, SIDE = 3, 24
 
 WINDOW = 16
-read = jax.jit(particle_maps.interpolate, static_argnums=1)
+read = jax.jit(particles.interpolate, static_argnums=1)
 around = jax.jit(
-    lambda place, side, size=WINDOW: particle_maps.windows_around(place, side, size).corner,
+    lambda place, side, size=WINDOW: particles.windows_around(place, side, size).corner,
     static_argnums=(1, 2),
 )
 cut = jax.jit(
-    lambda maps, corner, size, layer: particle_maps.read_window(maps, Windows(corner, size), layer),
+    lambda maps, corner, size, layer: particles.read_window(maps, Windows(corner, size), layer),
     static_argnums=(2, 3),
 )
 put = jax.jit(
-    lambda maps, corner, size, layer, values: particle_maps.write_window(
+    lambda maps, corner, size, layer, values: particles.write_window(
         maps, Windows(corner, size), layer, values
     ),
     static_argnums=(2, 3),
@@ -69,14 +69,12 @@ def test_places_outside_are_unexplored(place):
 
 def test_places_are_relative_to_the_middle_of_the_map():
     point = np.array([[0.0, 0.0], [0.1, -0.05]])
-    assert particle_maps.to_cells(point, 0.05, 51) == pytest.approx(np.array([[25, 25], [27, 24]]))
+    assert particles.to_cells(point, 0.05, 51) == pytest.approx(np.array([[25, 25], [27, 24]]))
     # In a map of even side the middle lies between cells.
-    assert particle_maps.to_cells(point, 0.05, 50)[0] == pytest.approx(24.5)
+    assert particles.to_cells(point, 0.05, 50)[0] == pytest.approx(24.5)
     maps = np.zeros((1, LAYERS, 51, 51))
     maps[0, 0, 24, 27] = 1  # row is y, column x
-    assert read(maps, 0, np.asarray(particle_maps.to_cells(point, 0.05, 51))[None])[0] == pytest.approx(
-        [0, 1]
-    )
+    assert read(maps, 0, np.asarray(particles.to_cells(point, 0.05, 51))[None])[0] == pytest.approx([0, 1])
 
 
 @pytest.mark.parametrize("side", [1, 5, WINDOW - 1, WINDOW, WINDOW + 1, 40])
@@ -88,7 +86,7 @@ def test_windows_lie_inside_the_map_and_contain_their_place(side, size, dtype):
         stream.uniform(0, side - 1, (50, 2)),
         stream.normal(0, 10.0 ** stream.uniform(0, 12, (50, 1)), (50, 2)),
     )
-    windows = particle_maps.windows_around(np.concatenate([near, far]).astype(dtype), side, size)
+    windows = particles.windows_around(np.concatenate([near, far]).astype(dtype), side, size)
     assert windows.size == min(size, side)
     assert windows.corner.dtype == np.int32
     corner = np.asarray(windows.corner)
@@ -122,7 +120,7 @@ def test_places_in_windows_are_places_in_the_map():
     maps = filled()
     place = np.random.default_rng(4).uniform(4, SIDE - 5, (COUNT, 2))
     corner = np.asarray(around(place, SIDE))
-    inside = np.asarray(particle_maps.to_window(place[:, None], Windows(corner, WINDOW)))
+    inside = np.asarray(particles.to_window(place[:, None], Windows(corner, WINDOW)))
     assert inside[:, 0] == pytest.approx(place - corner)
     windows = np.stack([cut(maps, corner, WINDOW, layer) for layer in range(LAYERS)], axis=1)
     for layer in range(LAYERS):
@@ -131,7 +129,7 @@ def test_places_in_windows_are_places_in_the_map():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_an_empty_map_has_no_evidence(dtype):
-    maps = particle_maps.empty_maps(COUNT, SIDE, dtype)
+    maps = particles.empty_maps(COUNT, SIDE, dtype)
     assert maps.shape == (COUNT, LAYERS, SIDE, SIDE)
     assert maps.dtype == dtype
     assert not np.any(maps)

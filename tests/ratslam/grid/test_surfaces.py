@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.grid.config import GridConfig
-from ratslam.grid.expectation import CROSSINGS, TIPS, UNEXPLORED, expect
-from ratslam.grid.map_drawing import contact_log
-from ratslam.grid.search import CONTACT, FREE, counted_agreement
-from ratslam.grid.surfaces import Surfaces, draw_surfaces
+from ratslam.grid.expectation import CROSSINGS, TIPS, UNEXPLORED, Surfaces, draw_surfaces, expect
+from ratslam.grid.localiser import CONTACT, FREE, counted_agreement
+from ratslam.grid.map import contact_log
 from tactile.base.se2 import compose
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import LENGTH, create

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
+from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import HEAD_FAULTS, PATIENCE, Faults, emulator, until, ur_emulator
 from tests.ratslam.live.forked_process import raise_priority

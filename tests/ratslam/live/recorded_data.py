@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.drivers.head.decoder import Frames
-from robot.recordings.cdr_live import Event
+from robot.recordings.cdr import Event
 from robot.recordings.mcap_scanner import McapScanner
 from robot.sources.source import Sample
 

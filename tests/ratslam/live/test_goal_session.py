@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import write_tum
-from evaluation.papers.maps.sessions import Recipe, touch_config
+from evaluation.papers.maps.scenarios import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
-from ratslam.live.goal_steering import plan_goals
+from ratslam.live.arm_session import plan_goals
 from ratslam.runs.settings.run_config import load_config
 from robot.live.arm_route import plan_path
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import ur10_head
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS
 from tests.ratslam.live.test_complete_session import CONFIG, PATIENT, emulated
 from tests.ratslam.runs.test_map_formats import FILES

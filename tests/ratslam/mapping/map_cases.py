@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.mapping.acceptance import AcceptByOdds
 from ratslam.mapping.appearance import LabelAppearance
-from ratslam.mapping.closure_odds import AcceptByOdds
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.piece_ties import no_tie

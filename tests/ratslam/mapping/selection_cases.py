@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.mapping.closure_selection import STEPS, SelectionProblem
-from ratslam.mapping.map_hypotheses import MapHypotheses
+from ratslam.mapping.closure_selection import STEPS, MapHypotheses, SelectionProblem
 from ratslam.mapping.optimizer import (
     CalibrationPrior,
     LoopClosures,

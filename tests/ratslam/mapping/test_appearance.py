@@ -16,7 +16,7 @@ from ratslam.mapping.appearance import (
     ViewAppearance,
     WhiskerAppearance,
 )
-from ratslam.mapping.gain_odds import GainPrior, learn_gain_odds
+from ratslam.mapping.ground import GainPrior, learn_gain_odds
 from ratslam.recall.observation_model import label_gains
 from tests.ratslam.mapping.appearance_cases import (
     PIXELS,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.block_cholesky import BlockPattern
+from ratslam.mapping.normal_equations import BlockPattern
 
 seeds, counts = st.integers(0, 10_000), st.integers(1, 25)
 

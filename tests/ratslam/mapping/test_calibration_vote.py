@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.closure_odds import LEAST_TURN_ERROR, SHRINK, vote
+from ratslam.mapping.acceptance import LEAST_TURN_ERROR, SHRINK, vote
 from ratslam.mapping.optimizer import CalibrationPrior
 
 LEAST = 1e-3

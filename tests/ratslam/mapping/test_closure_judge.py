@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.core.growable_array import GrowableArray
+from ratslam.core.arrays import GrowableArray
 from ratslam.mapping.acceptance import AcceptByEvidence
 from ratslam.mapping.appearance import LabelAppearance
 from ratslam.mapping.closure_judge import (
@@ -21,7 +21,7 @@ from ratslam.mapping.closure_judge import (
 )
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.loop_closures import UNLIKELY, Candidate, Verdict
-from ratslam.mapping.map_health import DOUBTED
+from ratslam.mapping.map_solution import DOUBTED
 from tests.ratslam.mapping.lap_cases import APPEARANCES, CLEAN, FALSE, LAP, LAPS, closed, drive, solution
 
 FIRST = np.array([0])

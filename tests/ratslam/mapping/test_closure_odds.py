@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ratslam.mapping.acceptance import AcceptByEvidence, believe
-from ratslam.mapping.closure_odds import MIN_LOG_ODDS, is_round
+from ratslam.mapping.acceptance import MIN_LOG_ODDS, AcceptByEvidence, believe, is_round
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.optimizer import CalibrationPrior
 from tactile.base.se2 import correct_heading, integrate

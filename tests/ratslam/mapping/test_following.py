@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.following import STILL, Motion, Supposed, advance, advance_all, move
+from ratslam.mapping.ground import STILL, Motion, Supposed, advance, advance_all, move
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (
     MOTIONS,

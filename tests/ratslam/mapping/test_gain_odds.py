@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ratslam.mapping.gain_odds import BINS, OUTLIERS, learn_gain_odds
+from ratslam.mapping.ground import BINS, OUTLIERS, learn_gain_odds
 from tests.ratslam.places.alignment_cases import SEEDS
 
 GAINS = arrays(np.float64, st.integers(0, 300), elements=st.floats(-30, 30))

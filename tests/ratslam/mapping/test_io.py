@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.edges import Edges
-from ratslam.mapping.io import read_json, write_g2o, write_json
+from ratslam.mapping.pose_graph import Edges, read_json, write_g2o, write_json
 from tactile.base.errors import InputError
 from tests.helpers.g2o import read_g2o
 

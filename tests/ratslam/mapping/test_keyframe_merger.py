@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ratslam.mapping import archive_selection
+from ratslam.mapping import archive
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_solution import Obstacle
 from ratslam.mapping.merging import NEAR
@@ -151,7 +151,7 @@ STOPS = {
 
 @pytest.fixture
 def early(monkeypatch):
-    monkeypatch.setattr(archive_selection, "FIRST", BEGUN // 2)
+    monkeypatch.setattr(archive, "FIRST", BEGUN // 2)
 
 
 @cache
@@ -188,7 +188,7 @@ def test_checkpoints_change_nothing(early):
 
 def test_the_archive_replaces_the_map_once_it_is_selected(monkeypatch, early):
     taken = []
-    real = archive_selection.UnmergedMap.replace
+    real = archive.UnmergedMap.replace
 
     def replace(self, graph, log, archive):
         before, rows = archive.poses(graph.pose.rows).copy(), graph.count
@@ -211,7 +211,7 @@ def test_the_archive_replaces_the_map_once_it_is_selected(monkeypatch, early):
         taken.append(size)
         return merge
 
-    monkeypatch.setattr(archive_selection.UnmergedMap, "replace", replace)
+    monkeypatch.setattr(archive.UnmergedMap, "replace", replace)
     drive = Drive(ROUTE, **MERGED).go(4 * LAP)
     assert len(taken) == 1
     assert len(drive.rows) == drive.map.kept_keyframes().count

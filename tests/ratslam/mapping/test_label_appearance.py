@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.mapping.view_sectors import NO_ESTIMATE
+from ratslam.mapping.odometry_calibration import NO_ESTIMATE
 from tests.ratslam.mapping.appearance_cases import SILENT, alone, labelled, no_pairs
 
 

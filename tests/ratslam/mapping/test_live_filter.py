@@ -13,8 +13,8 @@ from scipy.optimize import least_squares
 
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.live_filter import LEAST_WEIGHT, LiveFilter
 from ratslam.mapping.loop_closures import Candidate
+from ratslam.mapping.step_record import LEAST_WEIGHT, LiveFilter
 from tactile.base.se2 import between, compose, wrap
 from tests.ratslam.mapping.map_cases import LAP, STEP, drive, new_map, sequence
 

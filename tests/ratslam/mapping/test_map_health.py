@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping import claimed_revisits as revisits
+from ratslam.mapping import map_solution as revisits
 from ratslam.mapping.appearance import LabelAppearance
-from ratslam.mapping.claimed_revisits import CONTROLS, claimed_revisits, claims_cost
 from ratslam.mapping.loop_closures import Verdict
-from ratslam.mapping.map_health import DOUBTED, health_features, worse_than_odometry
-from ratslam.mapping.map_solution import solved_map
+from ratslam.mapping.map_solution import (
+    CONTROLS,
+    DOUBTED,
+    claimed_revisits,
+    claims_cost,
+    health_features,
+    solved_map,
+    worse_than_odometry,
+)
 from tactile.base.se2 import compose
 from tests.ratslam.mapping.lap_cases import (
     APPEARANCES,

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping import map_hypotheses
+from ratslam.mapping import closure_selection
 from ratslam.mapping.closure_selection import (
     ACCEPTED_WEIGHT,
+    KEPT,
+    MapHypotheses,
     SelectionProblem,
     choose_sequences,
     optimise_with_cuts,
     select_closures,
 )
-from ratslam.mapping.map_hypotheses import KEPT, MapHypotheses
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, OdometryChain, System
 from tactile.base.se2 import integrate, wrap
 from tests.ratslam.mapping.selection_cases import LAP, NOISE, PRIOR, World, closures_of, off, world
@@ -80,8 +81,8 @@ def test_sequences_that_all_fit_make_one_map():
 
 @pytest.mark.parametrize("kept", [1, 2, KEPT])
 def test_no_more_maps_are_kept_than_wanted(kept, monkeypatch):
-    monkeypatch.setattr(map_hypotheses, "KEPT", kept)
-    monkeypatch.setattr(map_hypotheses, "DOUBTS", 0)
+    monkeypatch.setattr(closure_selection, "KEPT", kept)
+    monkeypatch.setattr(closure_selection, "DOUBTS", 0)
     made = trap(1, -8, LAP + 12)
     hypotheses, most = MapHypotheses(), 0
     for known in numbers(made.case):
@@ -95,7 +96,7 @@ def test_a_dear_map_is_kept_if_it_refuses_what_all_cheaper_ones_accept():
     sequence."""
     taken = [[1, a, b, c] for a in (1, 0) for b in (1, 0) for c in (1, 0)] + [[0, 1, 1, 1]]
     maps = [MapFit(np.full((1, 3), float(k)), 0.0, np.array(row, float)) for k, row in enumerate(taken)]
-    kept = map_hypotheses.with_doubts(maps)
+    kept = closure_selection.with_doubts(maps)
     assert [fit.poses[0, 0] for fit in kept] == [0, 1, 2, 3, 4, 8]  # 4 refuses the second sequence
 
 
@@ -120,7 +121,7 @@ def test_the_maps_differ(at):
             apart = fit.poses - other.poses
             apart[:, 2] = wrap(apart[:, 2])
             deviation = (apart**2 / made.case.measurements.closures.variance).sum(axis=1).max()
-            assert deviation >= map_hypotheses.ALIKE**2
+            assert deviation >= closure_selection.ALIKE**2
 
 
 # Two maps that mirror each other
@@ -189,7 +190,7 @@ def test_a_forced_sequence_has_to_pay_for_itself(evidence):
 def test_only_force_finds_the_other_map(monkeypatch):
     case = fork((40.0, 60.0))
     fits = MapHypotheses().follow(case, np.arange(2))
-    monkeypatch.setattr(map_hypotheses, "FITS", 0.0)
+    monkeypatch.setattr(closure_selection, "FITS", 0.0)
     unforced = MapHypotheses().follow(case, np.arange(2))
     assert turned(fits[0]) < 0 < turned(unforced[0])
     assert total(case, fits[0]) < total(case, unforced[0])

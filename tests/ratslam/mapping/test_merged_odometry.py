@@ -12,8 +12,7 @@ from ratslam.mapping.archive import Archive
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.mapping.merged_odometry import ATTACHED, merge_keyframes
-from ratslam.mapping.merging import Merge
+from ratslam.mapping.merging import ATTACHED, Merge, merge_keyframes
 from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.mapping.optimizer import CalibrationPrior, System
 from tactile.base.se2 import between, compose, correct_heading, inverse, wrap

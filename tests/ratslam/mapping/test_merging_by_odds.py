@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ratslam.mapping.closure_odds import AcceptByOdds
+from ratslam.mapping.acceptance import AcceptByOdds
 from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import MapCovariance
 from ratslam.mapping.verification import judge_by_map

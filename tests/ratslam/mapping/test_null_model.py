@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.closure_odds import (
+from ratslam.mapping.acceptance import (
     LEAST_SCORE,
     MIN_TRUE,
     PRIOR_COUNT,

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from ratslam.core.backend import NO_CLOSURE
-from ratslam.mapping.acceptance import AcceptByEvidence, believe
-from ratslam.mapping.closure_odds import AcceptByOdds
+from ratslam.mapping.acceptance import AcceptByEvidence, AcceptByOdds, believe
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import APART
 from ratslam.mapping.loop_closures import Candidate
-from ratslam.mapping.map_health import DOUBTED
+from ratslam.mapping.map_solution import DOUBTED
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.piece_ties import Tie, no_tie
 from tactile.base.se2 import between, compose

@@ -11,9 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.classic.relaxation import relax
-from ratslam.mapping.edges import Edges, difference_error, logmap_error
-from ratslam.mapping.io import write_g2o
-from ratslam.mapping.least_squares import GrowingGraph, Termination, geman_mcclure, huber, least_squares
+from ratslam.mapping.pose_graph import (
+    Edges,
+    GrowingGraph,
+    Termination,
+    difference_error,
+    geman_mcclure,
+    huber,
+    least_squares,
+    logmap_error,
+    write_g2o,
+)
 from tactile.base.se2 import between, compose, integrate, wrap
 from tests.helpers.g2o import read_g2o
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.mapping.gain_odds import LEAVING
+from ratslam.mapping.ground import LEAVING
 from ratslam.mapping.pose_tracks import LOST
 from tests.ratslam.mapping.selection_cases import LAP, lap_poses
 from tests.ratslam.mapping.track_cases import COUNT, FIT, ODDS, laps, places

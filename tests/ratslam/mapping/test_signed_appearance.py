@@ -12,8 +12,8 @@ from ratslam.mapping.appearance import (
     NEUTRAL_IMAGE_MISFIT,
     NEW_IMAGE_LOG_ODDS,
     ConfirmedPairs,
+    SignedAppearance,
 )
-from ratslam.mapping.signed_appearance import SignedAppearance
 from tactile.base.types import Odometry, observation
 
 SHAPE, PLACES = (1, 4, 3), 10

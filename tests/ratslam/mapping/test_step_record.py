@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.optimizer import MapFit
-from ratslam.mapping.step_record import StepRecord, leading_to
-from ratslam.mapping.travel import HALT, Travel
+from ratslam.mapping.step_record import HALT, StepRecord, Travel, leading_to
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry
 

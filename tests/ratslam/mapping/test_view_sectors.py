@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping.view_sectors import NO_ESTIMATE, SectorFan
+from ratslam.mapping.odometry_calibration import NO_ESTIMATE, SectorFan
 
 SIZE = 18
 

@@ -15,7 +15,7 @@ from ratslam.mapping.appearance import (
     ConfirmedPairs,
     WhiskerAppearance,
 )
-from ratslam.mapping.view_sectors import NO_ESTIMATE
+from ratslam.mapping.odometry_calibration import NO_ESTIMATE
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend
 from ratslam.recall.whisker_likelihood import (

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ratslam.mapping import archive, archive_selection
+from ratslam.mapping import archive
 from ratslam.mapping.loop_closures import Verdict
 from tests.ratslam.mapping.map_cases import CELL
 from tests.ratslam.mapping.merging_cases import CORRIDOR, NORTH, SOUTH, Drive, corridors, off
@@ -27,7 +27,7 @@ PLACES = np.arange(CORRIDOR)
 def driven(first, merge_stood=1):
     """The drive with the first selection of unmerged keyframes at this number."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(archive_selection, "FIRST", first)
+        patch.setattr(archive, "FIRST", first)
         return Drive(ROUTE, **MERGED | {"merge_stood": merge_stood}).go(LAST)
 
 
@@ -80,7 +80,7 @@ def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
 
 
 def test_the_map_is_right_as_soon_as_it_is_restored(monkeypatch):
-    monkeypatch.setattr(archive_selection, "FIRST", BEGUN)
+    monkeypatch.setattr(archive, "FIRST", BEGUN)
     drive = Drive(ROUTE, **MERGED).go(BEGUN)
     assert drive.map.merger.archive_selection.busy
     while drive.map.merger.archive_selection.busy:

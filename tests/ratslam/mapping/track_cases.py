@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.mapping.gain_odds import GainOdds
-from ratslam.mapping.ground import REACH, REACH_HEADING, Ground
+from ratslam.mapping.ground import REACH, REACH_HEADING, GainOdds, Ground
 from ratslam.mapping.pose_tracks import SelfTraverse
 from tactile.base.se2 import between, integrate
 from tests.ratslam.mapping.selection_cases import LAP, NOISE, SPREAD, STEP, lap_poses

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.grid import particle_maps
-from ratslam.grid.particle_maps import EVIDENCE
+from ratslam.grid import particles
+from ratslam.grid.particles import EVIDENCE
 from tests.helpers.grid_world import BLANK, STEADY, filter_of, initial, report, settings
 
 FILTER = filter_of(settings())
@@ -37,13 +37,13 @@ def placed(backend, pose, point):
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = pose[:, :1] + c * point[:, 0] - s * point[:, 1]
     y = pose[:, 1:2] + s * point[:, 0] + c * point[:, 1]
-    return np.asarray(particle_maps.to_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
+    return np.asarray(particles.to_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
 
 
 def evidence_at(backend, state, point, layer=EVIDENCE):
     """[N, K] the layer of each particle's map at points [K, 2] of base_link."""
     place = placed(backend, state.particles.pose, point).astype(backend.dtype)
-    return np.asarray(particle_maps.interpolate(state.maps, layer, place))
+    return np.asarray(particles.interpolate(state.maps, layer, place))
 
 
 def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):

@@ -15,8 +15,7 @@ from ratslam.methods.grid import GridOutcome
 from ratslam.methods.localise_grid import GridLocaliseOutcome
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.places.localiser import Localisation
-from ratslam.service.checks.backend_checks import CHECKS
-from ratslam.service.checks.backend_trial import CIRCUIT, BackendTrial
+from ratslam.service.backend_checks import CHECKS, CIRCUIT, BackendTrial
 
 
 def pose_cells(method, source, **more):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.grid.particle_maps import COSINE, EVIDENCE, SINE
+from ratslam.grid.particles import COSINE, EVIDENCE, SINE
 from tactile.base.se2 import wrap
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, at_pose, drive, filter_of, initial, report, settings

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.grid.particle_maps import EVIDENCE
+from ratslam.grid.particles import EVIDENCE
 from ratslam.methods.grid import GridOutcome
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, at_pose, drive, initial, report, with_map

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.grid import likelihoods, particle_maps
-from ratslam.grid.particle_maps import EVIDENCE
+from ratslam.grid import likelihoods, particles
+from ratslam.grid.particles import EVIDENCE
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, at_pose, drive, initial, report, with_map
 from tests.ratslam.methods.grid_filters import CORRIDOR, FILTER, SINGLE, column_of_wall, placed
@@ -57,7 +57,7 @@ def corridor(backend, reports, spread):
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)
     maps = (
-        particle_maps.empty_maps(1, backend.side, np.dtype(float))
+        particles.empty_maps(1, backend.side, np.dtype(float))
         .at[0, EVIDENCE]
         .set(column_of_wall(backend, 0.65))
     )
@@ -65,7 +65,7 @@ def corridor(backend, reports, spread):
 
     def evidence(points):
         place = placed(backend, pose, points).reshape(1, -1, 2)
-        return np.asarray(particle_maps.interpolate(maps, EVIDENCE, place)).reshape(len(x), len(points))
+        return np.asarray(particles.interpolate(maps, EVIDENCE, place)).reshape(len(x), len(points))
 
     for o in reports:
         sd = spread * abs(float(o.odometry.dx))

@@ -8,9 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ratslam.mapping.following import Motion, Supposed
-from ratslam.mapping.gain_odds import GainOdds, learn_gain_odds
-from ratslam.mapping.ground import Ground
+from ratslam.mapping.ground import GainOdds, Ground, Motion, Supposed, learn_gain_odds
 from tactile.base.se2 import between, compose, wrap
 
 REACH, REACH_HEADING = 0.06, 0.3

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.ground import Ground
-from ratslam.places.session_changes import ContactMap, contact_map, contact_points, contact_signs
+from ratslam.places.change import ContactMap, contact_map, contact_points, contact_signs
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 LAYOUT = pixel_layout((3, 6, 1))

@@ -8,8 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.mapping.following import Motion, Supposed
-from ratslam.mapping.ground import Ground
+from ratslam.mapping.ground import Ground, Motion, Supposed
 from ratslam.places.hypotheses import SPAN, Hypotheses, Recalled, SessionViews
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.mapping.gain_odds import GainOdds, LearnedOdds, learn_gain_odds
+from ratslam.mapping.ground import GainOdds, LearnedOdds, learn_gain_odds
 
 
 def odds_of(seed: int) -> GainOdds:

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 
 from ratslam.core.estimates import Action, Estimate
+from ratslam.mapping.acceptance import AcceptByOdds
 from ratslam.mapping.appearance import LabelAppearance
-from ratslam.mapping.closure_odds import AcceptByOdds
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.ground import Ground
 from ratslam.mapping.map import KeyframeMap

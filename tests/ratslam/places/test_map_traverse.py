@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping.following import Motion
+from ratslam.mapping.ground import Motion
 from ratslam.places.joining import TOGETHER, MapTraverse
 from ratslam.places.placement import Traverse, find_placements
 from tactile.base.se2 import compose

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.places.overlap import LEAST, Overlap, Remembered, overlap, remembered
-from ratslam.places.union import unite
+from ratslam.places.union import LEAST, Overlap, Remembered, overlap, remembered, unite
 from tests.ratslam.mapping.map_cases import BIAS, LAP, drive, new_map, sequence
 
 law = settings(derandomize=True, deadline=None, max_examples=60)

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.gain_odds import LEAVING
-from ratslam.mapping.ground import NEAR
-from ratslam.places.paths import (
+from ratslam.mapping.ground import LEAVING, NEAR
+from ratslam.places.hypotheses import (
     AGAIN,
     AGAIN_SHARE,
     BESIDE,

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping.following import Motion
-from ratslam.mapping.gain_odds import learn_gain_odds
-from ratslam.mapping.ground import Ground
-from ratslam.places.placement import Traverse, find_placements
-from ratslam.places.view_comparison import Comparison
+from ratslam.mapping.ground import Ground, Motion, learn_gain_odds
+from ratslam.places.placement import Comparison, Traverse, find_placements
 from tactile.base.se2 import between, compose
 
 COUNT, RADIUS = 200, 2.0

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.mapping.gain_odds import learn_gain_odds
-from ratslam.mapping.ground import Ground
-from ratslam.places.self_comparison import LENGTH, Gains, compare_with_itself
+from ratslam.mapping.ground import Ground, learn_gain_odds
+from ratslam.places.localiser import LENGTH, Gains, compare_with_itself
 from tests.ratslam.places.alignment_cases import ground_at, square_loop
 
 GUARD = 20

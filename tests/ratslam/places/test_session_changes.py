@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.appearance import LabelAppearance, WhiskerAppearance
-from ratslam.mapping.gain_odds import learn_gain_odds
-from ratslam.mapping.ground import Ground
+from ratslam.mapping.ground import Ground, learn_gain_odds
+from ratslam.places.change import Touch, session_changes
 from ratslam.places.localiser import Place, Visits
-from ratslam.places.session_changes import Touch, session_changes
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 TOUCH = Touch(ur10_head(HeadConfig()), 0.05)
 LAYOUT = pixel_layout((3, 6, 1))

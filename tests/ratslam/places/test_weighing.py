@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ratslam.mapping.gain_odds import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
-from ratslam.places.self_comparison import compare_with_itself
+from ratslam.mapping.ground import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
+from ratslam.places.localiser import compare_with_itself
 from tests.ratslam.places.test_self_comparison import GUARD, gains_on, laps
 
 GAINS = arrays(

@@ -27,7 +27,7 @@ from ratslam.recall.signed_likelihood import (
     stored_image,
     unpack,
 )
-from robot.recordings.whiskers.objects import read_object
+from robot.recordings.real_whiskers import read_object
 
 SIZE, PLACES, VISITS = 24, 30, 4
 seeds = st.integers(0, 10_000)

@@ -21,7 +21,7 @@ from ratslam.recall.whisker_likelihood import (
     pixel_layout,
     pixel_levels,
 )
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 SHAPES = [(3, 6, 1), (3, 6, 2), (1, 4, 1), (2, 2, 3)]
 SIZE = 18

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.metrics.map_pieces import energy_within_pieces
+from evaluation.metrics.run_metrics import energy_within_pieces
 from ratslam.core.session import Session, Step
-from ratslam.mapping.io import read_json
 from ratslam.mapping.keyframe_graph import APART
+from ratslam.mapping.pose_graph import read_json
 from tactile.base.types import Observation
 from tests.helpers.g2o import read_g2o
 from tests.ratslam.runs.touch_walks import (

@@ -16,8 +16,7 @@ from ratslam.classic.levels import to_full_torus
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import Sensors
 from ratslam.runs.build_session import build_session
-from ratslam.runs.cell_plan import plan_recording
-from ratslam.runs.cell_recorder import ROWS
+from ratslam.runs.cell_recorder import ROWS, plan_recording
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
 from ratslam.runs.settings.run_config import LoopConfig

@@ -16,11 +16,10 @@ import ratslam
 import ratslam.runs.runner
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session
-from ratslam.runs.checkpoint_file import digest_of
 from ratslam.runs.continuation import resume_session
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
-from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map
+from ratslam.runs.saved_map import SavedMap, describe_readings, digest_of, read_map, write_map
 from ratslam.runs.settings.run_config import LoopConfig
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig

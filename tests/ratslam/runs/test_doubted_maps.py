@@ -11,10 +11,10 @@ from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics import run_metrics
 from evaluation.metrics.scorecard import render_health, render_warnings, score_run
 from evaluation.metrics.trajectory import ate
-from evaluation.papers.trials.spoilt_maps import Recipe, solved_anew, spoil
+from evaluation.papers.tables.spoilt_maps import Recipe, solved_anew, spoil
 from ratslam.core.backend import NO_CLOSURE
 from ratslam.mapping.loop_closures import Verdict
-from ratslam.mapping.map_health import DOUBTED, worse_than_odometry
+from ratslam.mapping.map_solution import DOUBTED, worse_than_odometry
 from tactile.base.se2 import compose, integrate, inverse
 from tests.ratslam.runs.test_recall_maps import golden, golden_map, map_log, started
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import align, ate
-from ratslam.core.localisation import Localisation
+from ratslam.core.estimates import Localisation
 from ratslam.runs.merge import merge_maps
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.slam import Slam
-from robot.sources.description import SourceDescription
+from robot.sources.source import SourceDescription
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import Observation, Odometry, observation
 

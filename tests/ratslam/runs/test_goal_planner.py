@@ -9,20 +9,18 @@ import networkx
 import numpy as np
 import pytest
 
-from evaluation.papers.maps.virtual_arm import VirtualArm
+from evaluation.papers.maps.goals import VirtualArm
 from ratslam.runs.goal_planner import GoalPlanner, felt_points
-from robot.live.goal_config import GoalConfig
-from robot.live.goal_drive import DriveState, GoalDrive
-from robot.live.goal_route import GoalRoute
-from robot.live.live_config import LiveConfig
-from robot.world.head_trajectory import MotionConfig
+from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
+from robot.live.live_config import GoalConfig, LiveConfig
 from robot.world.maze import Maze, between_cells, cell_centre, random_maze, wall_boxes
+from robot.world.scene import MotionConfig
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
 from tactile.frontend import Frontend, TouchConfig
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import ur10_head
 
 LOOP = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1)]
 MAP_POSE = np.array([0.3, -0.2, 0.7])

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from ratslam.methods.method_registry import LOCALISING
-from ratslam.runs.checkpoint_file import FORMAT
 from ratslam.runs.localise import localising
-from ratslam.runs.saved_map import SavedMap
+from ratslam.runs.saved_map import FORMAT, SavedMap
 from ratslam.runs.settings.run_config import LoopConfig
-from robot.sources.description import SourceDescription
+from robot.sources.source import SourceDescription
 from tactile.base.errors import InputError
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ratslam.core.session import CHUNK, Session, Step
-from ratslam.mapping import archive_selection
+from ratslam.mapping import archive
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tests.ratslam.runs.touch_walks import (
     Walk,
@@ -32,7 +32,7 @@ def walk_of(seed: int) -> Walk:
 @pytest.fixture(params=[NEVER, BEGUN], ids=["merged", "restored"])
 def first(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     if request.param == BEGUN:
-        monkeypatch.setattr(archive_selection, "FIRST", BEGUN // 2)
+        monkeypatch.setattr(archive, "FIRST", BEGUN // 2)
     return int(request.param)
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from evaluation.metrics.metric import Quantity
 from ratslam.examples import taxel_array
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.run import run
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from robot.sources.source_registry import SOURCES
+from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH
 from tests.helpers import tactile_arrays
 

@@ -10,8 +10,7 @@ import pytest
 import ratslam
 from ratslam.cli import main
 from ratslam.core.session import Session
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import open_observations, open_source, read_observations
+from ratslam.runs.build_session import build_session, open_observations, open_source, read_observations
 from ratslam.runs.settings.run_config import RunConfig, load_config
 
 SHORT = ("rat_simulation.seconds=4", "session.reserve=64")

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from evaluation.artifacts.closure_table import read_closure_table
-from evaluation.artifacts.closure_views import read_closure_views
+from evaluation.artifacts.recorded_views import read_closure_views
 from evaluation.report.charts import PALETTE
-from evaluation.report.closure_records import display_gain
+from evaluation.report.run_report import display_gain
 from ratslam.cli import main
-from ratslam.runs.report import write_report
+from ratslam.runs.map_results import write_report
 from tests.helpers.square_run import copy_square_run
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="of the extra [dev]")

@@ -10,9 +10,8 @@ import pytest
 
 import ratslam
 from ratslam.core.session import Session
-from ratslam.runs.checkpoint_file import FORMAT, FORMATS, digest_of
-from ratslam.runs.saved_map import SavedMap, read_map, write_map
-from ratslam.runs.sensor import check_same_sensor
+from ratslam.runs.map_settings import check_same_sensor
+from ratslam.runs.saved_map import FORMAT, FORMATS, SavedMap, digest_of, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump, dump_data, parse
 from tactile.base.errors import InputError
 

@@ -11,8 +11,8 @@ import pytest
 
 import ratslam
 from ratslam.core.session import Step
+from ratslam.runs.build_session import open_observations
 from ratslam.runs.estimate import pose_estimate
-from ratslam.runs.open_source import open_observations
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.types import MotionKind, Report, Whisk
 

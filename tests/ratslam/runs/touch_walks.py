@@ -11,8 +11,7 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
-from ratslam.runs.build_session import build_session
-from ratslam.runs.open_source import read_observations
+from ratslam.runs.build_session import build_session, read_observations
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.simulated_session import HeadSimulation

@@ -8,15 +8,15 @@ import sys
 
 import pytest
 
-from robot.drivers.lateness import WINDOW, LatenessMeter
 from robot.drivers.outcome import SessionOutcome
+from robot.drivers.processes import WINDOW, LatenessMeter
 from robot.drivers.ur10.driver_config import ArmConfig
-from robot.drivers.ur10.late_findings import ended_script_finding, silent_session_finding, stale_finding
+from robot.drivers.ur10.safety import ended_script_finding, silent_session_finding, stale_finding
 
 REAL = ArmConfig(host="192.168.1.10")
 PRIORITIES = """
 import os, subprocess, sys, threading
-from robot.drivers import process_priority as priority
+from robot.drivers import processes as priority
 def of(pid):
     return os.sched_getscheduler(pid), os.getpriority(os.PRIO_PROCESS, pid)
 waiting = threading.Event()
@@ -25,7 +25,7 @@ other.start()
 before = of(0)
 with priority.urgent():
     assert of(0) == of(other.native_id), "threads that run already"
-    code = "import os; from robot.drivers.process_priority import step_back; step_back();"
+    code = "import os; from robot.drivers.processes import step_back; step_back();"
     code += "print(os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0))"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     policy, niceness = map(int, child.stdout.split())

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.head.cycle_assembly import assemble_cycle, make_cut
-from robot.drivers.head.decoder import Frames
+from robot.drivers.head.decoder import Frames, assemble_cycle, make_cut
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import SourceInfo
 from tactile.base.types import Cycle, Odometry
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 ROOT = Path(__file__).parents[3]
 W, RATE = 4, 200

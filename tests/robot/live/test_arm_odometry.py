@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.live.arm_odometry import ArmOdometry
+from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.live.live_config import LiveConfig
+from robot.live.live_rig import ArmOdometry
 from robot.sources.odometry import OdometryConfig
 from tactile.base.se2 import compose, integrate
 

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.goal_config import GoalConfig
-from robot.live.goal_drive import DriveState, GoalDrive, PlannedWay, Sighting
-from robot.live.goal_route import MOVED, ContactMap, GoalRoute
-from robot.live.live_config import LiveConfig
+from robot.live.goal_drive import MOVED, ContactMap, DriveState, GoalDrive, GoalRoute, PlannedWay, Sighting
+from robot.live.live_config import GoalConfig, LiveConfig
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE = np.zeros((0, 2))

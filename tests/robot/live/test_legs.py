@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot.live.goal_drive import SCATTER, leg_heading, legs_of
-from tactile.base.segments import line_distances
+from tactile.base.se2 import line_distances
 
 
 def test_a_corner_has_two_legs_that_pass_all_poses():

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.base_transform import pose_from_tcp
+from robot.drivers.ur10.driver_config import pose_from_tcp
 from robot.live.arm_route import approach_route, descent_route, main_route, plan_path
 from robot.live.live_config import LiveConfig
-from robot.world.head_trajectory import poses_at
-from robot.world.scene import make_scene
+from robot.world.scene import make_scene, poses_at
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.drivers.head.cycle_assembly import make_cut
-from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.live.arm_odometry import ArmOdometry
+from robot.drivers.head.decoder import make_cut
+from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.live.live_config import LiveConfig
+from robot.live.live_rig import ArmOdometry
 from robot.sources.odometry import OdometryConfig
 from tests.robot.live.live_recordings import RATE, START, open_recorder, some_frames, some_states
 

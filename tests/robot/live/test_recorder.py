@@ -15,19 +15,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.cycle_assembly import (
+from robot.drivers.head.decoder import (
     MAX_FRAMES,
     Cut,
+    Frames,
     FrameWindow,
     assemble_cycle,
     empty_frames,
     make_cut,
     select_frames,
 )
-from robot.drivers.head.decoder import Frames
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
-from robot.recordings.cdr_live import (
+from robot.recordings.cdr import (
+    TRUTH,
     Event,
     decode_cut,
     decode_event,
@@ -40,7 +41,6 @@ from robot.recordings.cdr_live import (
 )
 from robot.recordings.mcap_reader import Recording
 from robot.recordings.mcap_scanner import McapScanner
-from robot.recordings.schemas import TRUTH
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 from tests.robot.live.live_recordings import (

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.drivers.head.cycle_assembly import make_cut
-from robot.drivers.head.decoder import Frames
+from robot.drivers.head.decoder import Frames, make_cut
 from robot.drivers.outcome import SessionOutcome
 from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner
@@ -35,9 +34,9 @@ import mmap, struct, sys
 from pathlib import Path
 import numpy as np
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.cycle_assembly import make_cut
+from robot.drivers.head.decoder import make_cut
 from robot.live.recorder import LiveRecorder
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import SourceInfo
 from tactile.base.types import Odometry
 
 path, beside = map(Path, sys.argv[1:])

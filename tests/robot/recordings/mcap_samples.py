@@ -10,12 +10,11 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robot.recordings.recorder import Recorder
-from robot.sources.source import Sample
-from robot.sources.source_info import MazeInfo, SourceInfo
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import MazeInfo, Sample, SourceInfo
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
-from tactile.features.calibration import Calibration
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.calibration import Calibration
+from tactile.whisker_geometry import HeadConfig
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -27,8 +27,7 @@ from robot.recordings.formats import FORMATS, open_recording
 from robot.recordings.mcap_reader import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.input_files import read_bytes
-from robot.sources.source import Source
-from robot.sources.source_registry import SOURCES, SourceEntry
+from robot.sources.source import SOURCES, Source, SourceEntry
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 from tests.helpers.distributions import install

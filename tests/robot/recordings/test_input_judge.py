@@ -25,10 +25,9 @@ from robot.recordings.input_judge import (
 )
 from robot.recordings.npz_trace import read_trace
 from robot.recordings.recording_config import RecordingConfig
-from robot.recordings.stretch import Stretch
+from robot.recordings.sanity_checks import Stretch
 from robot.sources.in_memory import InMemorySource
-from robot.sources.odometry import from_poses, from_velocities
-from robot.sources.odometry_correction import OdometryCorrection, replace_steps
+from robot.sources.odometry import OdometryCorrection, from_poses, from_velocities, replace_steps
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, integrate
 

@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from robot.recordings.cdr import OBSERVATION, SCHEMAS, TOPICS
 from robot.recordings.mcap_reader import Recording, record_source, recover
 from robot.recordings.mcap_scanner import FORMAT, McapScanner, metadata_checksum
+from robot.recordings.mcap_writer import Recorder
 from robot.recordings.npz_trace import read_trace
-from robot.recordings.recorder import Recorder
-from robot.recordings.schemas import OBSERVATION, SCHEMAS, TOPICS
-from robot.sources.source import Sample, Source
-from robot.sources.source_info import SourceInfo
+from robot.sources.source import Sample, Source, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 from tests.robot.recordings.mcap_samples import (

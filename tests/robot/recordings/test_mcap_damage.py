@@ -109,7 +109,7 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Pat
     code = f"""
         import os, signal
         from pathlib import Path
-        from robot.recordings.recorder import Recorder
+        from robot.recordings.mcap_writer import Recorder
         from robot.sources.source import Sample
         from tactile.base.types import Odometry, observation
         recorder = Recorder(Path({str(path)!r}))

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.recordings.cdr import decode, encode
-from robot.recordings.schemas import CYCLE, OBSERVATION, REPORT, TRUTH, WHISK
+from robot.recordings.cdr import CYCLE, OBSERVATION, REPORT, TRUTH, WHISK, decode, encode
 from robot.sources.source import Sample
 from tactile.base.types import Observation, Report, Whisk
 from tests.robot.recordings.mcap_samples import (

@@ -12,12 +12,12 @@ from robot.recordings.mcap_reader import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
-from robot.sources.odometry import from_motions
-from robot.sources.odometry_correction import (
+from robot.sources.odometry import (
     OdometryCorrection,
     correct_motions,
     correct_observations,
     correct_odometry,
+    from_motions,
 )
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry, observation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.trials.view_controls import apply_control
+from evaluation.papers.trial_sessions import apply_control
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import open_touch_source

@@ -13,16 +13,20 @@ from pydantic import ValidationError
 from scipy.ndimage import label
 
 from robot.world.arena import (
+    OTHER_START_CLEARANCE,
     Arena,
+    ArenaConfig,
     arena_text,
     has_clearance,
     in_free_space,
     is_enclosed,
     is_occupied,
+    make_arena,
+    place_start,
     read_arena,
     wall_segments,
 )
-from robot.world.polygons import (
+from robot.world.walls import (
     polygon_area,
     polygon_contains,
     polygon_edges,
@@ -31,7 +35,6 @@ from robot.world.polygons import (
     segments_cross,
     square,
 )
-from robot.world.random_arena import OTHER_START_CLEARANCE, ArenaConfig, make_arena, place_start
 from tactile.base.errors import InputError
 
 SEEDS = st.integers(0, 10**6)

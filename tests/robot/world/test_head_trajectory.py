@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.world.head_trajectory import HeadPath, JitterConfig, MotionConfig, add_kidnaps, plan_path, poses_at
-from robot.world.maze import CELL_SIDE, cell_centre, random_loop
-from robot.world.maze_routes import circuit_route
+from robot.world.maze import CELL_SIDE, cell_centre, circuit_route, random_loop
+from robot.world.scene import HeadPath, JitterConfig, MotionConfig, add_kidnaps, plan_path, poses_at
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 

@@ -9,12 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.world.maze import Maze, closed_maze, is_open, neighbours, random_loop, random_maze
-from robot.world.maze_routes import (
+from robot.world.maze import (
+    Maze,
     check_route,
     circuit_route,
+    closed_maze,
     exploration_route,
+    is_open,
     make_anticlockwise,
+    neighbours,
+    random_loop,
+    random_maze,
     winding_loop,
 )
 from tactile.base.errors import InputError

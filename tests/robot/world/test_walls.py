@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
+from tactile.whisker_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
 
 STEP = 1 / 600
 """Step of the search, as a fraction of the sweep."""

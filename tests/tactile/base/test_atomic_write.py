@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile.base.atomic_write import flush_to_disk, write_atomically, write_text_atomically
+from tactile.base.files import flush_to_disk, write_atomically, write_text_atomically
 
 
 def test_the_temporary_file_is_hidden_and_keeps_the_suffix(tmp_path: Path) -> None:

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tactile.base.atomic_write import write_atomically
 from tactile.base.errors import InputError
-from tactile.base.new_file import (
+from tactile.base.files import (
     make_new_file,
     new_folder,
     require_new_file,
     require_own_folder,
     require_writable,
+    write_atomically,
 )
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
-from tactile.features.calibration import (
+from tactile.calibration import (
     Calibration,
     CalibrationConfig,
     calibrate,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry
-from tactile.features.calibration import Calibration
-from tactile.features.contact_threshold import (
+from tactile.calibration import Calibration
+from tactile.contact_threshold import (
     ContactConfig,
     ShaftConfig,
     detect_contacts,

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile.base.random_streams import stream
-from tactile.features.contact_stream import (
+from tactile.calibration import FreeBaseline
+from tactile.contact_stream import (
     ContactStreamConfig,
     StreamPlan,
     StreamState,
@@ -17,7 +18,6 @@ from tactile.features.contact_stream import (
     find_fixed_contacts,
     start_stream,
 )
-from tactile.features.free_record import FreeBaseline
 
 RATE = 200.0
 FREE = FreeBaseline(np.array([[5.0, -3.0, 0.0], [0.0, 1.0, 2.0]]), np.array([[1.0, 2.0, 0.5]] * 2), ())

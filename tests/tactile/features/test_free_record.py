@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.features.free_record import DirtyRecordConfig, calibrate_free, clean_stretch
+from tactile.calibration import DirtyRecordConfig, calibrate_free, clean_stretch
 
 REPAIR = DirtyRecordConfig(on_dirty="repair")
 

@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry, Whisk
-from tactile.features.calibration import Calibration
-from tactile.features.rest_baseline import RestBaselineConfig, bent_whiskers, follow_baseline, start_baseline
+from tactile.calibration import (
+    Calibration,
+    RestBaselineConfig,
+    bent_whiskers,
+    follow_baseline,
+    start_baseline,
+)
 from tactile.frontend import Frontend, TouchConfig
 
 SD, COUNT = 2e-3, 18

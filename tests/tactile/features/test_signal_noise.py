@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.features.signal_noise import (
+from tactile.calibration import (
     LAG,
     WINDOW,
     estimate_drift,

@@ -10,16 +10,16 @@ from hypothesis.extra.numpy import arrays
 
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle, Odometry, Whisk, observation
-from tactile.features.calibration import Calibration
-from tactile.features.whisker_image import (
+from tactile.calibration import Calibration
+from tactile.frontend import Frontend, TouchConfig
+from tactile.whisker_geometry import HeadConfig, shaft_points, tip_height, ur10_head
+from tactile.whisker_image import (
     MIN_BRIGHTNESS,
     ImageConfig,
     view_shape,
     whisk_observation,
     whisker_image,
 )
-from tactile.frontend import Frontend, TouchConfig
-from tactile.whiskers.head_geometry import HeadConfig, shaft_points, tip_height, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 ODOMETRY = Odometry(0.03, 0.001, 0.02, 1.0)

@@ -10,8 +10,8 @@ import pytest
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
-from tactile.fit.head import HeadFit, fit_head
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.rig_signals import HeadFit, fit_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 ASSUMED = HeadConfig()
 DELAY_DEG = np.degrees(0.015)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile.base.errors import InputError
-from tactile.fit.signals import SignalFit, SignalRecord, fit_signals
+from tactile.rig_signals import SignalFit, SignalRecord, fit_signals
 
 ROWS, WHISKERS, RATE, BLOCK = 20000, 5, 200.0, 100
 NOISE, COLOUR, DRIFT = 3.0, 0.5, 0.8  # unit, correlation, unit per root second

@@ -24,12 +24,13 @@ from tactile.wall_estimation.estimators import (
     wall_normal,
     wall_through,
 )
-from tactile.wall_estimation.sliding_tip import TipModel, fit_tip_model
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     TemplateTraining,
+    TipModel,
     TrainingDrive,
     filter_strain,
+    fit_tip_model,
     match_template,
     train_templates,
 )

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.whiskers.outline import Circle, fit_circle, local_tangents, plane_covariance
 from evaluation.papers.whiskers.sliding_contact import (
     ContactTrack,
     SlidingContact,
     find_contact,
     track_contact,
 )
-from robot.recordings.whiskers.stage import cut_sweep, read_stage, read_stage_calibration
+from evaluation.papers.whiskers.tangent import Circle, fit_circle, local_tangents, plane_covariance
+from robot.recordings.real_whiskers import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
 from tactile.wall_estimation.signal_map import (
     SignalMap,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
-from tactile.whiskers.head_geometry import (
+from tactile.whisker_geometry import (
     Head,
     HeadConfig,
     RingConfig,

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import (
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import (
     WhiskingConfig,
     check_amplitude,
     initial_drive,

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.cells.anchoring import (
+from evaluation.papers.cells.figure import CellTask
+from evaluation.papers.cells.packet_figures import (
     PATHS,
     RATE,
     TESTS,
@@ -17,7 +18,6 @@ from evaluation.papers.cells.anchoring import (
     measure_anchoring,
     table_anchoring,
 )
-from evaluation.papers.cells.figure import CellTask
 
 SHORT = Schedule(test=20.0, back=28.0, end=34.0)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.cells.drift import (
+from evaluation.papers.cells.figure import CellTask
+from evaluation.papers.cells.packet_figures import (
     FIGURE,
     LEVELS,
     SPEED,
@@ -18,7 +19,6 @@ from evaluation.papers.cells.drift import (
     rms,
     table_drift,
 )
-from evaluation.papers.cells.figure import CellTask
 
 CELL = np.array([0.05, np.radians(10)])
 

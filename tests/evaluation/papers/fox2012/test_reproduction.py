@@ -11,32 +11,36 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluation.papers import paper_sets
 from evaluation.papers.commands import FOX2012
-from evaluation.papers.fox2012.protocols import FILTERED, MAPPERS, PAPERS, PROTOCOLS, RECKONED, TRUE
 from evaluation.papers.fox2012.reproduction import (
     FIELDS,
+    FILTERED,
+    MAPPERS,
     MEASURES,
     PAPER,
+    PAPERS,
+    PROTOCOLS,
+    RECKONED,
+    TRUE,
     Measure,
     plan_jobs,
     rank_mappers,
     render_rankings,
     run_job,
 )
-from evaluation.papers.trials import reproduction
-from evaluation.papers.trials.arena_trial import (
+from evaluation.papers.paper_sets import ResultRow, reproduce
+from evaluation.papers.trial_sessions import (
     collect_marks,
     draw_map,
     observe_session,
     run_filter,
     simulate_session,
 )
-from evaluation.papers.trials.reproduction import ResultRow, reproduce
 from ratslam.cli import main
 from ratslam.grid.config import GridConfig
-from ratslam.runs.artifacts import true_grid
-from robot.world.arena import Arena
-from robot.world.random_arena import ArenaConfig, make_arena
+from ratslam.runs.run_directory import true_grid
+from robot.world.arena import Arena, ArenaConfig, make_arena
 from tactile.base.errors import InputError
 from tests.helpers.grid_world import TIPS, create, report
 
@@ -241,7 +245,7 @@ def test_an_interrupt_keeps_the_finished_sessions(tmp_path: Path, monkeypatch: p
         ]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(reproduction, "run_tasks", interrupted)
+    monkeypatch.setattr(paper_sets, "run_tasks", interrupted)
     text, stopped = reproduce(PAPER, "fox-fig4", tmp_path, sets=3, workers=1)
     assert stopped
     assert "1 of 3 sets" in text

@@ -9,7 +9,7 @@ import numpy as np
 
 from evaluation.papers.maps.localisation_metrics import nearest_steps
 from evaluation.papers.maps.row import Localised, Methods
-from evaluation.papers.maps.sessions import Recorded
+from evaluation.papers.maps.scenarios import Recorded
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap
 from robot.world.maze import CELL_SIDE
 from tactile.base.se2 import between, compose

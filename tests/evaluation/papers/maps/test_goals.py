@@ -20,7 +20,7 @@ from evaluation.papers.maps.goals import (
     shortest_driven,
     walls_of,
 )
-from evaluation.papers.maps.sessions import Recipe, touch_config
+from evaluation.papers.maps.scenarios import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
 from robot.live.goal_drive import DriveState

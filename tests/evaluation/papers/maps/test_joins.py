@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.maps.joins import judge_join
+from evaluation.papers.maps.merged_maps import judge_join
 from evaluation.papers.maps.stored_maps import MapArrays
 
 COUNT = 20

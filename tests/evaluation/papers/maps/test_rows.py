@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.maps import halves
-from evaluation.papers.maps import merged_mazes as merging
+from evaluation.papers.maps import merged_maps
+from evaluation.papers.maps import merged_maps as merging
 from evaluation.papers.maps.reproduction import ROWS, reproduce_maps
 from evaluation.papers.maps.row import MapTask, Methods
 from evaluation.papers.maps.scenarios import (
+    Recipe,
     carried_sessions,
     kidnapped,
     overlapping_sessions,
+    record,
     same_maze,
     ten_circuits,
 )
-from evaluation.papers.maps.sessions import Recipe, record
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, map_path
 from evaluation.papers.tables.comparison import read_sessions
 from tactile.base.se2 import compose
@@ -127,8 +128,8 @@ def test_a_place_named_in_an_unchanged_maze_is_a_false_alarm(maps: Path) -> None
 
 
 def test_a_recording_is_split_into_two_halves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(halves, "RECORDINGS", ("square",))
-    recipes = halves.split_recording("square")
+    monkeypatch.setattr(merged_maps, "RECORDINGS", ("square",))
+    recipes = merged_maps.split_recording("square")
     whole, first, second = map(record, recipes)
     assert first.log.length + second.log.length == whole.log.length
     np.testing.assert_array_equal(np.concatenate([first.truth, second.truth]), whole.truth)

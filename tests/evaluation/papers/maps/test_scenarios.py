@@ -12,6 +12,7 @@ from evaluation.papers.maps.scenarios import (
     LOCALISED,
     REENTERED,
     Change,
+    Recipe,
     carried_sessions,
     cells_of,
     closed_door,
@@ -19,12 +20,12 @@ from evaluation.papers.maps.scenarios import (
     open_world,
     other_maze,
     overlapping_sessions,
+    record,
     same_maze,
     ten_circuits,
     unknown_start,
     wall_middle,
 )
-from evaluation.papers.maps.sessions import Recipe, record
 from ratslam.runs.settings.run_config import RunConfig
 from robot.world.maze import CELL_SIDE, Maze
 from robot.world.scene import make_maze

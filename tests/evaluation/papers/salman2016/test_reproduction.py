@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluation.papers import paper_sets
 from evaluation.papers.commands import SALMAN2016
+from evaluation.papers.paper_sets import ResultRow, column, reproduce, sweep_thresholds
 from evaluation.papers.salman2016.protocols import PROTOCOLS, THRESHOLDS, Claim
 from evaluation.papers.salman2016.reproduction import (
     PAPER,
@@ -21,10 +23,7 @@ from evaluation.papers.salman2016.reproduction import (
     render_claims,
     session_config,
 )
-from evaluation.papers.trials import reproduction
-from evaluation.papers.trials.reproduction import ResultRow, column, reproduce
-from evaluation.papers.trials.threshold_sweep import sweep_thresholds
-from evaluation.papers.trials.touch_trial import capacity_for, collect_session, run_session
+from evaluation.papers.trial_sessions import capacity_for, collect_session, run_session
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.cli import main
 from robot.sources.in_memory import truncate_log
@@ -243,7 +242,7 @@ def test_an_interrupt_keeps_the_finished_sessions(tmp_path, monkeypatch):
             yield ResultRow(job.key, job.number, job.seed, {"across": 0.0}, (job.laps, result))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(reproduction, "run_tasks", interrupted)
+    monkeypatch.setattr(paper_sets, "run_tasks", interrupted)
     text, stopped = reproduce(PAPER, "fig2", tmp_path, sets=1, workers=1, assignments=TINY)
     assert stopped
     assert "Odometry drift" in text

@@ -20,7 +20,7 @@ from evaluation.papers.salman2016.threshold_tuning import (
     tune_threshold,
     view_differences,
 )
-from evaluation.studies.view_separation import ViewDifferences
+from evaluation.studies.metrics import ViewDifferences
 from ratslam.classic import view_templates
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.cli import main

@@ -29,7 +29,7 @@ from evaluation.papers.tables.comparison import (
 )
 from evaluation.papers.tables.recordings import Recording
 from evaluation.studies import machine
-from evaluation.studies.session_metrics import TouchMetrics
+from evaluation.studies.metrics import TouchMetrics
 from ratslam.cli import main
 from tactile.base.errors import InputError
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.tables import batches, buildings, cycles, laser, recordings
+from evaluation.papers.tables import buildings, cycles, recordings, speed
 from evaluation.papers.tables import grid_table as grid
 from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
-from evaluation.papers.trials.recording_trial import ClosureClaims, closure_claims, run_recording
-from evaluation.studies.session_metrics import TouchMetrics
+from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, run_recording
+from evaluation.studies.metrics import TouchMetrics
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError
@@ -118,9 +118,9 @@ def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
 
 def test_all_rows_of_the_laser_table_without_data_are_named(monkeypatch, tmp_path):
     monkeypatch.delenv(recordings.DATA, raising=False)
-    stub_sessions(monkeypatch, laser, lambda task: pytest.fail("a session without a recording"))
-    text = "\n".join(laser.laser_table(folder=tmp_path))
-    assert all(f"Left out: {row}: " in text for row in laser.ROWS)
+    stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
+    text = "\n".join(buildings.laser_table(folder=tmp_path))
+    assert all(f"Left out: {row}: " in text for row in buildings.ROWS)
     assert "set RATSLAM_DATA" in text
 
 
@@ -256,8 +256,8 @@ def test_the_command_refuses_unknown_rows(capsys):
 
 def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
     for name, value in {"SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
-        monkeypatch.setattr(batches, name, value)
-    lines = list(batches.batch_table(sets=10, sessions=3, steps=40, rounds=1, folder=ROOT))
+        monkeypatch.setattr(speed, name, value)
+    lines = list(speed.batch_table(sets=10, sessions=3, steps=40, rounds=1, folder=ROOT))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
     assert [what.split(",")[0] for what, _, _ in rows] == [
         "one network of 11 cells a side", "one network of 11 cells a side", "2 sets of 21 cells",

@@ -9,10 +9,10 @@ import pytest
 
 from evaluation.papers.whiskers.contact import baseline_of
 from evaluation.papers.whiskers.figure import REACH
-from robot.recordings.whiskers.reach import WHISKERS, ReachConfig, read_reach
+from robot.recordings.real_whiskers import WHISKERS, ReachConfig, read_reach
 from tactile.base.samples import true_runs
-from tactile.features.contact_stream import Touch, find_contacts, find_fixed_contacts, start_stream
-from tactile.features.free_record import calibrate_free
+from tactile.calibration import calibrate_free
+from tactile.contact_stream import Touch, find_contacts, find_fixed_contacts, start_stream
 
 
 @pytest.fixture(scope="module")

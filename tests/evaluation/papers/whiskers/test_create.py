@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.papers.whiskers.create import CreateResult, Variant, create_table, draw_create, true_revisits
-from evaluation.papers.whiskers.wall_distance import wall_distances
 from ratslam.mapping.appearance import ViewAppearance
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import KeyframeGraph

@@ -7,7 +7,7 @@ from itertools import islice, pairwise
 import numpy as np
 from scipy.signal import lfilter
 
-from evaluation.papers.whiskers.spliced_hours import (
+from evaluation.papers.whiskers.drift import (
     FreeModel,
     Snippet,
     StreamScore,

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.whiskers.outline import Tangents
 from evaluation.papers.whiskers.tangent import (
     RADIUS,
     CylinderResult,
     SweepResult,
     TangentResult,
+    Tangents,
     angle_between,
     circle_tangents,
     draw,

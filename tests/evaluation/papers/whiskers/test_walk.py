@@ -28,7 +28,7 @@ from evaluation.papers.whiskers.walk_source import (
 )
 from ratslam.recall.config import sector_shifts
 from ratslam.runs.settings.completion import complete
-from robot.recordings.whiskers.objects import ObjectRecord
+from robot.recordings.real_whiskers import ObjectRecord
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.odometry import OdometryConfig
 from robot.world.maze import CELL_SIDE

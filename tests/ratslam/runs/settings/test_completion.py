@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.completion import EXTENT_FACTOR, EXTENT_MARGIN, complete
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config

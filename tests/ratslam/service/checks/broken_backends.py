@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, PathMap
 from ratslam.core.estimates import Action, Estimate, Scalar
-from ratslam.core.path_map import PathMap
 from ratslam.methods.method_registry import BackendEntry
 from tactile.base.errors import InputError
 from tactile.base.plugins import NoSettings

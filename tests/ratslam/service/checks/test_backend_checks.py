@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from ratslam.service.checks.backend_checks import CHECKS, GROUPS
-from ratslam.service.checks.backend_trial import BackendTrial
-from ratslam.service.checks.check_results import run_checks
+from ratslam.service.backend_checks import CHECKS, GROUPS, BackendTrial
+from ratslam.service.check_results import run_checks
 from tactile.base.plugins import NoSettings
 from tests.ratslam.service.checks import broken_backends as broken
 from tests.ratslam.service.checks.broken_backends import entry_of

@@ -9,19 +9,19 @@ from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from ratslam.cli import main
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import BACKENDS
-from ratslam.service.checks import backend_checks as backend
-from ratslam.service.checks import metric_checks as metric
-from ratslam.service.checks import source_checks as source
-from ratslam.service.checks import touch_checks as touch
+from ratslam.service import backend_checks as backend
+from ratslam.service import metric_checks as metric
+from ratslam.service import source_checks as source
+from ratslam.service import touch_checks as touch
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
-from robot.sources.source_registry import SOURCES, SourceEntry
+from robot.sources.source import SOURCES, SourceEntry
 from robot.touch_source import TOUCH, TouchEntry
 from tactile.base.plugins import NoSettings
 from tactile.base.settings import Settings
 from tactile.frontend import Frontend, TouchConfig
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 from tests.ratslam.service.checks import broken_backends
 
 

@@ -10,8 +10,8 @@ import pytest
 from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import MetricEntry
 from evaluation.metrics.run_metrics import RUN_METRICS
-from ratslam.service.checks.check_results import run_checks
-from ratslam.service.checks.metric_checks import CHECKS, GROUPS, MetricTrial
+from ratslam.service.check_results import run_checks
+from ratslam.service.metric_checks import CHECKS, GROUPS, MetricTrial
 from tactile.base.plugins import NoSettings
 
 

@@ -9,20 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.service.checks.check_results import run_checks
-from ratslam.service.checks.source_checks import CHECKS, GROUPS
-from ratslam.service.checks.source_trial import SourceTrial
+from ratslam.service.check_results import run_checks
+from ratslam.service.source_checks import CHECKS, GROUPS, SourceTrial
+from robot.recordings import real_whiskers
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
-from robot.recordings.whiskers import objects
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
-from robot.sources.source_registry import SourceEntry
+from robot.sources.source import SourceEntry
 from robot.touch_source import TOUCH, TouchEntry
 from tactile.base.plugins import NoSettings, PluginConfig
 from tactile.base.types import Odometry, observation
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 ROOT = Path(__file__).parents[4]
 ROWS = 30
@@ -47,8 +46,8 @@ OURS = {
         most=50,
     ),
     "signed views": lambda: SourceTrial(
-        objects.ENTRY,
-        objects.ObjectConfig(file=ROOT / "tests" / "data" / "real_touch" / "purdue" / "cherry.csv"),
+        real_whiskers.OBJECTS,
+        real_whiskers.ObjectConfig(file=ROOT / "tests" / "data" / "real_touch" / "purdue" / "cherry.csv"),
     ),
 }
 

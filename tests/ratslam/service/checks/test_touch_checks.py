@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.service.checks.check_results import run_checks
-from ratslam.service.checks.touch_checks import CHECKS, GROUPS, TouchTrial, simulated_head
+from ratslam.service.check_results import run_checks
+from ratslam.service.touch_checks import CHECKS, GROUPS, TouchTrial, simulated_head
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import TouchEntry, report_config_of
 from tactile.base.plugins import NoSettings

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
+from ratslam.runs.build_session import open_source
 from ratslam.runs.localise import localising
-from ratslam.runs.map_settings import differing_settings
-from ratslam.runs.open_source import open_source
+from ratslam.runs.map_settings import differences, differing_settings, sensor_of
 from ratslam.runs.saved_map import SavedMap, describe_readings
-from ratslam.runs.sensor import differences, sensor_of
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data, parse, validate
-from ratslam.service.doctor.recording_check import diagnose_recording
+from ratslam.service.recording_check import diagnose_recording
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.errors import InputError

@@ -10,10 +10,10 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from evaluation.artifacts.nav2 import read_nav2
+from evaluation.artifacts.grid_files import read_nav2
 from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics.trajectory import read_tum
-from ratslam.service.export.export_formats import export_run
+from ratslam.service.export_formats import export_run
 from tests.helpers.g2o import read_g2o
 from tests.ratslam.service.export.export_cases import GRID, assert_same_poses, messages, nanoseconds, pose_of
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from ratslam.cli import main
-from ratslam.service.export.export_formats import export_run
+from ratslam.service.export_formats import export_run
 from tactile.base.errors import InputError
 
 

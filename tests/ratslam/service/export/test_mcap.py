@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from evaluation.artifacts.closure_table import read_closure_table
-from evaluation.artifacts.nav2 import write_nav2
+from evaluation.artifacts.grid_files import write_nav2
+from evaluation.artifacts.recorded_views import WhiskerViews, write_whisker_views
 from evaluation.artifacts.run_reader import read_run
-from evaluation.artifacts.whisker_views import WhiskerViews, write_whisker_views
 from evaluation.metrics.trajectory import align
-from ratslam.service.export.export_formats import export_run
+from ratslam.service.export_formats import export_run
 from tactile.base.se2 import compose
 from tests.ratslam.service.export.export_cases import (
     GRID,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.artifacts.pieces_table import write_pieces
-from evaluation.artifacts.run_reader import read_run
+from evaluation.artifacts.run_reader import read_run, write_pieces
 from evaluation.metrics.trajectory import write_tum
-from ratslam.service.export.export_formats import export_run
+from ratslam.service.export_formats import export_run
 from tests.ratslam.service.export.export_cases import messages, path_of
 
 

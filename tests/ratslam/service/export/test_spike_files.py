@@ -12,13 +12,10 @@ import pytest
 
 from evaluation.cells.analysis import AnalysisSettings, analyse_cells
 from evaluation.cells.recording import write_recording
-from ratslam.classic.pose_cell_config import NetworkConfig
+from ratslam.classic.config import NetworkConfig
 from ratslam.cli import main
-from ratslam.service.export.export_formats import export_run
-from ratslam.service.export.nwb import EPOCH, write_nwb
-from ratslam.service.rats.cell_poses import cell_poses
-from ratslam.service.rats.settled_peak import settled_peak
-from ratslam.service.rats.spikes import SpikeConfig, draw_spikes, read_spikes
+from ratslam.service.export_formats import EPOCH, export_run, write_nwb
+from ratslam.service.spikes import SpikeConfig, cell_poses, draw_spikes, read_spikes, settled_peak
 from tactile.base.errors import InputError
 from tests.ratslam.service.rats.recordings import drawn_recording
 

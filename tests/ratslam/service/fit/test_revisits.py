@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.runs.open_source import open_source
+from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.fit.record import RevisitFit, fit_record, fit_revisits, fit_wheels_of
-from ratslam.service.fit.rig_fit import rig_settings
-from ratslam.service.fit.wheel_fit import fit_wheels
+from ratslam.service.record_fit import RevisitFit, fit_record, fit_revisits, fit_wheels_of
+from ratslam.service.rig_fit import fit_wheels, rig_settings
 from robot.sources.in_memory import load_into_memory
 
 ROOT = Path(__file__).parents[4]
@@ -39,7 +38,7 @@ def test_a_record_without_truth_tells_no_length_scale(known: bool, monkeypatch: 
     with open_source(config) as source:
         samples = [sample._replace(truth=None) for sample in source]
     found = RevisitFit((0.03, 0.001), (1.0, 0.02), 0.0, 7) if known else None
-    monkeypatch.setattr("ratslam.service.fit.record.fit_revisits", lambda config: found)
+    monkeypatch.setattr("ratslam.service.record_fit.fit_revisits", lambda config: found)
     rig = fit_wheels_of(config, config, samples, 0)
     assert [quantity.name for quantity in rig.quantities] == (["turn scale", "heading bias"] if known else [])
     assert any("length scale" in reason for reason in rig.unknown)

@@ -9,11 +9,11 @@ import pytest
 
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.fit.record import fit_record
-from ratslam.service.fit.rig_fit import Rig, rig_settings
+from ratslam.service.record_fit import fit_record
+from ratslam.service.rig_fit import Rig, rig_settings
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 NOISE, DEAD = 3e-3, 7
 

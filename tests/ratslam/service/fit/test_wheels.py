@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import ate
-from ratslam.service.fit.wheel_fit import WheelFit, fit_wheels
-from robot.sources.odometry import from_motions
-from robot.sources.odometry_correction import correct_motions
+from ratslam.service.rig_fit import WheelFit, fit_wheels
+from robot.sources.odometry import correct_motions, from_motions
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
 

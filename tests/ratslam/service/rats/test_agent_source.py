@@ -8,8 +8,8 @@ from ratinabox.Agent import Agent
 from ratinabox.Environment import Environment
 
 import ratslam
-from ratslam.service.rats.agent_source import agent_in_box, agent_path, agent_source
-from robot.simulation.rat.rat_odometry import RatOdometryConfig
+from ratslam.service.rat_agents import agent_in_box, agent_path, agent_source
+from robot.simulation.rat.rat_path import RatOdometryConfig
 from robot.simulation.rat.simulated_session import RatSimulationConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError

@@ -11,9 +11,9 @@ import pytest
 from ratinabox.Agent import Agent
 from ratinabox.Environment import Environment
 
-from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.service.rats.pose_cell_neurons import PoseCellNeurons, agent_pose, anchor_at_truth
-from ratslam.service.rats.settled_peak import settled_peak
+from ratslam.classic.config import NetworkConfig
+from ratslam.service.rat_agents import PoseCellNeurons, agent_pose, anchor_at_truth
+from ratslam.service.spikes import settled_peak
 from tactile.base.errors import InputError
 
 CONFIG = NetworkConfig(cell_size=0.05)  # a torus of 1.05 m
@@ -144,6 +144,6 @@ def test_a_leap_beyond_the_network_is_an_error():
 
 def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ratinabox.Neurons", None)
-    monkeypatch.delitem(sys.modules, "ratslam.service.rats.pose_cell_neurons")
+    monkeypatch.delitem(sys.modules, "ratslam.service.rat_agents")
     with pytest.raises(InputError, match=r"pip install 'ratslam\[ratinabox\]'"):
-        import ratslam.service.rats.pose_cell_neurons  # noqa: F401
+        import ratslam.service.rat_agents  # noqa: F401

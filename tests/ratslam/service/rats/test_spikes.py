@@ -8,9 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from ratslam.classic.pose_cell_config import NetworkConfig
-from ratslam.service.rats.settled_peak import settled_peak
-from ratslam.service.rats.spikes import SpikeConfig, draw_spikes, expected_spikes, read_spikes, write_spikes
+from ratslam.classic.config import NetworkConfig
+from ratslam.service.spikes import (
+    SpikeConfig,
+    draw_spikes,
+    expected_spikes,
+    read_spikes,
+    settled_peak,
+    write_spikes,
+)
 from tactile.base.errors import InputError
 from tests.ratslam.service.rats.recordings import drawn_recording, recording
 

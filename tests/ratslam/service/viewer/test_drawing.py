@@ -7,10 +7,10 @@ import pytest
 from rerun.chunk import RrdReader
 
 from ratslam.core.estimates import GridDrawing
-from ratslam.runs.progress import MapReport, RunDescription, StepReport
-from ratslam.service.viewer.drawing import Drawing, open_recording, whisker_curves
+from ratslam.runs.runner import MapReport, RunDescription, StepReport
+from ratslam.service.viewer_process import Drawing, open_recording, whisker_curves
 from tactile.base.types import Odometry, observation
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, ur10_head
 
 HEAD = ur10_head(HeadConfig(dead=(7,)))
 WHISKERS = len(HEAD.length)

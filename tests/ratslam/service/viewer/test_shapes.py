@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.runs.progress import MapSchedule
-from ratslam.service.viewer.drawing import POINTS, VerdictLog, whisker_curves
-from tactile.whiskers.head_geometry import HeadConfig, tip_points, ur10_head
+from ratslam.runs.runner import MapSchedule
+from ratslam.service.viewer_process import POINTS, VerdictLog, whisker_curves
+from tactile.whisker_geometry import HeadConfig, tip_points, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 WHISKERS = len(HEAD.length)

@@ -20,9 +20,8 @@ from evaluation.artifacts.run_reader import read_run
 from ratslam.cli import main
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.viewer import target as targets
-from ratslam.service.viewer.observer import Viewer
-from ratslam.service.viewer.target import prepare_target
+from ratslam.service import viewer_link as targets
+from ratslam.service.viewer_link import Viewer, prepare_target
 from tactile.base.errors import InputError
 from tests.helpers.square_run import copy_square_run
 

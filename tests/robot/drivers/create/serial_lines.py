@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from robot.drivers.create.control_loop import PAUSE, ControlLoop
+from robot.drivers.create.driver import PAUSE, ControlLoop
 from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.protocol import SAFE, START
 from robot.drivers.create.serial_link import SerialLink

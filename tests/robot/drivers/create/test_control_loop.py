@@ -11,8 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.control_loop import ControlLoop
-from robot.drivers.create.stop_reasons import CommandRefused, StopReason
+from robot.drivers.create.driver import ControlLoop
+from robot.drivers.create.driver_config import CommandRefused, StopReason
 from robot.emulators.create import EmulatedCreate
 from tests.robot.drivers.create.serial_lines import Line
 

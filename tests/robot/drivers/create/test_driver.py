@@ -15,9 +15,8 @@ from pathlib import Path
 import pytest
 
 from robot.drivers.create.driver import CreateDriver, NoAnswer, NotSafe
-from robot.drivers.create.driver_config import CreateConfig
+from robot.drivers.create.driver_config import CommandRefused, CreateConfig, StopReason
 from robot.drivers.create.serial_link import NoPort
-from robot.drivers.create.stop_reasons import CommandRefused, StopReason
 from tactile.base.errors import InputError
 from tests.helpers.live import until
 from tests.robot.drivers.create.serial_lines import Emulated

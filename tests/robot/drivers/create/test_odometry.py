@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.control_loop import CreateOdometry
+from robot.drivers.create.driver import CreateOdometry
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 from tactile.base.se2 import compose
 

@@ -9,8 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver_config import CreateConfig
-from robot.drivers.create.stop_reasons import CommandRefused, wheel_speeds
+from robot.drivers.create.driver_config import CommandRefused, CreateConfig, wheel_speeds
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)

@@ -16,8 +16,8 @@ from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.reader import HeadReader, LinkState
 from robot.drivers.head.usb_protocol import ANGLE, FrameFlag
 from robot.drivers.head.whisk_control import HeadDriver
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import WhiskingConfig
 from tests.helpers.live import until
 
 pytest.importorskip("usb.core", reason="pyusb is not installed")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head import sequence_numbers
-from robot.drivers.head.sequence_numbers import SequenceUnwrapper
+from robot.drivers.head import decoder
+from robot.drivers.head.decoder import SequenceUnwrapper
 from tests.robot.drivers.head import oracle
 
 STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**31, -(2**31)]))
@@ -19,7 +19,7 @@ STEPS = st.one_of(st.integers(-9, 12), st.sampled_from([1, 1, 1, 2**31 - 1, 2**3
 @pytest.fixture(scope="module")
 def few():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequence_numbers, "LATE", 8)
+        patch.setattr(decoder, "LATE", 8)
         patch.setattr(oracle, "LATE", 8)
         yield
 

@@ -22,8 +22,8 @@ from robot.drivers.head.usb_protocol import (
 )
 from robot.drivers.head.whisk_control import HeadDriver, HostRcp, whisk_commands
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig, initial_drive, whisk_command
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import WhiskingConfig, initial_drive, whisk_command
 from tests.helpers.live import until
 from tests.robot.drivers.head.memory import MemoryHead
 

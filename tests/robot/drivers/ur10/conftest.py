@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.base_transform import tcp_from_pose
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.drivers.ur10.driver_config import ArmConfig
+from robot.drivers.ur10.driver_config import ArmConfig, tcp_from_pose
 from tests.helpers.live import Faults, until, ur_emulator
 
 HOME = tcp_from_pose(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.ur10.base_transform import (
+from robot.drivers.ur10.driver_config import (
     BaseTransformConfig,
     pose_from_tcp,
     tcp_from_pose,

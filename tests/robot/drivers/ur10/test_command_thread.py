@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.drivers.ur10.command_thread import ArmCommand, CommandThread
-from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, tcp_from_pose
+from robot.drivers.ur10.rtde_process import ArmCommand, CommandThread
 from robot.drivers.ur10.safety import MIN_SPEED, TargetRefused, in_box
 from robot.drivers.ur10.shared_state import SharedState
 from tests.robot.drivers.ur10.conftest import HOME

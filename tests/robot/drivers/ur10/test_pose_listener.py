@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.pose_listener import PoseListener
+from robot.drivers.ur10.rtde_protocol import PoseListener
 from tests.helpers.live import Faults, until, ur_emulator
 
 START = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)

@@ -16,7 +16,7 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import PORT, Dashboard, DashboardSilent
 from robot.drivers.ur10.driver_config import ArmConfig, BoxConfig
-from robot.drivers.ur10.startup_checks import StartupRefused, check_controller
+from robot.drivers.ur10.safety import StartupRefused, check_controller
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.conftest import HOME, settings
 

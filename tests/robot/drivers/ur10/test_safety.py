@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.base_transform import tcp_from_pose
-from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig, tcp_from_pose
 from robot.drivers.ur10.safety import (
     MIN_SPEED,
     MOVED_ON,

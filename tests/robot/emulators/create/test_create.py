@@ -13,8 +13,7 @@ from robot.drivers.head.decoder import Decoder
 from robot.drivers.head.usb_protocol import ANGLE, REQUEST_OUT, Request, to_radians
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 from robot.emulators.create.emulator_config import CreateWorldConfig
-from robot.emulators.create.serial_line import Terminal
-from robot.emulators.create.server import CreateWhiskers
+from robot.emulators.create.server import CreateWhiskers, Terminal
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.simulation.create.strain_sensors import (
     ShakeConfig,

@@ -21,11 +21,10 @@ from robot.drivers.head.usb_protocol import (
 )
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.emulator_config import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.sensor_array import BLOCK
-from robot.emulators.head.whiskers import AlongPath, PoseSource, maze_whiskers
+from robot.emulators.head.whiskers import BLOCK, AlongPath, PoseSource, maze_whiskers
 from robot.world.scene import KidnapConfig, Scene, make_scene
 from robot.world.walls import Walls
-from tactile.whiskers.head_geometry import ur10_head
+from tactile.whisker_geometry import ur10_head
 from tests.helpers.live import Faults, emulator
 
 TABLE = Walls(np.array([[-9.0, -9.0, 9.0, 9.0]]), np.array([0.05]))

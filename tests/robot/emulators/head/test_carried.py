@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_from_pose
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import until, ur_emulator
 from tests.robot.emulators.head.heads import running

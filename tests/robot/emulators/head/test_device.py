@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from robot.drivers.head.usb_protocol import ANGLE, REQUEST_IN, REQUEST_OUT, WRAP, FrameFlag, Request
 from robot.emulators.head.emulated_device import Fifo
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
-from robot.emulators.head.sensor_array import BLOCK
+from robot.emulators.head.whiskers import BLOCK
 from tests.robot.emulators.head.heads import EVER, HostedHead, drive
 
 FREE = HeadEmulatorConfig()

@@ -16,20 +16,18 @@ from robot.drivers.head.usb_protocol import (
     to_counts,
     to_radians,
 )
-from robot.drivers.ur10.base_transform import BaseTransformConfig, tcp_from_pose
-from robot.drivers.ur10.pose_listener import ToolPose
+from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_from_pose
+from robot.drivers.ur10.rtde_protocol import ToolPose
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
-from robot.emulators.head.sensor_array import BLOCK
-from robot.emulators.head.whiskers import AHEAD, AlongPath, CarriedByArm
+from robot.emulators.head.whiskers import AHEAD, BLOCK, AlongPath, CarriedByArm
 from robot.simulation.head.baseline import HALL_BASELINE, BaselineConfig, make_baseline
 from robot.simulation.head.kinematic import HeadSetup
-from robot.simulation.head.quasistatic import simulate_quasistatic
-from robot.simulation.head.whisk_stream import simulate_cycles
-from robot.world.head_trajectory import HeadPath
+from robot.simulation.head.whisk_stream import simulate_cycles, simulate_quasistatic
+from robot.world.scene import HeadPath
 from robot.world.walls import Surroundings
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import HeadConfig
-from tactile.whiskers.whisking import WhiskingConfig
+from tactile.whisker_geometry import HeadConfig
+from tactile.whisking import WhiskingConfig
 from tests.robot.emulators.head.heads import TABLE, HostedHead, drive, world
 
 PLACING = BaseTransformConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)

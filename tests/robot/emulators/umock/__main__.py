@@ -18,7 +18,7 @@ import sys
 import threading
 from typing import Any
 
-from robot.drivers.head.emulated_cable_protocol import PORT, Op, UsbConnection
+from robot.drivers.head.emulated_cable import PORT, Op, UsbConnection
 from tests.robot.emulators.umock.usbfs import REAP, REAP_NOW, Usbfs
 
 LOOK = 20

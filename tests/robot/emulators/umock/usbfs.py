@@ -13,7 +13,7 @@ import struct
 import threading
 from typing import Any
 
-from robot.drivers.head.emulated_cable_protocol import IN, Op, UsbConnection
+from robot.drivers.head.emulated_cable import IN, Op, UsbConnection
 
 SETINTERFACE, SETCONFIGURATION, GETDRIVER, SUBMIT, DISCARD, REAP, REAP_NOW = 4, 5, 8, 10, 11, 12, 13
 CLAIM, RELEASE, RESET, CLEAR, CAPABILITIES, CLAIM_AWAY, SPEED = 15, 16, 20, 21, 26, 27, 31

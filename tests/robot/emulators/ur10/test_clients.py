@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from robot.drivers.ur10.pose_listener import PoseListener
+from robot.drivers.ur10.rtde_protocol import PoseListener
 from tests.helpers.live import ROOT, Faults, until, ur_emulator
 
 REAL = os.environ.get("RATSLAM_UR_HOST", "")

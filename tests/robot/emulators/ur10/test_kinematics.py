@@ -10,14 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robot.emulators.ur10.kinematics import UR10, UR10E, Geometry, backward, forward, solutions
-from robot.emulators.ur10.rotations import (
+from robot.emulators.ur10.kinematics import (
+    UR10,
+    UR10E,
+    Geometry,
+    backward,
     compose_poses,
+    forward,
     invert_pose,
     quaternion,
     rotate_by,
     rotation_between,
     rotation_vector,
+    solutions,
 )
 
 ANGLE = st.floats(-3.1, 3.1)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from robot.emulators.ur10.emulated_arm import EmulatedArm
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig, WallConfig
-from robot.emulators.ur10.motion import Profile, Unreachable
-from robot.emulators.ur10.rotations import rotation_between
-from robot.emulators.ur10.urscript_moves import MoveL, StopL, parse_moves
+from robot.emulators.ur10.kinematics import rotation_between
+from robot.emulators.ur10.motion import MoveL, Profile, StopL, Unreachable, parse_moves
 
 DOWN = (math.pi, 0.0, 0.0)
 NOWHERE = (3.0, 0.0, 0.3, *DOWN)

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from robot.recordings.bags.bag_description import describe_bag
-from robot.recordings.bags.images import COMPRESSED, RAW, grey_image
+from robot.recordings.bags.views import COMPRESSED, RAW, grey_image
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource

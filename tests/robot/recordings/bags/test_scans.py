@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.bags.scans import Extent, cloud_view, scan_view, wider_extent
 from robot.recordings.bags.transforms import Mount
+from robot.recordings.bags.views import Extent, cloud_view, scan_view, wider_extent
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import ROS2, built, scan
 

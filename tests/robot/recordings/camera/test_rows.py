@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.recordings.camera.image_view import Crop, ImageViewConfig, image_view
-from robot.recordings.camera.rows import Frame, camera_rows
-from robot.recordings.camera.visual_odometry import VisualOdometryConfig
+from robot.recordings.video import Crop, Frame, ImageViewConfig, VisualOdometryConfig, camera_rows, image_view
 from tactile.base.errors import InputError
 
 PANORAMA = VisualOdometryConfig(fov_deg=360)

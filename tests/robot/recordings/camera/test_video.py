@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.camera.visual_odometry import VisualOdometryConfig
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
+from robot.recordings.video import VisualOdometryConfig
 from robot.sources.in_memory import InMemorySource
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_csv, write_video

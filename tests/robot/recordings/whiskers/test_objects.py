@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ratslam
-from robot.recordings.whiskers.objects import ObjectConfig, open_object, read_object
-from robot.sources.source_registry import SOURCES
+from robot.recordings.real_whiskers import ObjectConfig, open_object, read_object
+from robot.sources.source import SOURCES
 from tactile.base.errors import InputError
 
 CHERRY = Path(__file__).parents[3] / "data" / "real_touch" / "purdue" / "cherry.csv"

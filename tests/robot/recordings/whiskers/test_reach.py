@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.service.checks.source_checks import check_source
-from robot.recordings.whiskers.reach import COLUMNS, ENTRY, WHISKERS, ReachConfig, open_reach, read_reach
-from robot.sources.source_registry import SOURCES
+from ratslam.service.source_checks import check_source
+from robot.recordings.real_whiskers import COLUMNS, REACH, WHISKERS, ReachConfig, open_reach, read_reach
+from robot.sources.source import SOURCES
 from tactile.base.errors import InputError
 
 FILE = Path(__file__).parents[3] / "data" / "real_touch" / "stanford" / "reach_free_rows.csv"
@@ -40,7 +40,7 @@ def test_as_a_source_it_has_contacts_for_views() -> None:
 
 
 def test_it_passes_the_checks_of_a_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SOURCES.builtin, "reach_under_test", ENTRY)
+    monkeypatch.setitem(SOURCES.builtin, "reach_under_test", REACH)
     failed = [
         result
         for result in check_source("reach_under_test", [f"settings.file={FILE}"])

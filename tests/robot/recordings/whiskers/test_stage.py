@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robot.recordings.whiskers.stage import (
-    ENTRY,
+from robot.recordings.real_whiskers import (
+    STAGE,
     StageConfig,
     StageRecording,
     cut_sweep,
@@ -79,7 +79,7 @@ def test_a_sweep_is_no_calibration() -> None:
 
 def test_the_source_gives_the_stages_motion_and_the_sizes_of_the_signals() -> None:
     config = StageConfig(file=SLICES / "stage_cylinder_2.csv")
-    with ENTRY.open(config, None) as source:
+    with STAGE.open(config, None) as source:
         samples = list(source)
     assert source.length == len(samples) == 101
     truth = np.array([sample.truth for sample in samples])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from robot.recordings.whiskers.taxels import TaxelConfig, open_contacts, read_contacts
-from robot.sources.source_registry import SOURCES
+from robot.recordings.real_whiskers import TaxelConfig, open_contacts, read_contacts
+from robot.sources.source import SOURCES
 from tactile.base.errors import InputError
 
 SLICE = Path(__file__).parents[3] / "data" / "real_touch" / "sheffield" / "TXZY_dataI.mat"

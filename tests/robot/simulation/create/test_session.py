@@ -18,7 +18,7 @@ from robot.simulation.create.simulated_session import (
 from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import Sample, Source
 from robot.world.arena import arena_text, in_free_space, wall_segments
-from robot.world.polygons import segment_distance
+from robot.world.walls import segment_distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, wrap

@@ -9,20 +9,23 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from robot.simulation.create.strain_sensors import (
+    Bending,
+    Shaft,
     ShakeConfig,
     WhiskersConfig,
+    base_strain,
     base_strains,
+    bend_shafts,
     bend_whiskers,
     body_vibration,
     fixed_whiskers,
     sample_strain,
+    shaft_tilt,
 )
-from robot.simulation.create.whisker_bending import Bending, Shaft, base_strain, bend_shafts, shaft_tilt
-from robot.world.arena import Arena, has_clearance, wall_segments
-from robot.world.polygons import polygon_edges, segment_distance, segments_cross, square
-from robot.world.random_arena import ArenaConfig, make_arena
+from robot.world.arena import Arena, ArenaConfig, has_clearance, make_arena, wall_segments
+from robot.world.walls import polygon_edges, segment_distance, segments_cross, square
 from tactile.base.random_streams import stream
-from tactile.features.contact_threshold import ShaftConfig, stiffness
+from tactile.contact_threshold import ShaftConfig, stiffness
 
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()

@@ -12,9 +12,8 @@ from robot.simulation.create.simulated_session import (
     CreateSimulationConfig,
     drive_into_wall,
 )
-from robot.world.arena import wall_segments
-from robot.world.polygons import segment_distance
-from robot.world.random_arena import ArenaConfig
+from robot.world.arena import ArenaConfig, wall_segments
+from robot.world.walls import segment_distance
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, Report, StepEnd

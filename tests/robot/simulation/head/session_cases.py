@@ -10,7 +10,7 @@ import numpy as np
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import Sample, Source
 from tactile.base.types import Cycle
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 
 SHORT = {"path": {"circuits": "CA"}}
 LOOP = [(0, 0), (1, 0), (1, 1), (0, 1)]

@@ -10,12 +10,16 @@ from hypothesis import strategies as st
 
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
-from robot.simulation.head.quasistatic import advance_balance, simulate_quasistatic, whiskers_at_rest
-from robot.simulation.head.whisk_stream import WallSweep
+from robot.simulation.head.whisk_stream import (
+    WallSweep,
+    advance_balance,
+    simulate_quasistatic,
+    whiskers_at_rest,
+)
 from robot.world.walls import NO_CONTACT
 from tactile.base.random_streams import stream
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskDrive, WhiskingConfig, whisk_command
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command
 
 HEAD = ur10_head(HeadConfig())
 SAMPLES, CYCLES = 80, 3

@@ -13,9 +13,9 @@ from robot.sources.in_memory import load_into_memory
 from robot.touch_source import head_config_of, open_touch_source
 from tactile.base.errors import InputError
 from tactile.base.types import Observation
-from tactile.features.whisker_image import ImageConfig
 from tactile.frontend import TouchConfig
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
+from tactile.whisker_image import ImageConfig
 from tests.robot.simulation.head.session_cases import bits, simulate
 
 

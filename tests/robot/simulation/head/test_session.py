@@ -15,7 +15,7 @@ from robot.world.maze import CELL_SIDE, maze_text
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Cycle, Whisk
 from tactile.frontend import TouchConfig
-from tactile.whiskers.head_geometry import HeadConfig
+from tactile.whisker_geometry import HeadConfig
 from tests.robot.simulation.head.session_cases import bits, simulate
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from robot.world.maze import CELL_SIDE, maze_text
 from tactile.base.se2 import between
-from tactile.whiskers.head_geometry import HeadConfig, RingConfig
+from tactile.whisker_geometry import HeadConfig, RingConfig
 from tests.robot.simulation.head.session_cases import simulate
 
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig, choose_tier
 from tactile.base.errors import InputError
-from tactile.whiskers.head_geometry import HeadConfig, RingConfig
+from tactile.whisker_geometry import HeadConfig, RingConfig
 from tests.robot.simulation.head.session_cases import LOOP, simulate
 
 ROOM = "o---o---o\n|       |\no   o   o\n|       |\no---o---o\n"

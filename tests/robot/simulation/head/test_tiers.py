@@ -7,19 +7,23 @@ import pytest
 
 from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
-from robot.simulation.head.quasistatic import simulate_quasistatic
 from robot.simulation.head.simulated_session import simulate_dynamic
-from robot.simulation.head.whisk_stream import MechanicsModel, simulate_cycles, simulate_free_cycles
-from robot.world.head_trajectory import HeadPath, MotionConfig, plan_path
+from robot.simulation.head.whisk_stream import (
+    MechanicsModel,
+    simulate_cycles,
+    simulate_free_cycles,
+    simulate_quasistatic,
+)
 from robot.world.maze import random_loop, random_maze, wall_boxes
+from robot.world.scene import HeadPath, MotionConfig, plan_path
 from robot.world.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Cycle
-from tactile.features.calibration import Calibration, CalibrationConfig, calibrate
-from tactile.features.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, stiffness
-from tactile.whiskers.head_geometry import HeadConfig, ur10_head
-from tactile.whiskers.whisking import WhiskingConfig
+from tactile.calibration import Calibration, CalibrationConfig, calibrate
+from tactile.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, stiffness
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisking import WhiskingConfig
 
 HEAD = ur10_head(HeadConfig())
 STREAM, MECHANICS, OPEN, RCP = (

@@ -1,1 +1,0 @@
-"""Progress of a running job, read from its run directory."""

@@ -1,0 +1,396 @@
+"""The figure of drift: the packet's error by path integration alone, against the noise of odometry.
+
+Rats walk at random in a box of 1 m without views; networks differ in the noise on their odometry alone. The
+control is that odometry integrated without a network: the packet should add little to its error.
+
+The figure of anchoring: the packet's error with views, in darkness, with shuffled views, and after them.
+
+Each session has a first part in light, in which places are learnt, a test and light again. Sessions differ in
+the test alone: light; darkness; or the views of the test in random order, the control. The path is a slice of
+a real rat's or a random walk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.cells.decoding import packet_pose
+from evaluation.papers.cells.figure import (
+    CellFigure,
+    CellTask,
+    error_size,
+    head_panel,
+    panel_grid,
+    shortest,
+    spread_dots,
+    torus_error,
+)
+from evaluation.papers.cells.rat_sessions import RatRun, RatSessions, rat_config, rat_source, slice_start
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.plots import style
+from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
+from ratslam.classic.batch import CellSets, Network, walk
+from ratslam.classic.config import rings, units
+from ratslam.core.compilation import prepare_precision
+from robot.sources.in_memory import load_into_memory
+from robot.sources.source import Source
+from tactile.base.random_streams import stream
+from tactile.base.se2 import integrate
+
+RATE = 10.0
+"""Steps per second."""
+TIMES = (60, 300, 600)
+"""Times at which errors are read, s."""
+SPEED = (0.05, 0.1, 0.2, 0.4)
+"""Levels of white noise of the speed, as a share of it over one second, sqrt(s); the heading is exact."""
+HEADING = (0.01, 0.02, 0.05)
+"""Levels of white noise of the heading, rad / sqrt(s); the speed is exact."""
+USUAL = 5
+"""Seeds: each is a path and a draw of the noise, common to all levels."""
+LEAST = 0.1
+"""Least upper end of the axes of errors, m and rad: smaller errors are those of the lattice of cells."""
+COLOURS = (style.SKY, style.BLUE, style.VERMILLION)
+"""Of the times."""
+COLUMNS = (
+    "noise", "after s", "packet m", "odometry m (control)", "packet - odometry m", "packet rad",
+    "expected rad", "odometry rad (control)", "packet - odometry rad",
+)  # fmt: skip
+
+
+class Noise(NamedTuple):
+    """Noise of odometry. speed: sqrt(s). heading: rad / sqrt(s)."""
+
+    speed: float
+    heading: float
+
+    def __str__(self) -> str:
+        if self.speed:
+            return f"speed {self.speed:g} sqrt(s)"
+        return f"heading {self.heading:g} rad / sqrt(s)" if self.heading else "none"
+
+
+LEVELS = (Noise(0.0, 0.0), *(Noise(each, 0.0) for each in SPEED), *(Noise(0.0, each) for each in HEADING))
+"""One block of networks."""
+
+
+class DriftResult(NamedTuple):
+    """Errors of n seeds at L levels of noise and at M times.
+
+    Attributes:
+        times: [M] s. packet, odometry: [n, L, M, 2] size of the error against the true pose, m and rad.
+            added: [n, L, M, 2] of the packet against integrated odometry.
+    """
+
+    times: tuple[int, ...]
+    packet: np.ndarray
+    odometry: np.ndarray
+    added: np.ndarray
+
+
+def measure_drift(task: CellTask, times: tuple[int, ...] = TIMES) -> DriftResult:
+    """The errors of all seeds after the given times, s."""
+    prepare_precision("float64")
+    found = [_errors_of(seed, times) for seed in task.seeds(USUAL)]
+    return DriftResult(times, *(np.array(each) for each in zip(*found, strict=True)))
+
+
+def rms(errors: np.ndarray) -> np.ndarray:
+    """[L, M, 2] root mean square over the seeds of errors [n, L, M, 2]."""
+    return np.sqrt((errors**2).mean(axis=0))
+
+
+def table_drift(result: DriftResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    packet, odometry, added = rms(result.packet), rms(result.odometry), rms(result.added)
+    lines = [
+        f"Root mean square over {len(result.packet)} seeds; a cell is 0.05 m and {np.radians(10):.2f} rad.",
+        "Goal: the packet adds little to the error of odometry; heading: noise times the root of the time.",
+        "",
+        *markdown_header(COLUMNS).splitlines(),
+    ]
+    for k, level in enumerate(LEVELS):
+        for j, time in enumerate(result.times):
+            (m, rad), (m_o, rad_o), (m_a, rad_a) = packet[k, j], odometry[k, j], added[k, j]
+            expected = level.heading * np.sqrt(time)
+            cells = [m, m_o, m_a, rad, expected, rad_o, rad_a]
+            lines.append(markdown_row([str(level), str(time), *(f"{each:.3f}" for each in cells)]))
+    return [*lines, "", NOT_SHOWN]
+
+
+NOT_SHOWN = (
+    "Not shown: noise inside the network, which has none; the packet drifts because odometry does, and with a"
+    " few seeds a root mean square is uncertain by a third."
+)
+
+
+def draw_drift(result: DriftResult, png: Path) -> None:
+    """Errors of position and heading against the noise of speed and of heading."""
+    most = float(result.added[..., 0].max()), float(result.added[..., 1].max())
+    line = (
+        f"Dots: {len(result.packet)} seeds, lines: root mean square. "
+        f"The packet adds at most {most[0]:.3f} m, {most[1]:.3f} rad to odometry."
+    )
+    figure, axes = panel_grid("Path integration drift against noise of odometry", line, 2, 2)
+    speed = [0, *range(1, 1 + len(SPEED))]
+    heading = [0, *range(1 + len(SPEED), len(LEVELS))]
+    columns = (
+        (speed, [each.speed for each in LEVELS], "noise of the speed (sqrt(s))"),
+        (heading, [each.heading for each in LEVELS], "noise of the heading (rad / sqrt(s))"),
+    )
+    for column, (rows, levels, across) in enumerate(columns):
+        for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
+            panel = axes[quantity][column]
+            _draw_curves(panel, result, rows, [levels[k] for k in rows], quantity)
+            style.name_axes(panel, across, up)
+    head_panel(axes[0][0], "heading exact")
+    head_panel(axes[0][1], "speed exact")
+    style.add_legend(figure, axes[0][0], columns=6)
+    figure.savefig(png)
+
+
+def _draw_curves(
+    axes: style.Axes, result: DriftResult, rows: Sequence[int], levels: Sequence[float], quantity: int
+) -> None:
+    packet, odometry = rms(result.packet)[rows, :, quantity], rms(result.odometry)[rows, :, quantity]
+    for j, time in enumerate(result.times):
+        colour = COLOURS[j % len(COLOURS)]
+        axes.plot(levels, packet[:, j], "-", color=colour, lw=1.6, label=f"packet after {time} s")
+        axes.plot(levels, odometry[:, j], "--", color=style.INK, lw=0.9, zorder=3)
+        spread_dots(axes, levels, result.packet[:, rows, j, quantity].T.tolist(), colour)
+    axes.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
+    axes.set_ylim(0, max(axes.get_ylim()[1], LEAST))
+
+
+def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[L, M, 2] errors of packets, of odometry, and of packets against odometry."""
+    study = _course(seed, times[-1])
+    at = np.round(np.array(times) * RATE).astype(int)
+    packets, odometry = _packets(study)[:, at], _odometry(study)[:, at]
+    true = study.expected[at]
+    unit = units(study.config, np.dtype(float))
+    pairs = (packets, true), (odometry, true), (packets, odometry)
+    packet, alone, added = (error_size((a - b) * unit) for a, b in pairs)
+    return packet, alone, added
+
+
+def _course(seed: int, seconds: int) -> StudyCourse:
+    config = rat_config(
+        f"rat_simulation.seconds={seconds + 1}",
+        f"rat_simulation.rate_hz={RATE}",
+        f"rat_simulation.seed={seed}",
+        "rat_simulation.walk={}",
+        "rat_simulation.odometry={speed_white: 0.0, heading_white: 0.0}",
+        "rat_simulation.views.every=1000",
+    )
+    return read_course(config, round((seconds + 1) * RATE), False, 2, (0,), seed)
+
+
+def _packets(study: StudyCourse) -> np.ndarray:
+    """[L, T, 3] packets in cells, followed round the torus."""
+    count, ring = len(LEVELS), rings(study.config, np.dtype(float))
+    network = study.config.excite_sigma, study.config.inhibit_sigma, study.config.global_inhibition, 1.0
+    speed, heading = np.array(LEVELS).T
+    # `CellSets` scales the noise of a step; over a step the white noise of a second is larger.
+    sets = CellSets(Network(*(np.full(count, each) for each in network)), speed * np.sqrt(RATE), heading)
+    tracks = walk(study.config, sets, study.course, study.chosen)
+    wrapped = np.concatenate([track.pose for track in tracks], axis=1)
+    start = np.broadcast_to(ring // 2, (count, 1, 3))
+    gone = np.diff(wrapped, axis=1, prepend=start)
+    return start + np.cumsum(gone - ring * np.round(gone / ring), axis=1)
+
+
+def _odometry(study: StudyCourse) -> np.ndarray:
+    """[L, T, 3] poses in cells of the noisy odometry integrated without a network."""
+    motion, noise = study.course.motion, study.course.noise
+    poses = []
+    for level in LEVELS:
+        faster = 1 + level.speed * np.sqrt(RATE) * noise[:, :1]
+        turn = motion[:, 2] + level.heading * noise[:, 1]
+        poses.append(expected_poses(study.config, integrate(np.column_stack([motion[:, :2] * faster, turn]))))
+    return np.array(poses)
+
+
+FIGURE = CellFigure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
+
+
+"""Steps and views per second."""
+PATHS = ("sargolini", "walk")
+"""A real rat's path, of which each seed has a slice; a random walk."""
+TESTS = ("light", "dark", "shuffled")
+"""What the test shows."""
+ANCHORING_USUAL = 3
+"""Seeds: each is a path and a draw of the noise of odometry, common to the tests."""
+NEAR = (0.1, np.radians(20))
+"""Two cells, m and rad: a packet so near to that of the session in light throughout is anchored again, once
+it stays there for `HELD`."""
+HELD = 2.0
+"""s."""
+SMOOTH = 5.0
+"""Width of the running median of the curves, s."""
+ANCHORING_COLOURS = {"light": style.BLUE, "dark": style.INK, "shuffled": style.VERMILLION}
+ANCHORING_COLUMNS = ("path", "test", "error in the test", "error after it", "anchored again", "after s")
+
+
+class Schedule(NamedTuple):
+    """Times, s: the test begins; the light returns; the session ends."""
+
+    test: float = 120.0
+    back: float = 180.0
+    end: float = 240.0
+
+
+class AnchoringResult(NamedTuple):
+    """Errors of n seeds over T steps.
+
+    Attributes:
+        schedule: of the sessions. error: by path and test [n, T, 2] distance (m) and angle (rad) of the
+            packet from the true pose. again: by path and test [n] time from the return of the light until
+            the packet is anchored again, s; inf: not by the end.
+    """
+
+    schedule: Schedule
+    error: Mapping[tuple[str, str], np.ndarray]
+    again: Mapping[tuple[str, str], np.ndarray]
+
+    def median(self, path: str, test: str, first: float, last: float) -> np.ndarray:
+        """[2] median of the errors (m, rad) of all seeds between two times, s."""
+        rows = slice(round(first * RATE), round(last * RATE))
+        return np.median(self.error[path, test][:, rows].reshape(-1, 2), axis=0)
+
+
+def measure_anchoring(task: CellTask, schedule: Schedule | None = None) -> AnchoringResult:
+    """The errors of all paths, tests and seeds."""
+    schedule = schedule or Schedule()
+    sessions = RatSessions(
+        rat_config(f"rat_simulation.rate_hz={RATE}", "rat_simulation.views.every=1", "session.reserve=256")
+    )
+    error: dict[tuple[str, str], np.ndarray] = {}
+    again: dict[tuple[str, str], np.ndarray] = {}
+    for path in PATHS:
+        runs = [
+            {test: _run(sessions, schedule, path, test, seed) for test in TESTS}
+            for seed in task.seeds(ANCHORING_USUAL)
+        ]
+        for test in TESTS:
+            error[path, test] = np.array([error_size(torus_error(each[test].recording)) for each in runs])
+            again[path, test] = np.array(
+                [anchored_after(each[test], each["light"], schedule) for each in runs]
+            )
+    return AnchoringResult(schedule, error, again)
+
+
+def anchored_after(run: RatRun, light: RatRun, schedule: Schedule) -> float:
+    """Time from the return of the light until the packet is and stays near to that of the session of the same
+    seed in light throughout, s; inf if it does not."""
+    apart = packet_pose(run.recording) - packet_pose(light.recording)
+    far = np.any(error_size(shortest(run.recording, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
+    held = round(HELD * RATE)
+    windows = np.lib.stride_tricks.sliding_window_view(far, held)
+    near = np.flatnonzero(~windows.any(axis=1))
+    return float(near[0]) / RATE if len(near) else np.inf
+
+
+def table_anchoring(result: AnchoringResult) -> list[str]:
+    """The lines of the table, and what it does not show."""
+    _, back, end = result.schedule
+    seeds = len(next(iter(result.error.values())))
+    lines = [
+        f"{seeds} seeds a path; medians over seeds and time. Goal: error in light far below that in darkness;"
+        " control: shuffled views do not anchor.",
+        f"Anchored again: seeds whose packet comes within {NEAR[0]:g} m and {NEAR[1]:.2f} rad of the packet"
+        f" in light throughout, and stays for {HELD:g} s; their median time after the light returned.",
+        "",
+        *markdown_header(ANCHORING_COLUMNS).splitlines(),
+    ]
+    for (path, test), again in result.again.items():
+        during = result.median(path, test, result.schedule.test, back)
+        after = result.median(path, test, (back + end) / 2, end)
+        done = again[np.isfinite(again)]
+        which = f"{test} (control)" if test == "shuffled" else test
+        cells = [path, which, *(f"{m:.3f} m, {rad:.3f} rad" for m, rad in (during, after))]
+        if test == "light":
+            cells += ["-", "-"]
+        else:
+            cells += [f"{len(done)} of {seeds}", f"{np.median(done):.1f}" if len(done) else "-"]
+        lines.append(markdown_row(cells))
+    return [*lines, "", ANCHORING_NOT_SHOWN]
+
+
+ANCHORING_NOT_SHOWN = (
+    "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so the"
+    " error in light contains the drift during learning; the experience map corrects it, pose cells do not."
+)
+
+
+def draw_anchoring(result: AnchoringResult, png: Path) -> None:
+    """Median errors over time, with the range of the middle half of the seeds."""
+    during = {
+        test: np.mean([result.median(path, test, *result.schedule[:2]) for path in PATHS], axis=0)
+        for test in TESTS
+    }
+    line = "Median error in the test: " + ", ".join(
+        f"{test} {m:.2f} m, {rad:.2f} rad" for test, (m, rad) in during.items()
+    )
+    figure, axes = panel_grid("Anchoring of the packet by views", f"{line}.", 2, 2)
+    for column, path in enumerate(PATHS):
+        for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
+            panel = axes[quantity][column]
+            for test in TESTS:
+                _draw_curve(panel, result.error[path, test][..., quantity], test)
+            _mark_test(panel, result.schedule)
+            panel.set_ylim(bottom=0)
+            style.name_axes(panel, "time (s)", up)
+        head_panel(axes[0][column], "path of a real rat" if path == "sargolini" else "random walk")
+    style.add_legend(figure, axes[0][0])
+    figure.savefig(png)
+
+
+def _draw_curve(axes: style.Axes, error: np.ndarray, test: str) -> None:
+    """Medians of errors [n, T] over windows of `SMOOTH`."""
+    width = round(SMOOTH * RATE)
+    count = error.shape[1] // width
+    windows = error[:, : count * width].reshape(len(error), count, width)
+    time = (np.arange(count) + 0.5) * SMOOTH
+    each = np.median(windows, axis=2)
+    low, middle, high = np.percentile(each, [25, 50, 75], axis=0)
+    axes.fill_between(time, low, high, color=ANCHORING_COLOURS[test], alpha=0.15, lw=0)
+    axes.plot(time, middle, color=ANCHORING_COLOURS[test], lw=1.6, label=f"{test} in the test")
+
+
+def _mark_test(axes: style.Axes, schedule: Schedule) -> None:
+    axes.axvspan(schedule.test, schedule.back, color=style.LINE_GREY, lw=0, zorder=0.5)
+    axes.text(
+        (schedule.test + schedule.back) / 2, 1.0, "test", transform=axes.get_xaxis_transform(), ha="center",
+        va="top", fontsize=8.5, color=style.LABEL_GREY,
+    )  # fmt: skip
+    axes.set_xlim(0, schedule.end)
+
+
+def _run(sessions: RatSessions, schedule: Schedule, path: str, test: str, seed: int) -> RatRun:
+    changed: dict[str, Any] = {"seconds": schedule.end}
+    if path == "walk":
+        changed["walk"] = {}
+    else:
+        start = slice_start(seed, schedule.end)
+        changed["path"] = {"file": path, "heading_smoothing": 0.25, "skip": start}
+    if test == "dark":
+        changed["phases"] = [{"start": schedule.test, "end": schedule.back, "dark": True}]
+    source = rat_source(sessions.config, seed, **changed)
+    return sessions.run(_shuffled(source, schedule, seed) if test == "shuffled" else source)
+
+
+def _shuffled(source: Source, schedule: Schedule, seed: int) -> Source:
+    """The source with the views of the test in random order."""
+    log = load_into_memory(source)
+    rows = np.flatnonzero(log.seen & (log.time >= schedule.test) & (log.time < schedule.back))
+    views = log.views.copy()
+    views[rows] = log.views[stream(seed, "cells.shuffled_views").permutation(rows)]
+    return replace(log, views=views)
+
+
+ANCHORING_FIGURE = CellFigure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)

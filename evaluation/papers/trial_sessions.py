@@ -1,0 +1,414 @@
+"""A whisker session through one backend, held in memory.
+
+A process runs many sessions of one kind with one compiled kernel: a session object is reset to its start for
+each of them.
+
+A recording with truth, or a perturbed copy of it, through one backend, held in memory.
+
+A session of the simulated Create and its result by a grid filter, in the frame of the arena.
+
+Sessions in one arena start at different places. A process runs many sessions with few compiled filters.
+
+Control conditions: the views of a source replaced, its odometry and truth unchanged.
+
+A method that closes loops on shuffled or blank views does so by odometry alone; ideal views give the upper
+bound of the rest of the method.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from evaluation.metrics.occupancy_grid import OccupancyGrid
+from evaluation.metrics.trajectory import ate
+from evaluation.studies.metrics import SessionResult
+from evaluation.studies.perturbation import Perturbation
+from ratslam.core.backend import Backend
+from ratslam.core.compilation import Precision, prepare_precision
+from ratslam.core.session import Session, capacity_at
+from ratslam.grid.config import GridConfig
+from ratslam.grid.likelihoods import distinct_cells
+from ratslam.grid.map import ContactLog, contact_log, draw_occupancy
+from ratslam.methods.grid import GridBackend
+from ratslam.methods.method_registry import Sensors, backend_settings, build
+from ratslam.runs.build_session import build_session, open_observations
+from ratslam.runs.settings.run_config import RunConfig
+from robot.simulation.create.simulated_session import (
+    CreateSimulation,
+    CreateSimulationConfig,
+    train_strain_templates,
+)
+from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.touch_source import TouchSource, observation_of, report_config_of
+from robot.world.arena import Arena, arena_text, make_arena, place_start
+from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
+from tactile.base.se2 import compose, integrate, wrap
+from tactile.base.settings import Settings
+from tactile.base.types import Observation, stack
+from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
+from tactile.wall_estimation.strain_templates import StrainTemplates
+from tactile.whisker_geometry import PlanarWhiskers
+
+
+def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
+    """The configuration completed by its source, and the whole source in memory.
+
+    Raises:
+        InputError: the source cannot be read or simulated, or lacks the true pose of a step.
+    """
+    with open_observations(config) as (config, source):
+        log = load_into_memory(source)
+    if log.truth is None or not np.isfinite(log.truth).all():
+        raise InputError(log.name, "steps without a true pose", "the true pose of every step")
+    return config, log
+
+
+def run_session(
+    config: RunConfig,
+    log: InMemorySource,
+    start: Callable[[RunConfig, InMemorySource], Session] | None = None,
+) -> SessionResult:
+    """Runs a session from memory, with a configuration completed by its source.
+
+    Args:
+        start: makes the session; None: `start_session`.
+    """
+    session = (start or start_session)(config, log)
+    steps = list(session.replay(observation_of(sample) for sample in log))
+    place = np.array([int(step.estimate.place) for step in steps])
+    nodes = session.map.graph().nodes
+    rows = (nodes[k] for k in range(len(nodes)))
+    node = np.array([[row["x"], row["y"], row["heading"]] for row in rows]).reshape(-1, 3)
+    return SessionResult(
+        truth=np.asarray(log.truth),
+        odometry=integrate(log.motion[:, :3]),
+        trajectory=session.map.trajectory(),
+        place=np.where(place < len(node), place, -1),
+        node=node,
+        closures=session.map.closures(),
+        live=np.array([step.pose for step in steps]),
+        piece=session.map.pieces(),
+    )
+
+
+def start_session(config: RunConfig, log: InMemorySource) -> Session:
+    """A session at its start, for a configuration completed by its source; the next call takes it back."""
+    session = _compiled(*_kind(config, log))
+    session.restart(config.session.seed)
+    return session
+
+
+def new_session(
+    config: RunConfig, log: InMemorySource, change: Callable[[Backend], None] | None = None
+) -> Session:
+    """The same, compiled anew and for the caller alone.
+
+    Args:
+        change: is done to the backend before.
+    """
+    session = _build(*_kind(config, log), change)
+    session.restart(config.session.seed)
+    return session
+
+
+def capacity_for(steps: int) -> int:
+    """Memory rows for a session: a power of two, so that sessions of similar length share a kernel."""
+    return capacity_at(max(steps, 1) - 1)
+
+
+def _kind(
+    config: RunConfig, log: InMemorySource
+) -> tuple[str, Settings, Precision, tuple[int, int, int], int]:
+    method = backend_settings(config.backend, config)
+    reserve = max(capacity_for(log.length), config.session.reserve)
+    return config.backend, method, config.session.precision, log.view_shape, reserve
+
+
+def _build(
+    name: str,
+    method: Settings,
+    precision: Precision,
+    shape: tuple[int, int, int],
+    reserve: int,
+    change: Callable[[Backend], None] | None = None,
+) -> Session:
+    prepare_precision(precision)
+    backend = build(name, method, Sensors(shape), precision)
+    if change is not None:
+        change(backend)
+    return Session(backend, reserve=reserve, precision=precision)
+
+
+_compiled = lru_cache(maxsize=2)(_build)
+"""A session of any state; a recently compiled one is used again."""
+
+
+class RecordingRun(NamedTuple):
+    """A finished session of T steps over a recording.
+
+    Attributes:
+        config: completed for the recording. truth: [T, 3] true poses, rows of NaN where unknown. odometry,
+            online, final: [T, 3] poses by dead reckoning, as estimated at the time, and of the final map.
+    """
+
+    config: RunConfig
+    session: Session
+    truth: np.ndarray
+    odometry: np.ndarray
+    online: np.ndarray
+    final: np.ndarray
+
+    def ate(self, poses: np.ndarray) -> float:
+        """ATE of poses [T, 3] at the steps with truth, m."""
+        known = np.isfinite(self.truth).all(axis=1)
+        return ate(poses[known], self.truth[known])
+
+
+class ClosureClaims(NamedTuple):
+    """What n candidates of closure sequences claim, beside the truth; n is 0 for maps without candidates.
+
+    A candidate claims that its two steps have the same position, and headings that differ by the sectors that
+    its view is shifted by.
+
+    Attributes:
+        sequence: [n] number of its sequence. accepted: [n] bool. distance: [n] between the true positions, m;
+            NaN where the truth is unknown. turn: [n] between the claimed difference of the headings and the
+            true one, rad, not negative; NaN likewise. log_odds: [n] that its sequence is true; NaN where no
+            odds decide.
+    """
+
+    sequence: np.ndarray
+    accepted: np.ndarray
+    distance: np.ndarray
+    turn: np.ndarray
+    log_odds: np.ndarray
+
+
+def run_recording(config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0) -> RecordingRun:
+    """Maps a recording, or the perturbed copy of a seed.
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    with open_observations(config) as (config, source):
+        log = load_into_memory(source)
+    if log.truth is None:
+        raise InputError(log.name, "no true poses", "a recording with truth")
+    if perturbation is not None:
+        log = perturbation(log, seed)
+    session = build_session(config, log)
+    steps = list(session.replay(observation_of(sample) for sample in log))
+    return RecordingRun(
+        config=config,
+        session=session,
+        truth=np.asarray(log.truth),
+        odometry=integrate(log.motion[:, :3]),
+        online=np.array([step.pose for step in steps]),
+        final=session.map.trajectory(),
+    )
+
+
+def closure_claims(run: RecordingRun) -> ClosureClaims:
+    """The claims of all candidates in closures.csv that belong to a sequence."""
+    rows = [row for row in _closure_rows(run.session) if int(row["sequence"]) >= 0]
+    step, match, shift, sequence = (
+        np.array([int(row[name]) for row in rows], int)
+        for name in ("step", "match_step", "shift", "sequence")
+    )
+    later, earlier = run.truth[step], run.truth[match]
+    angle = run.session.map.feedback().angle if rows else 0.0
+    return ClosureClaims(
+        sequence=sequence,
+        accepted=np.array([row["verdict"] == "accepted" for row in rows], bool),
+        distance=np.hypot(*(later - earlier)[:, :2].T),
+        turn=np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle)),
+        log_odds=np.array([float(row["log_odds"]) for row in rows], float),
+    )
+
+
+def _closure_rows(session: Session) -> list[dict[str, str]]:
+    """The rows of closures.csv by column; none for a map without that file."""
+    write = session.map.files().get("closures.csv")
+    if write is None:
+        return []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "closures.csv"
+        write(path)
+        return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+MAP_SCALE = 2.0  # side of a drawn map over the side of the arena (Fox et al. 2012, II-D)
+MAP_MARGIN = 0.4  # margin of the filter's map, which is centred on the start, beyond the arena, m
+
+
+class ArenaSession(NamedTuple):
+    """A session of T reports.
+
+    Attributes:
+        source: of the reports. arena: with the robot's start. truth, odometry: [T, 3] true and dead-reckoned
+            poses after each report.
+    """
+
+    source: CreateSimulation
+    arena: Arena
+    truth: np.ndarray
+    odometry: np.ndarray
+
+
+class FilterResult(NamedTuple):
+    """The result of a filter after T reports, in the frame of the arena.
+
+    Attributes:
+        online: [T, 3] poses as estimated at the time. path: [T, 3] final poses. grid: the map drawn along
+            `path`.
+    """
+
+    online: np.ndarray
+    path: np.ndarray
+    grid: OccupancyGrid
+
+
+def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
+    """A session from a random start.
+
+    Raises:
+        InputError: it cannot be simulated.
+    """
+    made = place_start(make_arena(config.arena, config.seed), config.seed)
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "arena.txt"
+        file.write_text(arena_text(made), encoding="utf-8")
+        arena = config.arena.model_copy(update={"file": file})
+        source = CreateSimulation(config.model_copy(update={"arena": arena}))
+    return ArenaSession(source, made, source.truth, compose(made.start, integrate(source.odometry[:, :3])))
+
+
+def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list[Observation]:
+    """The filter's observations of a session, with the configured wall estimator.
+
+    Args:
+        seed: of the drives for the training of strain templates.
+
+    Raises:
+        InputError: templates that cannot be used.
+    """
+    reports = report_config_of(session.source.info, config.touch.reports)
+    templates = None
+    if reports.templates is None and reports.walls in ("template", "fused"):
+        made = session.source.config
+        robot = CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
+        templates = _templates(robot)
+    source = TouchSource(session.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
+    return [observation_of(sample) for sample in source]
+
+
+def run_filter(
+    config: RunConfig, session: ArenaSession, reports: list[Observation], stops: tuple[int, ...]
+) -> list[FilterResult]:
+    """The result of the configured filter after each number of reports in `stops`."""
+    touch = report_config_of(session.source.info, config.touch.reports)
+    grid = config.grid
+    if grid.side is None:
+        grid = grid.model_copy(update={"side": 2 * (session.arena.side + MAP_MARGIN)})
+    slam = session_at_start(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
+    start, marks = session.arena.start, collect_marks(reports)
+    online: list[np.ndarray] = []
+    found = []
+    for stop in stops:
+        online += [step.pose for step in slam.replay(reports[len(online) : stop])]
+        path = compose(start, slam.map.trajectory())
+        drawn = draw_map(grid, touch.feelers, session.arena, path, marks)
+        found.append(FilterResult(compose(start, np.array(online)), path, drawn))
+    return found
+
+
+def draw_map(
+    config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: ContactLog
+) -> OccupancyGrid:
+    """The map drawn along a path [T, 3], in the frame of the arena; `MAP_SCALE` gives its side.
+
+    Args:
+        marks: of at least T reports.
+    """
+    side = round(MAP_SCALE * arena.side / config.cell)
+    middle = (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
+    first = ContactLog(*(rows[: len(path)] for rows in marks))
+    probability = draw_occupancy(config, feelers, side, path - np.array([*middle, 0.0]), first)
+    return OccupancyGrid(probability, middle - side * config.cell / 2, config.cell)
+
+
+def collect_marks(reports: list[Observation]) -> ContactLog:
+    """The marks that the reports add to a map."""
+    rows = stack(reports)
+    wall = np.where(rows.wall[:, None], rows.wall_point, np.nan)
+    return contact_log(rows.motion, rows.contact, rows.alive, rows.point, wall)
+
+
+def session_at_start(
+    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision, seed: int
+) -> Session:
+    """A session at its start; a recently compiled one is used again."""
+    session = _compiled_of_arena_trial(grid, mounts, length, precision)
+    session.restart(seed)
+    return session
+
+
+@lru_cache(maxsize=4)
+def _compiled_of_arena_trial(
+    grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision
+) -> Session:
+    assert grid.side is not None
+    feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
+    prepare_precision(precision)
+    backend = GridBackend(grid, feelers, grid.side, precision, distinct_cells)
+    return Session(backend, precision=precision)
+
+
+@lru_cache(maxsize=1)
+def _templates(config: CreateSimulationConfig) -> StrainTemplates:
+    """Templates of a robot, trained once for all sessions as in the paper."""
+    return train_strain_templates(config)
+
+
+Control = Literal["none", "shuffled", "blank", "ideal"]
+"""`none`: unchanged; `shuffled`: random order; `blank`: all zero; `ideal`: a distinct view for each spot."""
+SPOT = 0.06
+"""Side length of a spot with an ideal view, m."""
+SECTORS = 8
+"""Heading sectors of a spot, each with its own ideal view."""
+LIT = 0.5
+"""Share of non-zero pixels of an ideal view."""
+
+
+def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemorySource:
+    """The source with replaced views; steps without a view stay without one."""
+    if control == "none":
+        return log
+    views = np.zeros_like(log.views)
+    if control == "shuffled":
+        rows = np.flatnonzero(log.seen)
+        views[rows] = log.views[stream(seed, "control.shuffled").permutation(rows)]
+    elif control == "ideal":
+        views = _ideal_views(log, seed)
+    views = np.where(log.seen[:, None, None, None], views, log.views)
+    return replace(log, digest=f"{log.digest}+{control}+{seed}", views=views)
+
+
+def _ideal_views(log: InMemorySource, seed: int) -> np.ndarray:
+    """Random views, one for each pair of spot and heading sector."""
+    assert log.truth is not None
+    spot = np.round(log.truth[:, :2] / SPOT)
+    sector = np.round(log.truth[:, 2] / (2 * np.pi / SECTORS)) % SECTORS
+    kinds, row = np.unique(np.column_stack([spot, sector]), axis=0, return_inverse=True)
+    random = stream(seed, "control.ideal")
+    shape = (len(kinds), *log.view_shape)
+    return (random.random(shape) * (random.random(shape) < LIT))[row.reshape(-1)]

@@ -1,1 +1,0 @@
-"""Touch sessions repeated over mazes and seeds."""

@@ -1,0 +1,195 @@
+"""Checks, their results, and the comparison of nested records."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ratslam.runs.settings.strict_yaml import override, validate
+from ratslam.runs.settings.yaml_document import Document, Place
+from tactile.base.errors import InputError
+from tactile.base.settings import Settings
+
+LONGEST_MESSAGE = 300
+"""Length at which the text of a foreign exception is cut off."""
+
+
+class Violation(Exception):
+    """A part does not do what its protocol says.
+
+    Args:
+        found: what the check found. expected: what the protocol asks for.
+    """
+
+    def __init__(self, found: str, expected: str) -> None:
+        super().__init__(f"{found}; expected {expected}")
+        self.found, self.expected = found, expected
+
+
+class Check(NamedTuple):
+    """One requirement.
+
+    Attributes:
+        name: the requirement in a few words. reason: what goes wrong in a run otherwise.
+        run: takes the part under test; raises `Violation`, or returns a remark ('' for none).
+    """
+
+    name: str
+    reason: str
+    run: Callable[[Any], str]
+
+
+class Result(NamedTuple):
+    """Result of a check.
+
+    Attributes:
+        check: its requirement. status: 'ok', 'FAIL' or '-' (not run). text: remark, or finding and
+            expectation.
+    """
+
+    check: Check
+    status: str
+    text: str
+
+    def line(self) -> str:
+        """The result in one line; of a failed check with the reason for the requirement."""
+        reason = f" ({self.check.reason})" if self.status == "FAIL" else ""
+        return f"{self.status:<5} {self.check.name}{self.text and ': '}{self.text}{reason}"
+
+
+def run_checks(groups: Iterable[Sequence[Check]], part: Any) -> Iterator[Result]:
+    """Runs the checks of one group after another; a group after one with a failed check is not run."""
+    sound = True
+    for group in groups:
+        results = []
+        for check in group:
+            result = (
+                run_check(check, part) if sound else Result(check, "-", "not run after the failures above")
+            )
+            results.append(result)
+            yield result
+        sound = all(result.status == "ok" for result in results)
+
+
+def run_check(check: Check, part: Any) -> Result:
+    """Runs one check; an exception of the part under test is a failure."""
+    try:
+        return Result(check, "ok", check.run(part))
+    except Violation as violation:
+        return Result(check, "FAIL", str(violation))
+    except Exception as error:  # whatever foreign code raises
+        return Result(check, "FAIL", f"{describe_error(error)}; expected no exception")
+
+
+def describe_error(error: Exception) -> str:
+    """Type, text and place of an exception in one line."""
+    text = " ".join(str(error).split())
+    text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "jax" not in Path(frame.filename).parts] or list(frames)
+    place = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+    return f"{type(error).__name__}: {text}{place}"
+
+
+def require(condition: bool, found: str, expected: str) -> None:
+    """Raises `Violation` unless the condition holds."""
+    if not condition:
+        raise Violation(found, expected)
+
+
+def require_equal(expected: Any, found: Any, pair: str) -> None:
+    """Raises `Violation` unless two nested records have the same bits.
+
+    Args:
+        pair: what the two are, for the message.
+    """
+    if where := difference(expected, found):
+        raise Violation(f"{pair} differ: {where}", "the same bits")
+
+
+def difference(first: Any, second: Any, path: str = "") -> str:
+    """Path and values of the first leaf in which two nested records differ; '' if all have the same bits."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        if list(first) != list(second):
+            return f"{path or 'keys'} {list(first)} and {list(second)}"
+        parts = [(f"{path}[{key!r}]", first[key], second[key]) for key in first]
+    elif isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        if type(first) is not type(second) or len(first) != len(second):
+            return (
+                f"{path} {type(first).__name__} of {len(first)} and {type(second).__name__} of {len(second)}"
+            )
+        names = [f".{n}" for n in getattr(first, "_fields", ())] or [f"[{k}]" for k in range(len(first))]
+        parts = [(path + name, a, b) for name, a, b in zip(names, first, second, strict=True)]
+    elif _is_object(first) and type(first) is type(second):
+        return difference(vars(first), vars(second), path)
+    elif _same(first, second):
+        return ""
+    else:
+        return f"{path} {_short(first)} and {_short(second)}".strip()
+    return next((found for name, a, b in parts if (found := difference(a, b, name))), "")
+
+
+def _is_object(value: Any) -> bool:
+    """Whether a value is compared by its attributes, for example a dataclass."""
+    return hasattr(value, "__dict__") and not isinstance(value, np.ndarray | np.generic | Enum)
+
+
+def _same(first: Any, second: Any) -> bool:
+    if first is None or second is None or isinstance(first, str):
+        return bool(first == second)
+    a, b = np.asarray(first), np.asarray(second)
+    if a.dtype == object or b.dtype == object:
+        return bool(first == second)
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def _short(value: Any) -> str:
+    array = np.asarray(value)
+    if array.size > 6 or array.dtype == object:
+        return f"{array.dtype} {array.shape}" if array.dtype != object else type(value).__name__
+    return f"{array.dtype} {array.tolist()}"
+
+
+def leaves(record: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested named tuples, each with its path."""
+    if isinstance(record, tuple) and hasattr(record, "_fields"):
+        for name in record._fields:
+            yield from leaves(getattr(record, name), f"{path}.{name}" if path else name)
+    elif record is not None:
+        yield path, record
+
+
+def require_settings_class(model: Any) -> None:
+    """Raises `Violation` unless a registered part's `config_class` is a model of settings."""
+    sound = isinstance(model, type) and issubclass(model, Settings)
+    require(sound, f"config_class {model!r}", "a subclass of tactile.base.settings.Settings")
+
+
+def read_assignments(
+    models: dict[str, Any], assignments: Sequence[str], option: str = "--set"
+) -> dict[str, Settings | None]:
+    """The settings of registered parts, each from the assignments `SECTION.key=value`.
+
+    Args:
+        models: config class by section; a section whose class is no model of settings gives None.
+
+    Raises:
+        InputErrors: an assignment names another section, or the settings do not fit their model.
+    """
+    for assignment in assignments:
+        section = assignment.partition("=")[0].partition(".")[0]
+        if section not in models:
+            keys = " or ".join(f"{name}.key=value" for name in models)
+            raise InputError(f"{option} {assignment}", f"the section '{section}'", keys)
+    document = override(Document({}, {(): Place(option, option)}), assignments)
+    return {
+        section: validate(document.section((section,)), model)
+        if isinstance(model, type) and issubclass(model, Settings)
+        else None
+        for section, model in models.items()
+    }

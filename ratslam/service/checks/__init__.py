@@ -1,1 +1,0 @@
-"""Conformance checks for registered backends, sources, touch front ends and metrics."""

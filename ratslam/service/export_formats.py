@@ -1,0 +1,359 @@
+"""Exports a run; the suffix of the new file chooses the format.
+
+Spikes and behaviour as a Neurodata Without Borders (NWB) file.
+
+Rübel et al. 2022, eLife 11: e78362; written by pynwb, of the extra [nwb]. The spikes are simulated from the
+activity of pose cells; the file says so.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+from uuid import NAMESPACE_URL, uuid5
+
+import numpy as np
+
+from evaluation.artifacts.grid_files import read_grid, write_nav2
+from evaluation.cells.analysis import (
+    AnalysisSettings,
+    CellScores,
+    analyse_all_cells,
+    analyse_cells,
+    write_scores,
+)
+from evaluation.cells.recording import NAME, CellRecording, read_recording
+from ratslam.classic.config import NetworkConfig, network_of
+from ratslam.core.compilation import prepare_precision
+from ratslam.mapping.pose_graph import read_json
+from ratslam.runs.settings.run_config import load_config
+from ratslam.service.ros_bag import ExportedRun, RosMessages, read_exported_run, write_bag, write_mcap
+from ratslam.service.spikes import (
+    SpikeConfig,
+    SpikeTrains,
+    cell_poses,
+    draw_spikes,
+    packet_poses,
+    settled_peak,
+    write_spikes,
+)
+from robot.sources.input_files import digest_of
+from tactile.base.errors import InputError
+from tactile.base.files import make_new_file, new_folder, require_new_file
+from tactile.base.se2 import wrap
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+"""The start of every session. Times in the file are those of the source in s: dates are right if the source
+counts from 1970, and unknown otherwise."""
+TRUE_FRAME = "world frame of the source; x forward at heading 0, y left of it"
+TORUS_FRAME = "torus of pose cells: x and y in 0 to {side:g} m, where they begin again"
+HEADING_FRAME = "counter-clockwise from the x axis, rad"
+TRUE_NAMES, PACKET_NAMES = ("Position", "CompassDirection"), ("PacketPosition", "PacketDirection")
+
+
+def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest: str) -> None:
+    """Writes the spikes and the behaviour of a recording as an NWB file.
+
+    Equal input gives equal bytes with the same versions of pynwb and HDF5: dates are `EPOCH`, and the ids of
+    objects follow from the digest and their place in the file.
+
+    Contents: `units`: spike times of each cell, its index and its pose on the torus, and the interval in
+    which spikes were drawn. `processing/behavior`: `Position` and `CompassDirection` of the true pose (NaN
+    where unknown), `PacketPosition` and `PacketDirection` of the decoded packet. `acquisition`: `activity` of
+    the chosen cells, `injected_energy` of views.
+
+    Args:
+        path: of the new file; an existing one is replaced. spikes: of the recording. digest: identifies the
+            recording and the settings.
+
+    Raises:
+        InputError: pynwb is not installed, or the spikes are not of the cells of the recording.
+    """
+    pynwb = _import_pynwb()
+    if not np.array_equal(recording.cell, spikes.cell):
+        raise InputError("spikes", "other cells than those of the recording", "the spikes of the recording")
+    file = pynwb.NWBFile(
+        session_description="spikes simulated from the activity of pose cells of a RatSLAM network",
+        identifier=digest,
+        session_start_time=EPOCH,
+        file_create_date=EPOCH,
+    )
+    _add_behaviour(pynwb, file, recording)
+    _add_cells(pynwb, file, recording)
+    _add_units(file, recording, spikes)
+    with pynwb.NWBHDF5IO(path, "w") as output:
+        output.write(file)
+    _fix_ids(path, digest)
+
+
+def _import_pynwb() -> Any:
+    try:
+        import pynwb
+        import pynwb.behavior
+    except ImportError:
+        cure = "pip install 'ratslam[nwb]'"
+        raise InputError("export", "pynwb is not installed", "the extra 'nwb'", cure) from None
+    return pynwb
+
+
+def _add_behaviour(pynwb: Any, file: Any, recording: CellRecording) -> None:
+    """The true pose and the decoded packet, on one array of times."""
+    module = file.create_processing_module("behavior", "true pose of the robot and decoded packet")
+    packet = packet_poses(recording.shape, recording.cell_size, recording.packet)
+    frame = TORUS_FRAME.format(side=recording.shape[2] * recording.cell_size)
+    true = _pose_series(pynwb, "", np.asarray(recording.truth, float), recording.time, TRUE_FRAME)
+    decoded = _pose_series(pynwb, "packet_", packet, true[0], frame)
+    for (place, direction), (position, heading) in ((TRUE_NAMES, true), (PACKET_NAMES, decoded)):
+        module.add(pynwb.behavior.Position(name=place, spatial_series=position))
+        module.add(pynwb.behavior.CompassDirection(name=direction, spatial_series=heading))
+
+
+def _pose_series(pynwb: Any, prefix: str, pose: np.ndarray, timestamps: Any, frame: str) -> tuple[Any, Any]:
+    """Position and heading of poses [T, 3]; timestamps: [T] s, or the series whose times they share."""
+    make = pynwb.behavior.SpatialSeries
+    position = make(
+        name=f"{prefix}position", data=pose[:, :2], timestamps=timestamps, unit="meters",
+        reference_frame=frame,
+    )  # fmt: skip
+    heading = make(
+        name=f"{prefix}heading", data=wrap(pose[:, 2]), timestamps=position, unit="radians",
+        reference_frame=HEADING_FRAME,
+    )  # fmt: skip
+    return position, heading
+
+
+def _add_cells(pynwb: Any, file: Any, recording: CellRecording) -> None:
+    """Activity of the chosen cells and injected energy."""
+    times = file.processing["behavior"]["Position"]["position"]
+    texts = {
+        "activity": (recording.activity, "of the cells of the table units; that of all cells sums to 1"),
+        "injected_energy": (recording.energy, "activity injected at the recalled pose by views"),
+    }
+    for name, (data, text) in texts.items():
+        file.add_acquisition(
+            pynwb.TimeSeries(name=name, data=data, timestamps=times, unit="1", description=text)
+        )
+
+
+def _add_units(file: Any, recording: CellRecording, spikes: SpikeTrains) -> None:
+    heading, y, x = recording.shape
+    columns = {
+        "cell": f"index in the flattened network of {heading} x {y} x {x} cells over heading, y, x",
+        "x": "of the cell on the torus, m",
+        "y": "of the cell on the torus, m",
+        "heading": "of the cell, rad",
+    }
+    for name, text in columns.items():
+        file.add_unit_column(name, text)
+    poses = cell_poses(recording.shape, recording.cell_size, recording.cell)
+    for cell, times, pose in zip(spikes.cell.tolist(), spikes.times, poses.tolist(), strict=True):
+        row = dict(zip(("x", "y", "heading"), pose, strict=True))
+        file.add_unit(spike_times=times, obs_intervals=[[spikes.start, spikes.stop]], cell=cell, **row)
+
+
+def _fix_ids(path: Path, digest: str) -> None:
+    """Replaces the random ids of the objects in a file."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+
+        def fix(name: str, item: Any) -> None:
+            if "object_id" in item.attrs:
+                item.attrs.modify("object_id", str(uuid5(NAMESPACE_URL, f"ratslam:{digest}/{name}")))
+
+        fix("", file)
+        file.visititems(fix)
+
+
+Warn = Callable[[str], None]
+PARTED = "the map is in several pieces, whose poses cannot be compared"
+FORMATS = (
+    ".mcap, .tum, .g2o, .json, .graphml, .yaml, .nwb, .npz or .csv, "
+    "or a folder without a suffix for a ROS 2 bag"
+)
+
+
+def export_run(
+    directory: Path, output: Path, warn: Warn = lambda sentence: None, spikes: SpikeConfig | None = None
+) -> None:
+    """Writes the results of a run to a new file, whole or not at all.
+
+    Args:
+        directory: of the run. output: its suffix chooses the format; without one, the folder of a ROS 2 bag.
+        warn: called with a sentence about parts that the file lacks. spikes: of the recorded cells in .nwb
+            and .npz files; its peak rate is also that of the scores in a .csv file.
+
+    Raises:
+        InputError: the run lacks what the format holds, a file of it is malformed, the output exists or its
+            folder does not, or the format is unknown.
+    """
+    suffix = output.suffix.lower()
+    if suffix not in WRITERS and suffix not in CELL_WRITERS:
+        raise InputError(str(output), f"an unknown suffix {output.suffix!r}", FORMATS)
+    if not directory.is_dir():
+        raise InputError(str(directory), "no such folder", "a run directory")
+    require_new_file(output)
+    if suffix in CELL_WRITERS:
+        CELL_WRITERS[suffix](directory, output, spikes or SpikeConfig())
+    else:
+        WRITERS[suffix](directory, output, warn)
+
+
+def _read_run(directory: Path, warn: Warn) -> ExportedRun:
+    exported = read_exported_run(directory, warn)
+    if exported.run.has_pieces:
+        warn(f"{PARTED}; the file shows them beside each other, or each where it is true if that is known")
+    return exported
+
+
+def _write_mcap(directory: Path, output: Path, warn: Warn) -> None:
+    ros = RosMessages()
+    exported = _read_run(directory, warn)
+    make_new_file(output, lambda path: write_mcap(path, exported, ros))
+
+
+def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
+    ros = RosMessages()
+    exported = _read_run(directory, warn)
+    with new_folder(output) as folder:
+        write_bag(folder, output.name, exported, ros)
+
+
+def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
+    """The final trajectory, of an interrupted run the online one; of a map in several pieces also which of
+    them each pose is in, beside it."""
+    final, pieces = directory / "trajectory.tum", directory / "pieces.csv"
+    if pieces.exists():
+        beside = output.with_suffix(".pieces.csv")
+        require_new_file(beside)
+        warn(f"{PARTED}; {beside} says which of them each pose is in")
+        make_new_file(beside, lambda path: shutil.copyfile(pieces, path))
+    _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
+
+
+def _write_g2o(directory: Path, output: Path, warn: Warn) -> None:
+    _copy(directory / "map.g2o", output, "a pose graph")
+
+
+def _write_json(directory: Path, output: Path, warn: Warn) -> None:
+    _copy(directory / "map.json", output, "a map of experiences")
+
+
+def _write_graphml(directory: Path, output: Path, warn: Warn) -> None:
+    import networkx  # slow to import
+
+    graph = read_json(_file(directory / "map.json", "a map of experiences"))
+    make_new_file(output, lambda path: networkx.write_graphml_xml(graph, path))
+
+
+def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
+    """map_server's YAML file, and beside it the image of the same name."""
+    grid = read_grid(_file(directory / "grid.npz", "an occupancy grid"))
+    for suffix in (".pgm", ".yaml"):  # whatever the case of the one given
+        require_new_file(output.with_suffix(suffix))
+    write_nav2(output.parent, grid, output.stem)
+
+
+def _write_nwb(directory: Path, output: Path, config: SpikeConfig) -> None:
+    cells = read_run_cells(directory, config)
+    make_new_file(output, lambda path: write_nwb(path, *cells))
+
+
+def _write_spikes(directory: Path, output: Path, config: SpikeConfig) -> None:
+    cells = read_run_cells(directory, config)
+    make_new_file(output, lambda path: write_spikes(path, cells.spikes))
+
+
+def _write_scores(directory: Path, output: Path, config: SpikeConfig) -> None:
+    scores = score_run_cells(directory, config.peak_rate)
+    make_new_file(output, lambda path: write_scores(path, scores))
+
+
+WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
+    "": _write_bag,
+    ".mcap": _write_mcap,
+    ".tum": _write_tum,
+    ".g2o": _write_g2o,
+    ".json": _write_json,
+    ".graphml": _write_graphml,
+    ".yaml": _write_nav2,
+}
+CELL_WRITERS: dict[str, Callable[[Path, Path, SpikeConfig], None]] = {
+    ".nwb": _write_nwb,
+    ".npz": _write_spikes,
+    ".csv": _write_scores,
+}
+
+
+def _copy(file: Path, output: Path, what: str) -> None:
+    _file(file, what)
+    make_new_file(output, lambda path: shutil.copyfile(file, path))
+
+
+def _file(file: Path, what: str) -> Path:
+    """The file of a run directory.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not file.exists():
+        cure = "`run --continue` ends an interrupted run; some methods have no such map"
+        raise InputError(str(file), "no such file", f"a run with {what}", cure)
+    return file
+
+
+CURE = "add `cells: {chosen: 64}` to the configuration and run it again"
+
+
+class RunCells(NamedTuple):
+    """Recorded cells of a run, their spikes, and the sha256 (hex) of all that they were made from."""
+
+    recording: CellRecording
+    spikes: SpikeTrains
+    digest: str
+
+
+def read_run_cells(directory: Path, config: SpikeConfig) -> RunCells:
+    """Reads the chosen cells of a run and draws their spikes. A cell fires at the peak rate at the peak of a
+    settled packet of the run's network; that is computed in float64, also for a run in float32.
+
+    Raises:
+        InputError: the run has no recorded cells, no chosen ones among them, or a file is malformed.
+    """
+    recording, network = _read_cells(directory)
+    file = directory / NAME
+    if not len(recording.cell):
+        raise InputError(str(file), "no chosen cells", "cells recorded at every step", CURE)
+    spikes = draw_spikes(recording, settled_peak(network), config)
+    documents = [network.model_dump_json().encode(), config.model_dump_json().encode()]
+    return RunCells(recording, spikes, digest_of([file.read_bytes(), *documents]))
+
+
+def score_run_cells(directory: Path, peak_rate: float) -> CellScores:
+    """Scores of the chosen cells of a run; if only sums were recorded, of all cells.
+
+    Args:
+        peak_rate: of a cell at the peak of a settled packet of the run's network, Hz.
+
+    Raises:
+        InputError: the run has no recorded cells, no true pose is known, the path has no area, or a file is
+            malformed.
+    """
+    recording, network = _read_cells(directory)
+    settings = AnalysisSettings(gain=peak_rate / settled_peak(network))
+    analyse = analyse_all_cells if not len(recording.cell) and recording.sums else analyse_cells
+    return analyse(recording, settings)
+
+
+def _read_cells(directory: Path) -> tuple[CellRecording, NetworkConfig]:
+    """The recorded cells of a run and its network; sets JAX to float64."""
+    file = directory / NAME
+    if not file.exists():
+        raise InputError(str(file), "no such file", "a run with recorded pose cells", CURE)
+    recording = read_recording(file)
+    prepare_precision("float64")
+    config = load_config(directory / "config.yaml")
+    return recording, network_of(config.pose_cells, config.attractor)

@@ -1,0 +1,200 @@
+"""Checks of a metric on synthetic runs."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from evaluation.metrics.exm import DEFAULT_EXM
+from evaluation.metrics.metric import Finding, Metric
+from evaluation.metrics.metric_registry import METRICS, MetricEntry
+from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import RUN_METRICS, RunData, run_data
+from ratslam.service.check_results import (
+    Check,
+    Result,
+    Violation,
+    read_assignments,
+    require,
+    require_equal,
+    require_settings_class,
+    run_checks,
+)
+from tactile.base.se2 import integrate
+
+LAPS, PLACES = 3, 36
+GAP = 10
+"""Distance of the pairs of `energy_gap`, steps."""
+
+
+def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
+    """Checks the metric registered under a name.
+
+    Args:
+        assignments: of its settings, each `settings.key=value`.
+
+    Raises:
+        InputError: there is no such metric, its package is broken, or the settings do not fit it.
+    """
+    entry = METRICS.get(name, "check metric")
+    settings = read_assignments({"settings": entry.config_class}, assignments)["settings"]
+    return run_checks(GROUPS, MetricTrial(entry, settings))
+
+
+class MetricTrial:
+    """A metric with settings, and the runs that its checks share.
+
+    Args:
+        settings: an instance of the entry's `config_class`.
+    """
+
+    def __init__(self, entry: MetricEntry, settings: Any) -> None:
+        self.entry, self.settings = entry, settings
+
+    @cached_property
+    def metric(self) -> Metric:
+        return self.entry.build(self.settings)
+
+    @cached_property
+    def with_truth(self) -> RunData:
+        return _data(synthetic_run())
+
+    @cached_property
+    def without_truth(self) -> RunData:
+        return _data(synthetic_run()._replace(truth=None))
+
+
+def _data(run: RunArrays) -> RunData:
+    return run_data(run, DEFAULT_EXM, None, GAP)
+
+
+def synthetic_run() -> RunArrays:
+    """Laps of a circle with a map that is a little wrong, and odometry that drifts."""
+    count = LAPS * PLACES
+    stream = np.random.default_rng(0)
+    motion = np.stack([np.full(count, 0.1), np.zeros(count), np.full(count, 2 * np.pi / PLACES)], axis=1)
+    truth = integrate(motion)
+    final = truth + stream.normal(0, 0.01, truth.shape)
+    links = np.stack([np.arange(PLACES), (np.arange(PLACES) + 1) % PLACES], axis=1)
+    return RunArrays(
+        time=100.0 + np.arange(count) / 2,
+        truth=truth,
+        online=truth + stream.normal(0, 0.02, truth.shape),
+        final=final,
+        odometry=integrate(motion * np.array([1.0, 1.0, 1.03])),
+        experience=np.arange(count) % PLACES,
+        created=np.arange(PLACES),
+        nodes=final[:PLACES],
+        links=links,
+    )
+
+
+def _entry(trial: MetricTrial) -> str:
+    require_settings_class(trial.entry.config_class)
+    return ""
+
+
+def _names(trial: MetricTrial) -> str:
+    metric = trial.metric
+    require(isinstance(metric, Metric), f"build gave a {type(metric).__name__}", "Metric")
+    named = isinstance(metric.name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", metric.name)
+    require(bool(named), f"name {metric.name!r}", "small letters, digits and _")
+    taken = any(one.name == metric.name and one is not metric for one in RUN_METRICS)
+    require(not taken, f"name {metric.name!r} of one of our metrics", "another name")
+    for name in ("label", "section"):
+        value = getattr(metric, name)
+        one_line = isinstance(value, str) and value.strip() != "" and "\n" not in value
+        require(one_line, f"{name} {value!r}", "a few words in one line")
+    unit = metric.unit
+    require(isinstance(unit, str) and not re.search(r"\s", unit), f"unit {unit!r}", "SI, 'deg', or ''")
+    found = f"direction {metric.direction!r}"
+    require(metric.direction in ("low", "high", None), found, "'low', 'high' or None")
+    require(callable(metric.compute), f"compute {metric.compute!r}", "a function of a RunData")
+    return f"{metric.name}, {metric.label}{unit and f', {unit}'}"
+
+
+def _require_finding(found: Any, what: str) -> Finding:
+    if not isinstance(found, Finding):
+        raise Violation(f"{what} gave a {type(found).__name__}", "Finding(value)")
+    for name, value in (("value", found.value), ("odometry", found.odometry)):
+        number = isinstance(value, float | int) and not isinstance(value, bool)
+        none = value is None and name == "odometry"
+        require(number or none, f"{name} {value!r} of type {type(value).__name__} in {what}", "a number")
+    require(isinstance(found.note, str), f"note {found.note!r} in {what}", "text")
+    return found
+
+
+def _computes(trial: MetricTrial) -> str:
+    what = "a run with truth"
+    result = trial.metric.compute(trial.with_truth)
+    require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
+    found = _require_finding(result, what)
+    trial.metric.quantity(found)
+    return f"{found.value:.4g}{trial.metric.unit and f' {trial.metric.unit}'}"
+
+
+def _without_truth(trial: MetricTrial) -> str:
+    result = trial.metric.compute(trial.without_truth)
+    if result is None:
+        return "no ground truth"
+    found = _require_finding(result, "a run without truth")
+    known = np.isfinite(found.value) or found.note != ""
+    require(bool(known), f"{found.value} without a note", "None, or the reason in `note`")
+    return f"{found.value:.4g} {found.note}".rstrip()
+
+
+def _rare_runs(trial: MetricTrial) -> str:
+    run = synthetic_run()
+    half = run.truth[: len(run.time) // 2] if run.truth is not None else np.zeros((0, 3))
+    unknown = np.full((len(run.time) - len(half), 3), np.nan)
+    none, no_links = np.zeros(0, int), np.zeros((0, 2), int)
+    names = ("time", "truth", "online", "final", "odometry", "experience")
+    first: dict[str, Any] = {name: getattr(run, name)[:1] for name in names}
+    first |= {"created": np.zeros(1, int), "nodes": run.nodes[:1], "links": no_links}
+    empty: dict[str, Any] = {"created": none, "nodes": np.zeros((0, 3)), "links": no_links}
+    rare = {
+        "a run whose second half has no truth": run._replace(truth=np.concatenate([half, unknown])),
+        "a run without experiences": run._replace(experience=np.full(len(run.time), -1), **empty),
+        "a run of one step": run._replace(**first),
+    }
+    for what, one in rare.items():
+        result = trial.metric.compute(_data(one))
+        if result is not None:
+            _require_finding(result, what)
+    return ""
+
+
+def _unchanged(trial: MetricTrial) -> str:
+    data = _data(synthetic_run())
+    before = copy.deepcopy(data)
+    trial.metric.compute(data)
+    require_equal(before, data, "the run before and after `compute`")
+    return ""
+
+
+def _deterministic(trial: MetricTrial) -> str:
+    first = trial.metric.compute(_data(synthetic_run()))
+    second = trial.entry.build(trial.settings).compute(_data(synthetic_run()))
+    require_equal(first, second, "the findings of one run computed twice")
+    return ""
+
+
+ENTRY_CHECKS = (
+    Check("the entry is complete", "a configuration names it with its settings", _entry),
+    Check("name, label and unit are well-formed", "scorecard.json and tables show them", _names),
+)
+VALUE_CHECKS = (
+    Check("it computes with truth", "a scorecard holds numbers", _computes),
+    Check("it does without truth", "most recordings have none", _without_truth),
+    Check("it computes on rare runs", "a run would end without its scorecard", _rare_runs),
+    Check("it does not change the run", "later metrics would see other arrays", _unchanged),
+    Check("it is deterministic", "a score could not be reproduced", _deterministic),
+)
+GROUPS = (ENTRY_CHECKS, VALUE_CHECKS)
+CHECKS = tuple(check for group in GROUPS for check in group)
+"""All checks of a metric; the checks of a group assume those of the groups before it."""

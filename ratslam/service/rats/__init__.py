@@ -1,1 +1,0 @@
-"""Pose cells as a neuroscientist uses them: spikes, RatInABox."""

@@ -1,0 +1,468 @@
+"""What a recording holds, whether it can be read, and the configuration that reads it.
+
+The kinds of recordings, and what a file of each kind holds.
+
+A diagnosis: what something is, what it holds, what is wrong with it, and what to do next; as text.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ratslam.runs.build_session import open_source
+from ratslam.runs.map_settings import (
+    check_same_fov,
+    check_same_sensor,
+    differences,
+    differing_settings,
+    sensor_of,
+    settings_of_map,
+)
+from ratslam.runs.saved_map import SavedMap
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.strict_yaml import (
+    FOLDER,
+    RECORDING,
+    dump_data,
+    kind_of,
+    override,
+    parse,
+    refuse_other_files,
+    validate,
+)
+from ratslam.service.record_fit import shows_place
+from ratslam.service.rig_fit import aligned
+from robot.recordings.bags.bag import METADATA
+from robot.recordings.bags.bag_description import (
+    BagDescription,
+    CloudShape,
+    ImageShape,
+    MotionShape,
+    ScanShape,
+    Shape,
+    Times,
+    ValueShape,
+)
+from robot.recordings.bags.views import CLOUD, IMAGES, LONGEST, SCAN
+from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
+from robot.recordings.video import SUFFIXES as VIDEOS
+from robot.recordings.video import ImageViewConfig
+from robot.sources.source import SOURCES, Source
+from tactile.base.errors import InputError, printable
+
+LONG_GAP = 5.0
+"""Steps of a topic after which a pause is a gap."""
+USUAL_FOV = 60.0
+"""Horizontal field of view of most cameras, degrees."""
+NO_WHEELS = (
+    f"odometry: from the images, without scale, for a camera of {USUAL_FOV:g} degrees; set "
+    "recording.visual_odometry.fov_deg to yours, or give wheel odometry"
+)
+VIEWS = (SCAN, CLOUD, *IMAGES)
+"""Types of messages that are views."""
+SMALL = ImageViewConfig()
+"""Smaller images are views of their own size."""
+Rows = tuple[tuple[str, ...], ...]
+
+
+class FileContents(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        what: one line. recording: settings of `recording` that read it, besides `file`; None if none do.
+        table, notes, faults: as in `Diagnosis`. max_range: of its ranges, m, NaN without ranges.
+        field_of_view: of its ranges, rad, counter-clockwise positive; None if unknown.
+    """
+
+    what: str
+    recording: dict[str, Any] | None
+    table: Rows = ()
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+    max_range: float = np.nan
+    field_of_view: float | None = None
+
+
+def describe_file(path: Path) -> FileContents:
+    """What a recording holds.
+
+    Raises:
+        InputError: it is missing, damaged, or of no known format.
+    """
+    if not path.exists():
+        raise InputError(str(path), "no such file or folder", "a recording or a run directory")
+    if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
+        return _bag(path)
+    describe = KINDS.get(path.suffix.lower())
+    if describe is None:
+        found = f"no reader for {path.suffix!r} files" if path.suffix else "a file without a suffix"
+        raise InputError(
+            str(path), found, f"one of {', '.join([*KINDS, '.bag', '.db3'])}, or the folder of a bag"
+        )
+    return describe(path)
+
+
+def _csv(path: Path) -> FileContents:
+    from robot.recordings.csv_description import describe_csv
+
+    found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
+    columns = [(name, f"{low:.6g}", f"{high:.6g}") for name, low, high in found.columns]
+    rows = (("column", "from", "to"), *columns)
+    notes, faults = list(found.parts.values()), []
+    what = f"{path}: a CSV file, {found.rows} row{'s' * (found.rows != 1)}"
+    if found.time is not None:
+        what += f" over {found.time[-1] - found.time[0]:.6g} s"
+        steps = np.diff(found.time) if len(found.time) > 1 else np.zeros(1)
+        if np.median(steps) <= 0 or not steps.max() > 0:
+            faults.append("its times do not increase")
+        elif steps.max() > 10 * np.median(steps):
+            notes.append(f"longest gap: {steps.max():.3g} s after t = {found.time[steps.argmax()]:.6g} s")
+    if found.missing:
+        notes.append(f"missing: {'; '.join(found.missing)}")
+    table = {"table": found.table} if found.table else None
+    return FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
+
+
+def _npz(path: Path) -> FileContents:
+    from robot.recordings.npz_trace import array_shapes
+
+    shapes = [(name, " x ".join(map(str, shape))) for name, shape in array_shapes(path).items() if shape]
+    return FileContents(f"{path}: arrays of a reference trace", {}, (("array", "shape"), *shapes))
+
+
+def _mcap(path: Path) -> FileContents:
+    from robot.recordings.mcap_scanner import is_foreign
+
+    if is_foreign(path):
+        return _bag(path)
+    return FileContents(f"{path}: a recording of ratslam", {})
+
+
+def _bag(path: Path) -> FileContents:
+    from robot.recordings.bags.bag_description import describe_bag
+    from robot.recordings.bags.topic_suggestion import robots_of, suggested_topics
+
+    found = describe_bag(path)
+    rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]
+    notes, faults = list(found.notes), []
+    for topic in found.topics:
+        clock = topic.stamped or topic.received
+        roles = ", ".join(topic.roles) or "-"
+        rows.append(
+            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", in_words(topic.shape), roles)
+        )
+        if topic.roles:
+            notes += clock_notes(topic.name, clock)
+    moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
+    if found.links:
+        fixed = len(found.links) - len(moving)
+        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {fixed} fixed link{'s' * (fixed != 1)}")
+    topics = suggested_topics(found)
+    if not topics:
+        faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
+    sees = {"views", "touch"} & topics.keys()
+    for topic in found.topics:
+        if topic.fault:
+            (notes if sees or topic.kind not in VIEWS else faults).append(topic.fault)
+    if faults:
+        return FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
+    notes += [
+        f"missing: {name}"
+        for name in ("views", "truth")
+        if name not in topics and not (name == "views" and "touch" in topics)
+    ]
+    start = min(topic.received.first for topic in found.topics)
+    end = max(topic.received.last for topic in found.topics)
+    what = f"{path}: a bag of {len(found.topics)} topics over {end - start:.4g} s"
+    recording: dict[str, Any] = {"topics": topics}
+    if "tf" in (topics.get("odometry") or ()) and (others := robots_of(found)[1:]):
+        named = ", ".join(f"[{parent}, {child}]" for parent, child in others)
+        notes.append(f"other robots: {named}; name one with recording.topics.odometry.tf")
+    if "odometry" not in topics:
+        recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
+        notes.append(NO_WHEELS)
+    shape = _shape_of_views(found, topics)
+    fov = None
+    if isinstance(shape, ScanShape):
+        fov = 2 * np.pi if shape.extent.ring else shape.extent.width
+    if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
+        size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
+        recording["image"] = size
+    return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
+
+
+def clock_notes(name: str, clock: Times) -> list[str]:
+    """What is remarkable about the stamps of a topic."""
+    counts = {
+        "a stamp of 0": clock.zero,
+        "the stamp of the message before": clock.repeated,
+        "an earlier stamp than the message before": clock.backwards,
+    }
+    notes = [f"{name}: {count} messages have {words}" for words, count in counts.items() if count]
+    if 0.5 < clock.ahead < 1e6:
+        cure = "if those of others are not, --set recording.topics.clock=bag"
+        notes.append(f"{name}: stamps are {clock.ahead:.3g} s ahead of their receipt; {cure}")
+    if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
+        notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")
+    return notes
+
+
+def in_words(shape: Shape | None) -> str:
+    """What the messages of a topic hold."""
+    match shape:
+        case ScanShape():
+            width = np.degrees(abs(shape.extent.width))
+            turn = "all around" if shape.extent.ring else f"over {width:.0f} degrees"
+            return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
+        case CloudShape():
+            return f"{shape.points} points, median {shape.reach:.2g} m away"
+        case ImageShape():
+            return f"{shape.width} x {shape.height} {shape.encoding}, mean grey {shape.grey:.0f}"
+        case ValueShape():
+            return f"{' x '.join(map(str, shape.sizes))} values from {shape.low:.3g} to {shape.high:.3g}"
+        case MotionShape():
+            poses, twists = (shape.pose_path, shape.pose_speed), (shape.twist_path, shape.twist_speed)
+            path, speed = poses if np.isfinite(shape.pose_path) else twists
+            return f"{path:.3g} m at {speed:.2g} m/s"
+    return ""
+
+
+def _shape_of_views(bag: BagDescription, topics: dict[str, Any]) -> Shape | None:
+    """What the topic of the views holds."""
+    views = topics.get("views")
+    name = views if isinstance(views, str) or views is None else views["topic"]
+    return next((topic.shape for topic in bag.topics if topic.name == name), None)
+
+
+def _reach(shape: Shape | None) -> float:
+    """The range that becomes 1 in the views, m; NaN for images."""
+    if isinstance(shape, ScanShape):
+        return min(shape.high, LONGEST)
+    return LONGEST if isinstance(shape, CloudShape) else np.nan
+
+
+def _video(path: Path) -> FileContents:
+    from robot.recordings.video import describe_video
+
+    frames, rate, width, height = describe_video(path)
+    what = f"{path}: a video of {frames} frames, {width} x {height}, {rate:g} a second"
+    if not rate > 0:
+        fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
+        return FileContents(what, None, faults=(fault,))
+    recording = {"video": {"rate": rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
+    return FileContents(what, recording, notes=(NO_WHEELS,))
+
+
+KINDS: dict[str, Callable[[Path], FileContents]] = {
+    ".csv": _csv,
+    ".npz": _npz,
+    ".mcap": _mcap,
+    **dict.fromkeys(VIDEOS, _video),
+}
+"""By suffix; a folder, `.bag` and `.db3` are bags."""
+
+
+class Diagnosis(NamedTuple):
+    """What was found.
+
+    Attributes:
+        what: one line. table: rows of cells, the first row the heading; may be empty. notes: facts.
+            faults: what prevents a run, or speaks against a map. advice: what to do next.
+            config: sections of a configuration that reads the recording, {} if there is none.
+    """
+
+    what: str
+    table: tuple[tuple[str, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    config: dict[str, Any] = {}  # noqa: RUF012
+
+
+def render(diagnosis: Diagnosis) -> str:
+    """The diagnosis as lines of text."""
+    lines = [diagnosis.what, *(f"  {line}".rstrip() for line in aligned(diagnosis.table))]
+    for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
+        lines += [f"{mark}{text}" for text in texts]
+    return "\n".join(map(printable, lines))
+
+
+CELLS_IN_RANGE = 13
+"""Pose cells in the range of the sensor, as in the configurations of real buildings."""
+DEFAULT_CELL = 0.1
+"""Side of a pose cell of a robot that does not move, m."""
+TORUS = 61
+"""Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
+UNREADABLE = "no configuration reads it: see what is missing"
+
+
+class Contents(NamedTuple):
+    """What a source holds.
+
+    Attributes:
+        samples, views: numbers of samples, and of those with a view or label. motion: typical; None for
+            a single sample. path: m. step: median motion between two views, m. truth: share of the samples
+            with a true pose. view_shape: of the views. whiskers: number.
+    """
+
+    samples: int
+    views: int
+    motion: TypicalMotion | None
+    path: float
+    step: float
+    truth: float
+    view_shape: tuple[int, int, int]
+    whiskers: int
+
+
+def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
+    """What a recording is, whether it can be read, and the configuration that reads it.
+
+    Args:
+        like: a map; the configuration then has its view, cells and method. Another sensor is a fault.
+
+    Raises:
+        InputError: it is missing, or of no known format.
+    """
+    path = path.parent if path.name == METADATA and kind_of(path.parent) == RECORDING else path
+    refuse_other_files(path, "a recording", (RECORDING, FOLDER))
+    if path.is_file() and path.suffix.lower() in (".yaml", ".yml"):
+        cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
+        raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
+    try:
+        found = describe_file(path)
+    except InputError:
+        if path.is_file() and (diagnosis := diagnose_registered(path)):
+            return diagnosis
+        raise
+    if found.recording is None:
+        if diagnosis := diagnose_registered(path):
+            return diagnosis
+        return Diagnosis(found.what, found.table, found.notes, found.faults or (UNREADABLE,))
+    sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
+    if "visual_odometry" in found.recording:
+        sections["presets"] = ["visual_odometry"]
+    told, faults, contents = list[str](), found.faults, None
+    try:
+        if like is not None:
+            fov = found.field_of_view
+            sections = _alike(sections if fov is None else sections | {"recall": {"sector_fov": fov}}, like)
+        with open_source(validate(parse(dump_data(sections), path.name), RunConfig), told.append) as source:
+            contents = summarise(source)
+    except InputError as error:
+        faults = (*faults, *str(error).splitlines())
+    if like is None and not (contents and contents.whiskers):
+        cell = cell_size(contents.step if contents else 0.0, found.max_range)
+        sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
+        if found.field_of_view is not None:
+            sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
+    notes = (*found.notes, *told, *(facts(contents) if contents else ()))
+    return Diagnosis(
+        found.what, found.table, notes, faults, shortcomings(contents) if contents else (), sections
+    )
+
+
+def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
+    """The sections with all settings in which the view, the cells or the method of a map differ from theirs.
+
+    Raises:
+        InputError: the recording is of another sensor.
+    """
+    name = f"doctor --like {like.path}"
+    document = override(parse(dump_data(sections), name), [f"backend={like.config.backend}"])
+    given = validate(document, RunConfig)
+    check_same_fov(str(like.path), like.config, given)
+    with open_source(given) as source:
+        config = complete(given, source)
+        found = differences(like.sensor, sensor_of(config, source))
+    settings = settings_of_map(found)
+    if settings is None:
+        check_same_sensor(str(like.path), like.sensor, sensor_of(config, source))
+    method = differing_settings([like.config, config])
+    settings = {key: both[0] for key, both in method.items()} | (settings or {})
+    return override(document, [f"{key}={json.dumps(value)}" for key, value in settings.items()]).data
+
+
+def diagnose_registered(path: Path) -> Diagnosis | None:
+    """A recording that a registered source reads, whose only setting without default is `file`; None if no
+    source does."""
+    for name in SOURCES.names():
+        settings = {"plugin": name, "settings": {"file": str(path.resolve())}}
+        try:
+            fields = SOURCES.get(name, "source").config_class.model_fields
+            if [key for key, field in fields.items() if field.is_required()] != ["file"]:
+                continue
+            sections = {"source": settings}
+            with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
+                contents = summarise(source)
+        except Exception:  # whatever a package does with a file that is not its own
+            continue
+        what = f"{path}: a recording that the source {name} reads"
+        return Diagnosis(what, notes=facts(contents), advice=shortcomings(contents), config=sections)
+    return None
+
+
+def summarise(source: Source) -> Contents:
+    """Reads all samples of a source."""
+    motions, times, truths, views = [], [], 0, []
+    for sample in source:
+        motions.append(np.asarray(sample.reading.odometry, float))
+        times.append(sample.time)
+        truths += sample.truth is not None
+        views.append(shows_place(sample.reading))
+    motion, time, viewed = np.array(motions).reshape(-1, 4), np.array(times), np.array(views, bool)
+    length = np.hypot(motion[:, 0], motion[:, 1])
+    between = np.diff(np.cumsum(length)[viewed])
+    moved = between[between > 0]
+    track = MotionTrack(time, np.ones(len(time), bool), motion, None)
+    return Contents(
+        samples=len(time),
+        views=int(viewed.sum()),
+        motion=typical_motion(track) if len(time) > 1 else None,
+        path=float(length.sum()),
+        step=float(np.median(moved)) if len(moved) else 0.0,
+        truth=truths / max(len(time), 1),
+        view_shape=source.view_shape,
+        whiskers=source.whiskers,
+    )
+
+
+def cell_size(step: float, max_range: float) -> float:
+    """Side of a pose cell, m, to two digits: a share of the sensor's range, else the motion between views.
+
+    Args:
+        step: median motion between two views, m. max_range: of the sensor, m, NaN without one.
+    """
+    size = max_range / CELLS_IN_RANGE if np.isfinite(max_range) else step or DEFAULT_CELL
+    return float(f"{size:.2g}")
+
+
+def facts(contents: Contents) -> tuple[str, ...]:
+    """The contents in words."""
+    notes = []
+    if contents.motion is not None:
+        notes.append(
+            f"odometry: {contents.path:.3g} m, typically {contents.motion.speed:.2g} m/s and "
+            f"{contents.motion.turn_rate:.2g} rad/s, a sample every {contents.motion.interval:.2g} s"
+        )
+    shape = " x ".join(map(str, contents.view_shape[:2]))
+    kind = f"of {contents.whiskers} whiskers" if contents.whiskers else f"of {shape} values"
+    notes.append(f"views: {contents.views} {kind}, {contents.step:.2g} m apart")
+    notes.append(f"truth: for {contents.truth:.0%} of the samples" if contents.truth else "truth: unknown")
+    return tuple(notes)
+
+
+def shortcomings(contents: Contents) -> tuple[str, ...]:
+    """What the recording lacks for a good map, in words."""
+    advice = []
+    if not contents.views:
+        advice.append("without views or place labels no place is recognised: the map is the odometry")
+    if contents.path == 0:
+        advice.append("the odometry does not move: check its topic or columns")
+    return tuple(advice)

@@ -1,1 +1,0 @@
-"""Cameras: grey frames to views and visual odometry, and video files."""

@@ -1,1 +1,0 @@
-"""Contact detection, free-whisking calibration and whisker images."""

@@ -1,1 +1,0 @@
-"""Geometry and control of whiskers."""
