@@ -215,7 +215,7 @@ def _odometry(study: StudyCourse) -> np.ndarray:
     return np.array(poses)
 
 
-FIGURE = CellFigure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
+DRIFT = CellFigure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
 
 
 """Steps and views per second."""
@@ -393,4 +393,5 @@ def _shuffled(source: Source, schedule: Schedule, seed: int) -> Source:
     return replace(log, views=views)
 
 
-ANCHORING_FIGURE = CellFigure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)
+ANCHORING = CellFigure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)
+FIGURES = {"drift": DRIFT, "anchoring": ANCHORING}

@@ -29,6 +29,8 @@ NAMES: tuple[str, ...] = (
 """The figures and tables. The first nine are modules of this room and on `backend: classic`, the others on
 `backend: recall`."""
 MODULES = {
+    "drift": "packet_figures",
+    "anchoring": "packet_figures",
     "posterior": "belief_rows",
     "alike_rooms": "belief_rows",
     "kidnap": "belief_rows",
