@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.packet_figures import (
-    FIGURE,
+    DRIFT,
     LEVELS,
     SPEED,
     DriftResult,
@@ -55,4 +55,4 @@ def test_table_and_picture(result: DriftResult, tmp_path: Path) -> None:
     assert all(text.count(f"| {level} |") == len(result.times) for level in LEVELS)
     draw_drift(result, tmp_path / "drift.png")
     assert (tmp_path / "drift.png").read_bytes().startswith(b"\x89PNG")
-    assert FIGURE.draw is draw_drift
+    assert DRIFT.draw is draw_drift
