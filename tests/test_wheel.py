@@ -84,6 +84,20 @@ def test_an_installed_program_finds_its_configurations(site: Path, tmp_path: Pat
     assert Path(recording).exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        ("reproduce cells --rows drift --sessions 1", "cells.md"),
+        ("study --preset spread square --set copies=2", "table.md"),
+    ],
+)
+def test_an_installed_program_has_the_studies_and_the_papers(
+    command: str, file: str, site: Path, tmp_path: Path
+) -> None:
+    start(site, tmp_path, "-m", "ratslam", *command.split(), "-o", "made")
+    assert (tmp_path / "made" / file).read_text(encoding="utf-8").count("\n| ") > 3
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("name", ["square", "whisker_maze"])
 def test_an_installed_program_maps_to_the_same_bytes(name: str, site: Path, tmp_path: Path) -> None:
