@@ -1,7 +1,7 @@
 """Localisation of a session in a finished map, which does not change, and the odds of views that it needs.
 
-The log-odds that a view's gain is one of a true pose are learned from the map compared with itself: the later
-keyframes play sessions on the ground of the earlier ones, each from its own pose (true) and from the places
+The log-odds that a view's gain is one of a true pose are learned from the map compared with itself: later
+keyframes are localised against earlier ones, each stretch from its own pose (true) and from the places
 elsewhere whose first views fit best (false).
 """
 
