@@ -1,9 +1,8 @@
-"""Views of the keyframes: views or whisker images, and the metric by which recall compares them.
+"""Views of the keyframes and the metric by which recall compares them: camera views, whisker images, ids.
 
-Each class stores the views of all keyframes, gives recall the metric, and measures how badly a keyframe would
-fit at another pose. The properties of the sensor are estimated from the session itself.
-
-Signed touch images of the keyframes, compared by log-odds that are learned from the session.
+Each class stores the views of all keyframes, gives recall its metric, and measures how badly a keyframe
+would fit at another pose (its misfit). The properties of the sensor are estimated from the session itself:
+the scale of view errors, the log-odds of whisker levels, the covariances of signed touch images.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ LEAST_QUANTILE = 1e-3
 LOG_ODDS_INTERVAL = 40
 """Keyframes between two estimates of the log-odds of whisker images."""
 NEW_IMAGE_LOG_ODDS = 3.0
-"""Log-odds that stand for a whisker image never seen before."""
+"""Log-odds of a whisker image never seen before."""
 NEUTRAL_MISFIT = 0.5
 """Misfit of a keyframe without others to compare it with."""
 NEUTRAL_IMAGE_MISFIT = float(np.log(2))
@@ -61,14 +60,6 @@ class ViewMetric(NamedTuple):
     angle: float
     scale: float
     likeness: np.ndarray
-
-
-class ConfirmedPairs(NamedTuple):
-    """P pairs of keyframes at one place: keyframe [P], match [P], and bool [P]: they face opposite ways."""
-
-    frame: np.ndarray
-    match: np.ndarray
-    reversed: np.ndarray
 
 
 class Appearance(Checkpointed, ABC):
@@ -101,7 +92,7 @@ class Appearance(Checkpointed, ABC):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
 
-    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         """Updates the metric from the newest keyframe's evidence and, at intervals, from confirmed pairs.
 
         Returns:
@@ -117,8 +108,9 @@ class Appearance(Checkpointed, ABC):
         """Gains of views before any were counted; `usual` if nothing else is known of them."""
         return usual
 
-    def relearn(self, pairs: ConfirmedPairs) -> None:
-        """Learns the metric anew from all views and these confirmed pairs."""
+    def relearn(self, pairs: np.ndarray) -> None:
+        """Learns the metric anew from all views and confirmed pairs [P, 3], see
+        `Archive.confirmed_pairs`."""
 
     @abstractmethod
     def take(self, frames: np.ndarray) -> None:
@@ -129,26 +121,27 @@ class Appearance(Checkpointed, ABC):
         """The views [n, D] and ids [n] of keyframes [n], as recall stores them."""
 
     @abstractmethod
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """[n] how unlike the view of a keyframe, or of each of the keyframes [n], is that of each of the
-        keyframes `others` [n], in units of its own; `reversed` as in `misfit`."""
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """[n] misfit of the view of a keyframe, or of each of the keyframes [n], and that of each of the
+        keyframes `others` [n], in units of its own; `reversed` as in `least_misfit`."""
 
     @abstractmethod
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """[n] log-odds that the view of a keyframe and that of each of the keyframes `others` [n] are of one
-        place, nat; `reversed` as in `misfit`."""
+        """[n] log-odds that the view of a keyframe and that of each of the keyframes `others` [n] are of
+        one place, nat; `reversed` as in `least_misfit`."""
 
     @abstractmethod
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
-        """How badly a keyframe would fit among keyframes [n], seen in the same or in the opposite direction
-        (`reversed` [n] bool); 0 or more."""
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """Misfit of a keyframe with the most similar of the keyframes [n], seen in the same or in the
+        opposite direction (`reversed` [n] bool); 0 or more."""
 
 
 class ViewAppearance(Appearance):
     """Views compared by their mean absolute difference.
 
     Args:
-        size: number of values of a view. fan: field of view, rad; 0: to be estimated; None: the views are not
+        size: number of values of a view. fan: field of view, rad; 0: to be estimated; None: the views are
+        not
             ordered sectors. normalise: the preprocessing of recall.
     """
 
@@ -184,7 +177,7 @@ class ViewAppearance(Appearance):
         self._view.extend(other._view.rows)
         self._background.extend(other._background.rows)
 
-    def relearn(self, pairs: ConfirmedPairs) -> None:
+    def relearn(self, pairs: np.ndarray) -> None:
         self._scale = 0, self._scale[1]
         self._rescale()
 
@@ -194,7 +187,7 @@ class ViewAppearance(Appearance):
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._view.rows[frames], np.full(len(frames), -1)
 
-    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         errors = np.asarray(evidence.background)
         self._background.extend(errors[np.isfinite(errors)])
         self._rescale()
@@ -208,19 +201,19 @@ class ViewAppearance(Appearance):
             self._scale = 0, 0.0
         return estimate
 
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Mean absolute differences."""
         return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """1 for equal views, 0 at the scale of errors, which few different places stay below."""
-        return 1 - self.unlikeness(frame, others, reversed) / max(self._scale[1], 1e-300)
+        return 1 - self.misfits(frame, others, reversed) / max(self._scale[1], 1e-300)
 
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """0..1: the smallest error against the keyframes, relative to twice the scale."""
         if not len(near):
             return NEUTRAL_MISFIT
-        error = self.unlikeness(frame, near, reversed).min()
+        error = self.misfits(frame, near, reversed).min()
         return float(min(error / max(2 * self._scale[1], 1e-300), 1.0))
 
     def _rescale(self) -> None:
@@ -276,10 +269,12 @@ class WhiskerAppearance(Appearance):
         assert isinstance(other, WhiskerAppearance)
         self._level.extend(other._level.rows)
 
-    def relearn(self, pairs: ConfirmedPairs) -> None:
-        frame, match, reversed = pairs
-        images = self._level.rows
-        variation = estimate_variation(images[frame], self._images(match, reversed))
+    def relearn(self, pairs: np.ndarray) -> None:
+        frame, match, reversed = pairs.T
+        images, opposite = self._level.rows, self._pixels.opposite
+        # Matches that face the opposite way are compared as seen in that direction.
+        matched = np.where(reversed[:, None] > 0, images[match][:, opposite], images[match])
+        variation = estimate_variation(images[frame], matched)
         self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
 
     def take(self, frames: np.ndarray) -> None:
@@ -288,12 +283,12 @@ class WhiskerAppearance(Appearance):
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._level.rows[frames], np.full(len(frames), -1)
 
-    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:
             self.relearn(confirmed_pairs())
         return NO_ESTIMATE
 
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Negative log-odds; zeros while these are not learned."""
         if not self._likeness.size:
             return np.zeros(len(others))
@@ -303,18 +298,13 @@ class WhiskerAppearance(Appearance):
         )
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return -self._temper * self.unlikeness(frame, others, reversed)
+        return -self._temper * self.misfits(frame, others, reversed)
 
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""
         if not len(near) or not self._likeness.size:
             return NEUTRAL_IMAGE_MISFIT
-        return float(np.log1p(np.exp(self._temper * self.unlikeness(frame, near, reversed).min())))
-
-    def _images(self, frames: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """[n, D] levels of keyframes, those `reversed` [n] as seen in the opposite direction."""
-        images = self._level.rows[frames]
-        return np.where(reversed[:, None], images[:, self._pixels.opposite], images)
+        return float(np.log1p(np.exp(self._temper * self.misfits(frame, near, reversed).min())))
 
 
 @compiled
@@ -418,16 +408,16 @@ class LabelAppearance(Appearance):
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((len(frames), 0)), self._label.rows[frames]
 
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return (self._label.rows[others] != self._label.rows[frame]).astype(float)
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return SAME_ID_LOG_ODDS * (1 - 2 * self.unlikeness(frame, others, reversed))
+        return SAME_ID_LOG_ODDS * (1 - 2 * self.misfits(frame, others, reversed))
 
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         if not len(near):
             return NEUTRAL_MISFIT
-        return float(self.unlikeness(frame, near, reversed).min())
+        return float(self.misfits(frame, near, reversed).min())
 
 
 APART = np.arange(1, 9) / 9
@@ -461,12 +451,12 @@ class SignedAppearance(Appearance):
         assert isinstance(other, SignedAppearance)
         self._image.extend(other._image.rows)
 
-    def relearn(self, pairs: ConfirmedPairs) -> None:
+    def relearn(self, pairs: np.ndarray) -> None:
         images, count = self._image.rows, len(self._image.rows)
         row = np.arange(count)
         moved = (row + (count * APART[:, None]).astype(int)) % count
         apart = np.column_stack([np.tile(row, len(APART)), moved.ravel()])
-        known = ImagePairs(images[pairs.frame], images[pairs.match])
+        known = ImagePairs(images[pairs[:, 0]], images[pairs[:, 1]])
         self._likeness = pack(learn(images, known, apart))
 
     def take(self, frames: np.ndarray) -> None:
@@ -475,13 +465,13 @@ class SignedAppearance(Appearance):
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._image.rows[frames], np.full(len(frames), -1)
 
-    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], ConfirmedPairs]) -> BiasEstimate:
+    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         count = len(self._image.rows)
         if count >= MIN_KEYFRAMES and count % LOG_ODDS_INTERVAL == 0:
             self.relearn(confirmed_pairs())
         return NO_ESTIMATE
 
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Negative log-odds; zeros while these are not learned."""
         if not self._likeness.size:
             return np.zeros(len(others))
@@ -490,10 +480,10 @@ class SignedAppearance(Appearance):
         return -log_odds(model, first, project(model, images[others].T))
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return -self.unlikeness(frame, others, reversed)
+        return -self.misfits(frame, others, reversed)
 
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
         """log(1 + 1 / odds) of the most similar of the keyframes."""
         if not len(near) or not self._likeness.size:
             return NEUTRAL_IMAGE_MISFIT
-        return float(np.log1p(np.exp(self.unlikeness(frame, near, reversed).min())))
+        return float(np.log1p(np.exp(self.misfits(frame, near, reversed).min())))

@@ -1,14 +1,11 @@
-"""All keyframes and closure candidates of a map whose keyframes are merged, as they were taken.
+"""Merging of keyframes during a session, and the archive of all keyframes and candidates as they were
+taken.
 
-Closure selection on the unmerged keyframes.
-
-A merge takes for granted that its ground is right, and what the map solves for afterwards cannot show that it
-was wrong, because merged keyframes move together. So each time the keyframes have doubled, all closure
+A merge takes for granted that its ground is right, and what the map solves for afterwards cannot show that
+it was wrong, because merged keyframes move together. So each time the keyframes have doubled, all closure
 sequences are selected anew on the unmerged keyframes, from the present map and from odometry; the result is
-merged anew and replaces the map. It costs much more than a selection among the kept keyframes, so it stops at
-`LARGEST` keyframes.
-
-Merging of keyframes during a session, with an archive that undoes merges on ground that was wrong.
+merged anew and replaces the map. It costs much more than a selection among the kept keyframes, so it stops
+at `LARGEST` keyframes.
 """
 
 from __future__ import annotations
@@ -20,13 +17,12 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.mapping.appearance import ConfirmedPairs
 from ratslam.mapping.closure_selection import MapHypotheses
 from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog
 from ratslam.mapping.map_solution import MapSolution
-from ratslam.mapping.merging import Merge, find_merge, merge_keyframes, no_merge
+from ratslam.mapping.merging import Merge, find_merge, merge_keyframes
 from ratslam.mapping.selection_worker import DelayedJob, SelectedMap, SelectionWorker
 from ratslam.recall.memory import MergedRows
 from tactile.base.se2 import compose, fit_rigid_motion, inverse
@@ -44,9 +40,10 @@ class Archive(Checkpointed):
 
     Attributes:
         graph: its keyframes, [E]. log: its candidates. Poses and verdicts are those of the last `follow`.
-        row: [E] the keyframe of the map that each is or is merged with. offset: [E, 3] its pose in the frame
+        row: [E] the keyframe of the map that each is or is merged with. offset: [E, 3] its pose in the
+        frame
             of that one, m, m, rad.
-        pairs: [P, 3] confirmed pairs of which a keyframe was merged, the newest (see `confirmed_pairs`).
+        pairs: [P, 3] confirmed pairs of which a keyframe was merged, the newest ones.
     """
 
     PARTS = ("graph", "log")
@@ -78,8 +75,11 @@ class Archive(Checkpointed):
     def merge(self, merge: Merge, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Follows a merge of keyframes of the map, which has not changed yet."""
         if not self.begun:
-            self._begin(graph, log)
-        pairs = confirmed_pairs(graph, log)
+            self.graph.restore(graph.arrays())
+            self.log = log.copy()
+            self.row.replace(np.arange(graph.count))
+            self.offset.replace(np.zeros((graph.count, 3)))
+        pairs = _confirmed_pairs(graph, log)
         gone = np.isin(pairs[:, 0], graph.taken.rows[~merge.is_kept()])
         self.pairs.replace(np.concatenate([self.pairs.rows, pairs[gone]])[-PAIRS:])
         row, offset = self.row.rows, self.offset.rows
@@ -87,19 +87,14 @@ class Archive(Checkpointed):
         offset[moved] = compose(merge.offset[row[moved]], offset[moved])
         row[:] = merge.onto[row]
 
-    def unmerged_log(self, log: ClosureLog) -> ClosureLog:
-        """A log of all candidates with the verdicts of the map's."""
-        whole = self.log.copy()
-        whole.follow(log)
-        return whole
-
-    def confirmed_pairs(self, graph: KeyframeGraph, log: ClosureLog) -> ConfirmedPairs:
-        """Closures with a high posterior that the map has accepted, of merged keyframes the newest."""
-        pairs = np.concatenate([self.pairs.rows, confirmed_pairs(graph, log)])
-        return ConfirmedPairs(pairs[:, 0], pairs[:, 1], pairs[:, 2] > 0)
+    def confirmed_pairs(self, graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+        """[P, 3] keyframe, match, and 1 where they face opposite ways, of closures with a high posterior
+        that the map has accepted; of merged keyframes the newest ones."""
+        return np.concatenate([self.pairs.rows, _confirmed_pairs(graph, log)])
 
     def poses(self, poses: np.ndarray) -> np.ndarray:
-        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any merge."""
+        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any
+        merge."""
         return compose(poses[self.row.rows], self.offset.rows) if self.begun else poses
 
     def follow(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
@@ -126,16 +121,10 @@ class Archive(Checkpointed):
             log.weigh(fit.weights)
         return MapSolution(fit, log, cut).placed(self.graph)
 
-    def _begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
-        self.graph.restore(graph.arrays())
-        self.log = log.copy()
-        self.row.replace(np.arange(graph.count))
-        self.offset.replace(np.zeros((graph.count, 3)))
 
-
-def confirmed_pairs(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
-    """[P, 3] numbers of keyframe and match, among all ever taken, of accepted closures with a high posterior,
-    and 1 where they face opposite ways."""
+def _confirmed_pairs(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+    """[P, 3] numbers of keyframe and match, among all ever taken, of accepted closures with a high
+    posterior, and 1 where they face opposite ways."""
     table = log.table()[log.accepted_rows()]
     sure = (table[:, 3] > CONFIRMED_MASS) & (table[:, 8] > CONFIRMED_WEIGHT)
     frame, match, shift = table[sure, :3].astype(int).T
@@ -159,7 +148,7 @@ class UnmergedMap(Checkpointed):
 
     def __init__(self, selected: SelectedMap) -> None:
         self.selected = selected
-        self.kept, self.onto, self.offset = no_merge(0)
+        self.kept, self.onto, self.offset = Merge.of_none(0)
 
     def select(self, graph: KeyframeGraph) -> UnmergedMap:
         """Selects, and decides what to merge; changes `graph`."""
@@ -169,7 +158,7 @@ class UnmergedMap(Checkpointed):
             graph.bias, graph.turn_error = selected.calibration
             selected.log.confirm(graph.config.merge_stood)
             merge = find_merge(graph, selected.log, graph.config.merge_newest)
-            self.kept, self.onto, self.offset = merge or no_merge(graph.count)
+            self.kept, self.onto, self.offset = merge or Merge.of_none(graph.count)
         return self
 
     def replace(self, graph: KeyframeGraph, log: ClosureLog, archive: Archive) -> Merge:
@@ -185,7 +174,8 @@ class UnmergedMap(Checkpointed):
         cut = np.full(count, -1)
         cut[:size] = selected.cut.rows
         cut[graph.taken.rows[newer]] = graph.cut.rows[newer]
-        whole = archive.unmerged_log(log)
+        whole = archive.log.copy()
+        whole.follow(log)
         selected.judge(whole)
         whole.confirm(graph.config.merge_stood)
         log.restore(whole.arrays())
@@ -202,7 +192,7 @@ class UnmergedMap(Checkpointed):
         )
 
 
-class ArchiveSelection(Checkpointed):
+class _ArchiveSelection(Checkpointed):
     """Selects on the unmerged keyframes each time they have doubled."""
 
     PARTS = ("_job",)
@@ -216,7 +206,8 @@ class ArchiveSelection(Checkpointed):
         return self._job.busy
 
     def begin(self, archive: Archive) -> None:
-        """Begins a selection if it is due; poses and verdicts of the archive are those of the present map."""
+        """Begins a selection if it is due; poses and verdicts of the archive are those of the present
+        map."""
         count = archive.graph.count
         unmerged = UnmergedMap(SelectedMap(archive.log.copy(), MapHypotheses()))
         self._job.begin(count + count // DELAY, partial(unmerged.select, archive.graph.copy()))
@@ -225,12 +216,6 @@ class ArchiveSelection(Checkpointed):
         """The result when it is due at `count` keyframes; None if it found no map."""
         unmerged = self._job.take(count)
         return unmerged if unmerged is not None and unmerged.selected.found else None
-
-
-def is_due(count: int) -> bool:
-    """Whether unmerged keyframes are selected on at this number of them."""
-    doublings, rest = divmod(count, FIRST)
-    return rest == 0 and FIRST <= count <= LARGEST and doublings & (doublings - 1) == 0
 
 
 class KeyframeMerger(Checkpointed):
@@ -246,7 +231,7 @@ class KeyframeMerger(Checkpointed):
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive
-        self.archive_selection = ArchiveSelection()
+        self.archive_selection = _ArchiveSelection()
         self.merge_due = False
 
     def note_selection(self, graph: KeyframeGraph) -> None:
@@ -255,18 +240,20 @@ class KeyframeMerger(Checkpointed):
 
     def select(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection on the unmerged keyframes if it is due."""
-        if self._archive.begun and graph.config.select_every and is_due(graph.ever):
+        doublings, rest = divmod(graph.total, FIRST)
+        due = rest == 0 and FIRST <= graph.total <= LARGEST and doublings & (doublings - 1) == 0
+        if due and self._archive.begun and graph.config.select_every:
             self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
             self.archive_selection.begin(self._archive)
 
     def merge(
         self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, experiences: Experiences
     ) -> MergedRows | None:
-        """Merges keyframes of confirmed ground if that is due, or replaces the map by the one selected on the
-        unmerged keyframes, merged anew; returns what the kernel needs to follow."""
+        """Merges keyframes of confirmed ground if that is due, or replaces the map by the one selected on
+        the unmerged keyframes, merged anew; returns what the kernel needs to follow."""
         if selection.busy:
             return None
-        unmerged = self.archive_selection.take(graph.ever)
+        unmerged = self.archive_selection.take(graph.total)
         if unmerged is not None:
             return self._replace(unmerged, graph, log, selection, experiences)
         if not self.merge_due or self.archive_selection.busy:

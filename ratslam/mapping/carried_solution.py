@@ -1,26 +1,12 @@
 """The final map of a robot that may be carried: the odometry cut where all views together show it.
 
-While a session goes on, a cut is found from one closure sequence at a time: it lies up to a lap off, or is
-missing where no sequence shows it. In the final map the robot is retraced (`retracing`), the sequences are
-selected anew with the odometry cut there, and so on in turn, because each makes the other better. Each time
-it is retraced once on all keyframes and once on the earlier ones alone: two stretches at one wrong place bear
-each other out, but the first of them has to fit what was there before. Each map is aligned by closures along
-its own poses (`track_closures`): bent, the right one would look less likely than a wrong one. Of all these
-maps and the one before, the one that the views and the measurements together find most likely is given. The
-method is ours.
-
-Closure sequences along the poses of a map, where its views fit.
-
-Recall proposes few sequences on a stretch between two cuts of the odometry, so the stretch is bent and its
-views look as if it were elsewhere. Where the poses of two keyframes are near each other and the view fits,
-they are a closure. The rule is ours.
-
-Retracing: where a robot that may be carried was at each keyframe of a finished map, all views considered.
-
-The map's own stretches between breaks, the places that closure sequences claim and, where the map's poses fit
-badly, the places that look alike are followed as tracks in both directions. The sequence of tracks with the
-largest log-odds is that of a hidden Markov model in which the robot is seldom carried (Viterbi 1967);
-odometry is cut where it jumps from one track to another. That its states are tracks is ours.
+During a session a cut is found from one closure sequence at a time, up to a lap off, or not at all. So the
+final map is retraced: its own stretches, the places that sequences claim and places that look alike are
+followed as tracks, and the likeliest sequence of tracks is that of a hidden Markov model in which the robot
+is seldom carried (Viterbi 1967). Odometry is cut where it jumps, the sequences are selected anew, and so on
+in turn. Each time the robot is retraced once on all keyframes and once on earlier ones alone, because two
+segments placed wrongly together support each other. Each map is first aligned by closures along its own
+poses: without realignment a correct map scores below a wrong one. The most likely map is given.
 """
 
 from __future__ import annotations
@@ -36,13 +22,12 @@ from ratslam.mapping.closure_selection import (
     MapHypotheses,
     Selection,
     SelectionProblem,
-    cut_odometry,
     optimise_with_cuts,
 )
 from ratslam.mapping.ground import BINS, GainOdds, learn_gain_odds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import MapSolution, selected_map, selection_case, sequences_to_select
+from ratslam.mapping.map_solution import MapSolution, selected_map, selection_problem, sequences_to_select
 from ratslam.mapping.optimizer import MapFit, MapProblem, System
 from ratslam.mapping.pose_tracks import SelfTraverse, Track
 from ratslam.mapping.verification import turn_on_spot
@@ -57,13 +42,14 @@ FEWEST_RETRACED = 100
 """Least number of them: fewer teach nothing about how views fit."""
 
 
-class Case(NamedTuple):
+class _CarriedProblem(NamedTuple):
     """What is selected from once the odometry is cut.
 
     Attributes:
-        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem: among
-            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one if
-            there is none.
+        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem:
+        among
+            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one
+            if there is none.
     """
 
     log: ClosureLog
@@ -81,25 +67,25 @@ class Case(NamedTuple):
         return System(self._measurements()).robust_cost(fit) + self.problem.views_cost(fit.poses)
 
     def _measurements(self) -> MapProblem:
-        return cut_odometry(self.problem.measurements, self.breaks)
+        return self.problem.measurements.cut_at([frame for frame, _ in self.breaks])
 
 
-class Judged(NamedTuple):
+class _ScoredMap(NamedTuple):
     """A selection, and its log-likelihood with what all views say, nat.
 
     Attributes:
         case: with the sequences of recall. aligned: with those along the poses too. selection: of these.
     """
 
-    case: Case
-    aligned: Case
+    case: _CarriedProblem
+    aligned: _CarriedProblem
     selection: Selection
     likelihood: float
 
 
 def is_retraced(graph: KeyframeGraph) -> bool:
-    """Whether the final map of these keyframes, none of them merged, is retraced; one that is told where it
-    begins a piece is not."""
+    """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are
+    given."""
     config = graph.config
     known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
     return bool(config.may_be_carried and config.select_every and known)
@@ -113,56 +99,44 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
     """
     fits, fit, log = view_fits(graph), solution.fit, solution.log
     odds = learn_odds(SelfTraverse.of_map(graph, fit, fits))
-    first = _case(graph, log, np.flatnonzero(solution.cut.rows >= 0))
+    first = _carried_problem(graph, log, np.flatnonzero(solution.cut.rows >= 0))
     if not len(first.sequences):
         return solution
-    newest = best = _judge(graph, fits, odds, first, [fit])
-    past = earlier_fits(fits)
+    newest = best = _score(graph, fits, odds, first, [fit])
+    later = np.triu(np.ones((len(fits), len(fits)), bool))
+    past = np.where(later[:, None], np.float32(-np.inf), fits)  # those at earlier keyframes
     for _ in range(ROUNDS):
         found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
-        newest = max(found, key=lambda judged: judged.likelihood)
-        best = max(best, newest, key=lambda judged: judged.likelihood)
+        newest = max(found, key=lambda scored: scored.likelihood)
+        best = max(best, newest, key=lambda scored: scored.likelihood)
     case, cut = best.aligned, _uncut(graph)
     given = selected_map(graph, case.log, cut, case.sequences, best.selection)
     refused = given.log.verdicts() != Verdict.ACCEPTED
     refused[: log.sequences] = False  # what recall says against the map stays
-    given.log.strike_sequences(np.flatnonzero(refused))
+    given.log.reject_sequences(np.flatnonzero(refused))
     return given
 
 
 def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:
-    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`, and, if these
-    are fewer, to its sequences."""
+    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`, and, if
+    these are fewer, to its sequences."""
     if len(rows) == len(solution.fit.poses):
         return solution
     log, cut = kept.log.copy(), GrowableArray((), np.int64)
     log.follow(solution.log)
     cut.replace(solution.cut.rows[rows])
-    log.strike_across(np.flatnonzero(cut.rows >= 0))
+    log.reject_across(np.flatnonzero(cut.rows >= 0))
     return MapSolution(solution.fit._replace(poses=solution.fit.poses[rows]), log, cut)
 
 
-def _case(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
+def _carried_problem(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> _CarriedProblem:
     """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
     log = log.copy()
-    log.strike_across(cuts)
-    return _case_of(graph, log, cuts)
-
-
-def _case_of(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> Case:
-    """The selection among the sequences of a log, none of which lies across a cut; changes the log."""
+    log.reject_across(cuts)
     sequences = np.flatnonzero(sequences_to_select(graph, log))
-    problem = selection_case(graph, log, _uncut(graph), sequences, np.copy)
+    problem = selection_problem(graph, log, _uncut(graph), sequences, np.copy)
     shows = np.array([np.append(np.flatnonzero(problem.first >= frame), -1)[0] for frame in cuts], int)
-    return Case(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
-
-
-def _align(graph: KeyframeGraph, fits: np.ndarray, case: Case, fit: MapFit) -> tuple[Case, Selection]:
-    """The selection among the sequences of a case and those along the poses of a fit."""
-    log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
-    add_closures_along(log, SelfTraverse.of_map(graph, fit, fits), cuts, graph.config.max_gap)
-    aligned = _case_of(graph, log, cuts)
-    return aligned, optimise_with_cuts(aligned.problem, fit, aligned.breaks)
+    return _CarriedProblem(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
 
 
 def _retrace(
@@ -170,20 +144,21 @@ def _retrace(
     fits: np.ndarray,
     compared: np.ndarray,
     odds: GainOdds,
-    before: Judged,
+    before: _ScoredMap,
     log: ClosureLog,
-) -> Judged:
+) -> _ScoredMap:
     """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
     fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
     session = SelfTraverse.of_map(graph, fit, fits)
-    found = retrace(session._replace(fits=compared), learn_odds(session), cuts, log, graph.sector_angle)
-    case = _case(graph, log, found.cuts)
-    return _judge(graph, fits, odds, case, case.starts(fit._replace(poses=found.poses)))
+    compared_there = session._replace(fits=compared)
+    poses, _, cuts = retrace(compared_there, learn_odds(session), cuts, log, graph.sector_angle)
+    case = _carried_problem(graph, log, cuts)
+    return _score(graph, fits, odds, case, case.starts(fit._replace(poses=poses)))
 
 
-def _judge(
-    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, starts: list[MapFit]
-) -> Judged:
+def _score(
+    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, starts: list[MapFit]
+) -> _ScoredMap:
     """The most likely of the selections from these starts, aligned by the views.
 
     Args:
@@ -193,11 +168,18 @@ def _judge(
     likelihoods = [_likelihood(graph, fits, odds, case, one.fit) for one in selections]
     selection, aligned = selections[int(np.argmax(likelihoods))], case
     for _ in range(ALIGNED):
-        aligned, selection = _align(graph, fits, case, selection.fit)
-    return Judged(case, aligned, selection, _likelihood(graph, fits, odds, case, selection.fit))
+        # Among the sequences of the case and those along the poses of the fit.
+        log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
+        session = SelfTraverse.of_map(graph, selection.fit, fits)
+        add_closures_along(log, session, cuts, graph.config.max_gap)
+        aligned = _carried_problem(graph, log, cuts)
+        selection = optimise_with_cuts(aligned.problem, selection.fit, aligned.breaks)
+    return _ScoredMap(case, aligned, selection, _likelihood(graph, fits, odds, case, selection.fit))
 
 
-def _likelihood(graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: Case, fit: MapFit) -> float:
+def _likelihood(
+    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, fit: MapFit
+) -> float:
     """Of all views, the cuts, the odometry and the sequences of recall; those along the poses would count
     the views twice."""
     seen = SelfTraverse.of_map(graph, fit, fits).own_odds(odds).sum()
@@ -216,8 +198,8 @@ LONGEST = 10
 
 
 def add_closures_along(log: ClosureLog, session: SelfTraverse, cuts: np.ndarray, max_gap: int) -> None:
-    """Adds to the log the earlier keyframe that fits best at the pose of each keyframe, where any fits better
-    than a new place.
+    """Adds to the log the earlier keyframe that fits best at the pose of each keyframe, where any fits
+    better than a new place.
 
     Args:
         cuts: keyframes [n], ascending, before which the odometry is cut; no sequence lies across one.
@@ -261,12 +243,6 @@ def view_fits(graph: KeyframeGraph) -> np.ndarray:
     return fits
 
 
-def earlier_fits(fits: np.ndarray) -> np.ndarray:
-    """The fits [N, S, N] at earlier keyframes, -inf at later ones."""
-    later = np.triu(np.ones((len(fits), len(fits)), bool))
-    return np.where(later[:, None], np.float32(-np.inf), fits)
-
-
 def learn_odds(session: SelfTraverse) -> GainOdds:
     """The log-odds of a fit, from those at the map's own poses and on tracks from other places that look
     alike."""
@@ -286,48 +262,32 @@ def learn_odds(session: SelfTraverse) -> GainOdds:
 
 
 JUMP = CUT
-"""What being carried costs, nat: twice what a cut costs a selection, because each view counts here, and
+"""Penalty of one relocation, nat: twice what a cut costs a selection, because each view counts here, and
 successive ones are alike."""
 BEYOND, AROUND = 60, 180
 """Keyframes over which a stretch of the map is followed beyond its ends, and over which any other track is
 followed."""
 LOOKED, EVERY = 8, 4
-"""Keyframes whose views are considered together to see whether the map fits, and how often."""
-DOUBTED = 0.5
+"""Keyframes whose views together show whether the map fits, and how often that is asked."""
+POOR_FIT = 0.5
 """Mean log-odds of these below which other places are tried, nat."""
 TRIED = 4
 """Number of such places."""
 
 
-class Retraced(NamedTuple):
-    """Poses [N, 3] of the keyframes, the log-odds of their views there less `JUMP` for each cut, and the
-    keyframes [n] before which odometry is cut."""
-
-    poses: np.ndarray
-    odds: float
-    cuts: np.ndarray
-
-
 def retrace(
     session: SelfTraverse, odds: GainOdds, cuts: np.ndarray, log: ClosureLog, sector_angle: float
-) -> Retraced:
+) -> tuple[np.ndarray, float, np.ndarray]:
     """The most likely track through all keyframes.
 
     Args:
         cuts: keyframes [n] before which the odometry of the map is cut. log: whose sequences claim places.
+
+    Returns:
+        poses [N, 3] of the keyframes; the log-odds of their views there less `JUMP` for each cut; the
+        keyframes [n] before which odometry is cut.
     """
-    tracks = _own_tracks(session, odds, cuts)
-    for frame, pose in _claims(session, log, sector_angle):
-        _add(tracks, session, odds, frame, pose)
-    _search(tracks, session, odds)
-    poses, gained = (np.stack(part) for part in zip(*tracks, strict=True))
-    reach = session.ground.reach, session.ground.reach_heading
-    chosen, jumps, total = _best_sequence(poses, gained, *reach, JUMP)
-    return Retraced(poses[chosen, np.arange(session.size)], total, np.flatnonzero(jumps))
-
-
-def _own_tracks(session: SelfTraverse, odds: GainOdds, cuts: np.ndarray) -> list[Track]:
-    """The stretches of the map between its cuts, followed on beyond them."""
+    # The stretches of the map between its cuts, followed on beyond them.
     own, tracks = session.own_odds(odds), []
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), session.size], strict=True):
         track = Track(np.full((session.size, 3), np.nan), np.full(session.size, -np.inf))
@@ -336,28 +296,22 @@ def _own_tracks(session: SelfTraverse, odds: GainOdds, cuts: np.ndarray) -> list
             frames, poses, _, gained = session.follow(end, session.poses[end], stop, odds)
             track.poses[frames], track.odds[frames] = poses, gained
         tracks.append(track)
-    return tracks
-
-
-def _claims(session: SelfTraverse, log: ClosureLog, sector_angle: float) -> list[tuple[int, np.ndarray]]:
-    """The poses [3] that the sequences claim for the keyframe of their middle members."""
-    claims = []
+    # Where the sequences claim the keyframe of their middle members to be.
     for sequence in np.flatnonzero((log.left() > 1) & (log.verdicts() != Verdict.UNDONE)).tolist():
         members = log.members(sequence)
         frame, match, shift, _ = members[len(members) // 2].tolist()
-        claims.append((frame, turn_on_spot(session.poses[match], -shift * sector_angle)))
-    return claims
-
-
-def _search(tracks: list[Track], session: SelfTraverse, odds: GainOdds) -> None:
-    """Adds tracks of places that look alike where the poses of the map do not fit."""
-    fits = np.convolve(session.own_odds(odds), np.ones(LOOKED), "valid")
-    places = session.places()
+        _add(tracks, session, odds, frame, turn_on_spot(session.poses[match], -shift * sector_angle))
+    # Places that look alike where the poses of the map do not fit.
+    fits, places = np.convolve(own, np.ones(LOOKED), "valid"), session.places()
     for frame in range(0, len(fits), EVERY):
-        if fits[frame] < DOUBTED * LOOKED:
-            likeness = session.scan(frame, places, LOOKED)
-            for place in np.argsort(-likeness, kind="stable")[:TRIED].tolist():
+        if fits[frame] < POOR_FIT * LOOKED:
+            alike = session.scan(frame, places, LOOKED)
+            for place in np.argsort(-alike, kind="stable")[:TRIED].tolist():
                 _add(tracks, session, odds, frame, places[place])
+    poses, gained = (np.stack(part) for part in zip(*tracks, strict=True))
+    reach = session.ground.reach, session.ground.reach_heading
+    chosen, jumps, total = _best_sequence(poses, gained, *reach, JUMP)
+    return poses[chosen, np.arange(session.size)], total, np.flatnonzero(jumps)
 
 
 def _add(tracks: list[Track], session: SelfTraverse, odds: GainOdds, frame: int, pose: np.ndarray) -> None:
@@ -383,13 +337,13 @@ def _best_sequence(
     tracks, count = odds.shape
     score = odds[:, 0].copy()
     before, jumped = np.zeros((count, tracks), np.int64), np.zeros((count, tracks), np.bool_)
-    for k in range(1, count):
+    for k in range(1, count):  # Viterbi: the best way to each track t at keyframe k
         best, after = int(np.argmax(score)), np.full(tracks, -np.inf)
         for t in range(tracks):
             if odds[t, k] == -np.inf:
                 continue
             value, source, leaps = score[best] - jump, best, True
-            for u in range(tracks):
+            for u in range(tracks):  # without a jump from tracks that are at the same pose
                 if score[u] <= value or odds[t, k - 1] == -np.inf:
                     continue
                 x, y = poses[t, k - 1, 0] - poses[u, k - 1, 0], poses[t, k - 1, 1] - poses[u, k - 1, 1]
@@ -399,7 +353,7 @@ def _best_sequence(
             before[k, t], jumped[k, t], after[t] = source, leaps, value + odds[t, k]
         score = after
     chosen, jumps = np.empty(count, np.int64), np.zeros(count, np.bool_)
-    chosen[-1] = np.argmax(score)
+    chosen[-1] = np.argmax(score)  # and back along the best sources
     for k in range(count - 1, 0, -1):
         chosen[k - 1] = before[k, chosen[k]]
         jumps[k] = jumped[k, chosen[k]]

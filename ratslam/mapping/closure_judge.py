@@ -1,25 +1,18 @@
 """Whether the robot is really back: the log-odds that a closure sequence is true.
 
 A sequence claims that its middle keyframe was at the pose of the one it matched. That pose is followed by
-odometry, corrected by the keyframes near by, through the sequence and `BEYOND` keyframes before and after it,
-once over the map (m) and once over the older pass alone as odometry knows it (o), which no closure has bent.
-Each view on the way counts by how well it fits there, for or against:
+odometry, corrected by the keyframes near by, through the sequence and `BEYOND` keyframes before and after
+it, once over the map (m) and once over the older pass alone as odometry knows it (o), which no closure has
+bent. Each view on the way counts by how well it fits there, for or against:
 
     L_g = a_g + w+ max(R, 0) + w- min(R, 0) + n_within . w1 + n_around . w2,    g = m, o
     L   = (L_m + L_o) / 2
 
-R is the log of the density that odometry gave to the claimed place over its mean at all older keyframes. The
-numbers n count views by kind (`KINDS`), by their gain: log-odds at the best keyframe near by less the log of
-their mean elsewhere. The weights are those of a logistic regression on sequences with known truth of
-simulated sessions; `python -m ratslam reproduce tables closures` fits and tests them. They are far below
-those of independent views, because successive views are alike.
-
-Recall chooses a sequence because the views at the places that it claims are alike, which they may be by
-chance; the views around them are not chosen. So the evidence of recall counts less where L is low
-(`ClosureLog.credit`), a sequence that is not likely waits for a selection (`AT_ONCE`), and a map whose
-sequences are unlikely together is doubted. L of true sequences is small while a session is
-young, or where odometry is noisier than it was taken to be: a sequence is weighed against the others with
-less evidence, not refused by L alone. The rules are ours.
+R is the log of the density that odometry gave to the claimed place over its mean at all older keyframes.
+The numbers n count views by kind (`KINDS`). The weights are those of a logistic regression on simulated
+sessions with known truth (`python -m ratslam reproduce tables closures`); they are far below those of
+independent views, because successive views are alike. The evidence of recall counts less where L is low
+(`ClosureLog.credit`), and an unlikely sequence waits for a selection (`AT_ONCE`); L alone refuses none.
 """
 
 from __future__ import annotations
@@ -67,21 +60,29 @@ class SequenceEvidence(NamedTuple):
     """What is known of n sequences.
 
     Attributes:
-        foretold: [n] R; NaN where odometry is broken between the keyframes that a sequence joins, about which
-            nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over the older
-            pass; of the sequence and around it.
+        odometry_ratio: [n] R; NaN where odometry is broken between the keyframes that a sequence joins,
+        about
+            which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over the
+            older pass; of the sequence and around it.
     """
 
-    foretold: np.ndarray
+    odometry_ratio: np.ndarray
     counts: np.ndarray
 
     def features(self) -> np.ndarray:
         """[n, 2, 3 + 2 KINDS] factors of the weights, over the map and over the older pass."""
-        n = len(self.foretold)
-        ratio = np.column_stack([np.ones(n), np.maximum(self.foretold, 0), np.minimum(self.foretold, 0)])
+        n = len(self.odometry_ratio)
+        ratio = np.column_stack(
+            [np.ones(n), np.maximum(self.odometry_ratio, 0), np.minimum(self.odometry_ratio, 0)]
+        )
         return np.concatenate(
             [np.repeat(ratio[:, None], 2, axis=1), self.counts.reshape(n, 2, 2 * KINDS)], axis=2
         )
+
+    def log_odds(self, weights: np.ndarray) -> np.ndarray:
+        """[n] L; NaN where nothing is said. weights: see `shipped_weights`."""
+        ways: np.ndarray = (self.features() * weights).sum(axis=2)
+        return ways.mean(axis=1)
 
 
 @cache
@@ -91,35 +92,25 @@ def shipped_weights() -> np.ndarray:
     return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
 
 
-def log_odds(evidence: SequenceEvidence, weights: np.ndarray) -> np.ndarray:
-    """[n] L; NaN where nothing is said.
-
-    Args:
-        weights: see `shipped_weights`.
-    """
-    ways: np.ndarray = (evidence.features() * weights).sum(axis=2)
-    return ways.mean(axis=1)
-
-
 def judge_sequences(
     graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray
 ) -> np.ndarray:
-    """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and where
-    the robot may be carried, as odometry then foretells nothing.
+    """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and
+    where the robot may be carried, as odometry then gives no prior.
 
     Args:
         fit, log, cut: see `MapSolution`.
     """
     if not graph.appearance.JUDGED or graph.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    return log_odds(sequence_evidence(graph, fit, log, cut, sequences), shipped_weights())
+    return sequence_evidence(graph, fit, log, cut, sequences).log_odds(shipped_weights())
 
 
 def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
     """Stores the log-odds of sequences [n] of the present map in the log; of those that have lost keyframes
     by merging the former ones stay."""
     whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
-    log.rate_anew(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
+    log.set_log_odds(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
 
 
 def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
@@ -149,22 +140,40 @@ def sequence_evidence(
     Args:
         fit, log, cut: see `MapSolution`. after: number of keyframes after a sequence that are known.
     """
+    config = graph.config
     found = SequenceEvidence(np.full(len(sequences), np.nan), np.zeros((len(sequences), 2, 2, KINDS)))
     ways = _ways(graph, log, cut, sequences, after)
-    drive = _drive(graph, fit, ways)
+    # Odometry into each keyframe without its systematic errors, and poses by odometry alone.
+    motion = correct_heading(graph.motion.rows, graph.length.rows, fit.bias, fit.turn_error)
+    variance, reckoned = (
+        graph.own_variances(),
+        graph.dead_reckoned(graph.start.bias, graph.start.turn_error),
+    )
+    asked = np.zeros(graph.count, bool)
+    for way in ways.values():
+        asked[way.low : way.high] = True
+    elsewhere = np.zeros(graph.count)  # see `_fit_elsewhere`; 0 beside all ways
+    elsewhere[asked] = _fit_elsewhere(graph, np.flatnonzero(asked))
     for k, way in ways.items():
-        found.foretold[k] = _foretold(graph, drive, way)
+        j, i, turn = way[:3]
+        x, y, heading = reckoned[: j + 1].T.copy()
+        between = np.ascontiguousarray(variance[i + 1 : j + 1, 1:])
+        gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
+        apart = np.empty(max(j - graph.guard, 1))
+        ratio = log_ratio(x, y, heading, between, i, j, -turn, gate, apart)
+        found.odometry_ratio[k] = float(np.clip(ratio, LEAST, MOST))
         reach = EXTENT + way.last - way.first + BEYOND
         older = slice(
             max(way.match - reach, 0), max(min(way.match + reach, way.middle - graph.guard), way.match) + 1
         )
         before = max(way.first - graph.guard, way.match) + 1
-        for g, (ground, begins) in enumerate(((fit.poses[:before], 0), (drive.reckoned[older], older.start))):
-            found.counts[k, g] = _views_on(graph, drive, way, ground, begins)
+        moved = motion[way.low : way.high], variance[way.low : way.high]
+        for g, (ground, begins) in enumerate(((fit.poses[:before], 0), (reckoned[older], older.start))):
+            found.counts[k, g] = _count_views(graph, way, *moved, elsewhere, ground, begins)
     return found
 
 
-class Way(NamedTuple):
+class _Way(NamedTuple):
     """The keyframes from `low` to before `high` whose views count, those of the sequence from `first` to
     `last`; keyframe `middle` is claimed to be where `match` was, turned by `turn`, rad."""
 
@@ -179,7 +188,7 @@ class Way(NamedTuple):
 
 def _ways(
     graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
-) -> dict[int, Way]:
+) -> dict[int, _Way]:
     """The ways of sequences [n], by their row; none of those that join keyframes between which the odometry
     is broken."""
     table, breaks = log.table(), np.flatnonzero(graph.is_broken(cut))
@@ -194,35 +203,10 @@ def _ways(
             first, last = int(rows[0, 0]), int(rows[-1, 0])
             low = max(first - BEYOND, int(breaks[part - 1]) if part else 0)
             high = min(last + after + 1, int(breaks[part]) if part < len(breaks) else graph.count)
-            ways[k] = Way(
+            ways[k] = _Way(
                 middle, match, -shift * graph.sector_angle, low, high, max(first, low), min(last, high - 1)
             )
     return ways
-
-
-class Drive(NamedTuple):
-    """The odometry and views of N keyframes.
-
-    Attributes:
-        motion, variance: [N, 3] into each keyframe, without systematic errors. reckoned: [N, 3] poses by
-            odometry. elsewhere: [N] see `_fit_elsewhere`; 0 beside all ways.
-    """
-
-    motion: np.ndarray
-    variance: np.ndarray
-    reckoned: np.ndarray
-    elsewhere: np.ndarray
-
-
-def _drive(graph: KeyframeGraph, fit: MapFit, ways: dict[int, Way]) -> Drive:
-    motion = correct_heading(graph.motion.rows, graph.length.rows, fit.bias, fit.turn_error)
-    reckoned = graph.dead_reckoned(graph.start.bias, graph.start.turn_error)
-    asked = np.zeros(graph.count, bool)
-    for way in ways.values():
-        asked[way.low : way.high] = True
-    elsewhere = np.zeros(graph.count)
-    elsewhere[asked] = _fit_elsewhere(graph, np.flatnonzero(asked))
-    return Drive(motion, graph.own_variances(), reckoned, elsewhere)
 
 
 def _fit_elsewhere(graph: KeyframeGraph, frames: np.ndarray) -> np.ndarray:
@@ -242,35 +226,37 @@ def _sees_half_turns(graph: KeyframeGraph) -> bool:
     return bool(np.cos(graph.sector_angle) < 0)
 
 
-def _views_on(graph: KeyframeGraph, drive: Drive, way: Way, ground: np.ndarray, begins: int) -> np.ndarray:
-    """[2, KINDS] of `SequenceEvidence`, over keyframes from number `begins` on at the poses `ground`."""
+def _count_views(
+    graph: KeyframeGraph,
+    way: _Way,
+    motion: np.ndarray,
+    variance: np.ndarray,
+    elsewhere: np.ndarray,
+    ground: np.ndarray,
+    begins: int,
+) -> np.ndarray:
+    """[2, KINDS] of `SequenceEvidence`, over keyframes from number `begins` on at the poses `ground`.
+
+    Args:
+        motion, variance: [W, 3] of the odometry into each keyframe of the way. elsewhere: [N] see
+            `_fit_elsewhere`.
+    """
     start = ground[way.match - begins] + [0.0, 0.0, way.turn]
     reach, turns = REACH * graph.cell, np.arange(1 + _sees_half_turns(graph)) * np.pi
-    motion, variance = drive.motion[way.low : way.high], drive.variance[way.low : way.high]
     middle, lag = way.middle - way.low, way.low - begins
     ahead = integrate(motion[middle + 1 :], start)
     back = integrate(inverse(motion[middle:0:-1]), start)[::-1]
     path = np.concatenate([back, start[None], ahead])
     limits = (STRAY + MOST_REACH) * reach, MOST_REACH_HEADING * REACH_HEADING * 1.5
     frame, other, turned = _pairs(path, ground, turns, *limits, lag, graph.guard)
-    fits = graph.log_odds(frame + way.low, other + begins, turned > 0) - drive.elsewhere[frame + way.low]
+    fits = graph.log_odds(frame + way.low, other + begins, turned > 0) - elsewhere[frame + way.low]
     offsets = np.searchsorted(frame, np.arange(len(path) + 1))
-    near = Near(ground, turns, offsets, other, turned, fits)
+    near = ground, turns, offsets, other, turned, fits
     bounds = reach, REACH_HEADING, graph.closure_variance(), EDGES
     kinds = _follow(start, middle, motion, variance, near, bounds, lag, graph.guard)
     within = np.zeros(len(path), bool)
     within[way.first - way.low : way.last + 1 - way.low] = True
     return np.stack([np.bincount(kinds[part & (kinds >= 0)], minlength=KINDS) for part in (within, ~within)])
-
-
-def _foretold(graph: KeyframeGraph, drive: Drive, way: Way) -> float:
-    """R of a claim."""
-    config, (j, i, turn) = graph.config, way[:3]
-    x, y, heading = drive.reckoned[: j + 1].T.copy()
-    variance = np.ascontiguousarray(drive.variance[i + 1 : j + 1, 1:])
-    gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
-    apart = np.empty(max(j - graph.guard, 1))
-    return float(np.clip(log_ratio(x, y, heading, variance, i, j, -turn, gate, apart), LEAST, MOST))
 
 
 @compiled
@@ -294,7 +280,7 @@ def _pairs(
     close_x, close_y = np.empty(len(ground)), np.empty(len(ground))
     apart = np.empty(len(ground))
     for k in range(len(path)):
-        if k % BOX == 0:
+        if k % BOX == 0:  # the keyframes in the box around the next `BOX` poses of the path
             left, right, below, above, around = np.inf, -np.inf, np.inf, -np.inf, 0
             for at in range(k, min(k + BOX, len(path))):
                 left, right = min(left, path[at, 0] - reach), max(right, path[at, 0] + reach)
@@ -303,7 +289,7 @@ def _pairs(
                 x, y = ground[g, 0], ground[g, 1]
                 close[around], close_x[around], close_y[around] = g, x, y
                 around += int((x >= left) & (x <= right) & (y >= below) & (y <= above))
-        for near in range(around):
+        for near in range(around):  # squared distances; a loop of its own is vectorised
             apart[near] = (close_x[near] - path[k, 0]) ** 2 + (close_y[near] - path[k, 1]) ** 2
         for near in range(around):
             g = close[near]
@@ -320,21 +306,10 @@ def _pairs(
     return found[0, :count].copy(), found[1, :count].copy(), found[2, :count].copy()
 
 
-class Near(NamedTuple):
-    """The keyframes [n] that are compared with those [W] of a way.
-
-    Attributes:
-        ground: [G, 3] poses. turns: [S] rad, by which they may be seen turned. offsets: [W + 1] of the rows
-            of `other`, `turned` and `fits` [n] that belong to each keyframe of the way: the one compared
-            with, the number of its turn, and the gain there, nat.
-    """
-
-    ground: np.ndarray
-    turns: np.ndarray
-    offsets: np.ndarray
-    other: np.ndarray
-    turned: np.ndarray
-    fits: np.ndarray
+_Near = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""What keyframes [W] of a way are compared with: poses [G, 3] of the ground; turns [S] by which it may be
+seen turned, rad; offsets [W + 1] of the rows [n] of the last three that belong to each keyframe of the way:
+the keyframe compared with, the number of its turn, and the gain there, nat."""
 
 
 @compiled
@@ -361,8 +336,8 @@ def _is_apart(pose: np.ndarray, ground: np.ndarray, reach: float, frame: int, gu
 
 
 @compiled
-def _look(
-    pose: np.ndarray, near: Near, frame: int, reach: float, turn: float, on_way: tuple[float, float]
+def _compare_view(
+    pose: np.ndarray, near: _Near, frame: int, reach: float, turn: float, on_way: tuple[float, float]
 ) -> tuple[float, np.ndarray, bool]:
     """Compares a keyframe of a way with those within `reach` (m) and `turn` (rad).
 
@@ -370,16 +345,17 @@ def _look(
         the best gain, -inf without any; [3] how far the pose is from there, the mean weighted by the
         likelihoods; whether a keyframe is within `on_way`, m and rad.
     """
+    ground, turns, offsets, other, turned, fits = near
     best, weight, off, met = -np.inf, 0.0, np.zeros(3), False
-    for k in range(near.offsets[frame], near.offsets[frame + 1]):
-        g = near.other[k]
-        x, y = near.ground[g, 0] - pose[0], near.ground[g, 1] - pose[1]
-        angle = _turned(near.ground[g, 2] + near.turns[near.turned[k]] - pose[2])
+    for k in range(offsets[frame], offsets[frame + 1]):
+        g = other[k]
+        x, y = ground[g, 0] - pose[0], ground[g, 1] - pose[1]
+        angle = _turned(ground[g, 2] + turns[turned[k]] - pose[2])
         if x * x + y * y >= reach * reach or abs(angle) >= turn:
             continue
         if x * x + y * y < on_way[0] * on_way[0] and abs(angle) < on_way[1]:
             met = True
-        fit = near.fits[k]
+        fit = fits[k]
         if fit > best:
             scale = np.exp(best - fit) if weight > 0 else 0.0
             weight, off, best = weight * scale, off * scale, fit
@@ -391,7 +367,7 @@ def _look(
 
 @compiled
 def _follow(
-    start: np.ndarray, middle: int, motion: np.ndarray, variance: np.ndarray, near: Near,
+    start: np.ndarray, middle: int, motion: np.ndarray, variance: np.ndarray, near: _Near,
     bounds: tuple[float, float, np.ndarray, np.ndarray], lag: int, guard: int,
 ) -> np.ndarray:  # fmt: skip
     """[W] kind of each view on the way, -1 for none; it is followed from its keyframe `middle`.
@@ -404,6 +380,7 @@ def _follow(
     kinds = np.full(len(motion), -1)
     reach, reach_heading, spread, edges = bounds
     for onwards in (True, False):
+        # The pose with its variances of position and heading, from the claim on and back.
         pose, place, heading = start.copy(), spread[0], spread[2]
         frame = middle if onwards else middle - 1
         while 0 <= frame < len(motion):
@@ -414,9 +391,9 @@ def _follow(
                 heading += variance[row, 2]
             far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
             turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
-            best, off, on_way = _look(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
+            best, off, on_way = _compare_view(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
             seen = pose.copy()
-            if best > 0:
+            if best > 0:  # Kalman update, position and heading apart
                 share, again = place / (place + spread[0]), heading / (heading + spread[2])
                 pose[0] += share * off[0]
                 pose[1] += share * off[1]
@@ -424,7 +401,7 @@ def _follow(
                 place, heading = place * (1 - share), heading * (1 - again)
             if on_way:
                 kinds[frame] = np.searchsorted(edges, best)
-            elif _is_apart(seen, near.ground, reach, frame + lag, guard):
+            elif _is_apart(seen, near[0], reach, frame + lag, guard):
                 kinds[frame] = len(edges) + 2
             elif best < edges[0] and best > -np.inf:
                 kinds[frame] = 0

@@ -1,20 +1,11 @@
 """Selection among all closure sequences, by the cost of the map with each of them accepted or refused.
 
 Refusing a sequence costs its evidence, accepting it costs the strain on the map. So the robust cost of a
-sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total cost
-are selected. The cost has many local minima, so it is minimised from several starts. For a robot that may be
-carried, the odometry is cut where that saves more than the cost of a cut. The rules are ours; robust weights
-by Geman & McClure 1985, several starts after Latif et al. 2013.
-
-Several maps that follow the closure sequences in the order of time.
-
-The cost of a selection of closures has many local minima: a wrong sequence accepted early bends the map so
-far that the true ones after it look wrong. So a few maps are kept side by side. Each takes every new
-sequence as it fits, and once more with the sequence forced to fit, which then has to pay for itself; the
-cheapest maps are kept, and beside them a few that refuse what all cheaper ones accept: weak sequences, which
-can be taken or left, make many cheap maps, and these would push out the only one that a strong false sequence
-has not bent. Source: a beam search over the hypotheses of multiple hypothesis tracking (Reid
-1979); that its nodes are robust maps is ours.
+sequence is at most twice its evidence (in chi-square), and the sequences of the map with the least total
+cost are selected. Robust weights: Geman & McClure 1985. The cost has many local minima, so it is minimised
+from several starts (after Latif et al. 2013): the present map, and maps that follow the sequences in the
+order of time (`MapHypotheses`, a beam search as in multiple hypothesis tracking, Reid 1979). For a robot
+that may be carried, the odometry is cut where that saves more than the cost of a cut.
 """
 
 from __future__ import annotations
@@ -45,8 +36,6 @@ TRIALS = 5
 """Number of sequences at which a cut is tried before the best is taken."""
 COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
-LOOSE = 1e4
-"""Standard deviation of the odometry at a cut, m and rad."""
 
 
 ViewsCost = Callable[[np.ndarray], float]
@@ -57,9 +46,11 @@ class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
     Attributes:
-        measurements: with the closures of all R sequences. evidence: [R] log-likelihood ratios. first, last:
-            [R] first and last keyframe of each sequence. views_cost: what the views say against poses [N, 3],
-            chi-square. place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
+        measurements: with the closures of all R sequences.
+        evidence: [R] log-likelihood ratios.
+        first, last: [R] first and last keyframe of each sequence.
+        views_cost: what the views say against poses [N, 3], chi-square.
+        place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
     """
 
     measurements: MapProblem
@@ -71,8 +62,8 @@ class SelectionProblem(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of the
-    odometry: (keyframe after the cut, sequence that shows it)."""
+    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of
+    the odometry: (keyframe after the cut, sequence that shows it)."""
 
     fit: MapFit
     cost: float
@@ -80,19 +71,26 @@ class Selection(NamedTuple):
 
 
 FindCut = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
-"""Finds the keyframe before which the odometry is cut. Arguments: all poses [N, 3]; poses [n, 3] by odometry
-of the keyframes that follow a keyframe; the motion [3] that moves the last of them to where it was
+"""Finds the keyframe before which the odometry is cut. Arguments: all poses [N, 3]; poses [n, 3] by
+odometry of the keyframes that follow a keyframe; the motion [3] that moves the last of them to where it was
 recognised; the number of that keyframe."""
 
 
 def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selection:
     """The selection with the least cost, without cuts.
 
+    Each start is optimised with all sequences at once; robust weights decide which of them count. A
+    sequence is accepted in the result if its weight is above `ACCEPTED_WEIGHT`.
+
     Args:
+        case: the sequences and the odometry.
         starts: maps to start from; the first is the current map.
+
+    Returns:
+        the cheapest of the optimised maps.
     """
     system = System(case.measurements)
-    return min((_optimise(case, system, start, ()) for start in starts), key=_cost)
+    return min((_optimise(case, system, start, ()) for start in starts), key=lambda found: found.cost)
 
 
 def select_closures_and_cuts(
@@ -100,47 +98,44 @@ def select_closures_and_cuts(
 ) -> Selection:
     """The selection with the least cost for a robot that may be carried: with cuts of the odometry.
 
+    The odometry is cut where it is strained or contradicted most, one cut at a time, while that lowers the
+    cost of the map by more than a cut costs (`CUT`).
+
     Args:
-        starts: see `select_closures`. find: see `FindCut`. earlier: cuts (keyframe, sequence) of the current
-            map.
+        case: the sequences and the odometry.
+        starts: see `select_closures`.
+        find: see `FindCut`.
+        earlier: cuts (keyframe, sequence) of the current map.
+
+    Returns:
+        the selection with its cuts.
     """
     best = select_closures(case, starts)
     if earlier:
-        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=_cost)
-    return _with_cuts(case, best, find)
-
-
-def _cost(selection: Selection) -> float:
-    return selection.cost
-
-
-def _with_cuts(case: SelectionProblem, best: Selection, find: FindCut) -> Selection:
-    """Cuts the odometry where it is strained or contradicted most, while that lowers the cost."""
+        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=lambda found: found.cost)
     while True:
         strain = _strain(case, best)
         strained = [
             sequence for sequence in np.argsort(-strain)[:TRIALS].tolist() if strain[sequence] >= MIN_STRAIN
         ]
         found = [selection for sequence in strained for selection in _cut(case, best, sequence, find)]
-        cut = _nearest(case, best, found) if found else best
+        if not found:
+            return best
+        # Of equally good cuts the one that the earliest sequence shows: a cut costs the same anywhere between
+        # two sequences, and views find it better where less odometry lies between.
+        least, number = min(selection.cost for selection in found), len(best.cuts)
+        alike = [selection for selection in found if selection.cost <= least + COST_TOLERANCE]
+        cut = min(alike, key=lambda selection: case.first[selection.cuts[number][1]])
         if cut.cost >= best.cost:
             return best
         best = cut
 
 
-def _nearest(case: SelectionProblem, best: Selection, found: list[Selection]) -> Selection:
-    """The cheapest selection; of equally good ones the one whose cut is shown by the earliest sequence. A cut
-    costs the same anywhere between two sequences, and views find it better where less odometry lies
-    between."""
-    least = min(selection.cost for selection in found)
-    alike = [selection for selection in found if selection.cost <= least + COST_TOLERANCE]
-    return min(alike, key=lambda selection: case.first[selection.cuts[len(best.cuts)][1]])
-
-
 def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
     """[R] squared deviation between the start of each sequence and the odometry since the last accepted
-    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
-    chain, closures, *_ = cut_odometry(case.measurements, best.cuts)
+    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide
+    it."""
+    chain, closures, *_ = case.measurements.cut_at([frame for frame, _ in best.cuts])
     strain = np.zeros(len(case.evidence))
     for sequence in range(len(strain)):
         since, first = _since(case, best, sequence), int(case.first[sequence])
@@ -224,18 +219,9 @@ def _carry(
     return frame, moved
 
 
-def cut_odometry(problem: MapProblem, cuts: tuple[tuple[int, int], ...]) -> MapProblem:
-    """The problem with loose odometry at the cuts (keyframe, sequence)."""
-    if not cuts:
-        return problem
-    variance = problem.chain.variance.copy()
-    variance[[frame - 1 for frame, _ in cuts]] = LOOSE**2
-    return problem._replace(chain=problem.chain._replace(variance=variance))
-
-
 def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
     """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
-    return _optimise(case, System(cut_odometry(case.measurements, cuts)), start, cuts)
+    return _optimise(case, System(case.measurements.cut_at([frame for frame, _ in cuts])), start, cuts)
 
 
 def _optimise(
@@ -244,20 +230,6 @@ def _optimise(
     fit = system.solve(start, STEPS, FINE)
     cost = system.robust_cost(fit) + case.views_cost(fit.poses)
     return Selection(fit, cost + CUT * len(cuts), cuts)
-
-
-def choose_sequences(closures: LoopClosures, sequences: np.ndarray) -> LoopClosures:
-    """The closures of the sequences marked in [R] bool."""
-    rows = sequences[closures.sequence]
-    number = np.cumsum(sequences) - 1
-    return closures._replace(
-        i=closures.i[rows],
-        j=closures.j[rows],
-        turn=closures.turn[rows],
-        sequence=number[closures.sequence[rows]],
-        scale=closures.scale[sequences],
-        cost_limit=np.broadcast_to(closures.cost_limit, closures.scale.shape)[sequences],
-    )
 
 
 KEPT = 4
@@ -298,7 +270,12 @@ class MapHypotheses(Checkpointed):
         Args:
             case: with R sequences. sequences: [R] their numbers.
         """
-        self._extend(case.measurements)
+        # All maps are continued by odometry; the first one starts with the means of the calibration.
+        problem, since = case.measurements, self.poses.shape[1] - 1
+        if not since:
+            self._calibration = np.array([[problem.prior.bias, problem.prior.turn_error]])
+        onwards = [integrate(fit.corrected(problem.chain)[since:], fit.poses[-1]) for fit in self._fits(0)]
+        self.poses = np.concatenate([self.poses, np.stack(onwards)], axis=1)
         known = np.isin(sequences, self._followed)
         fits = [fit._replace(poses=case.place(fit.poses)) for fit in self._fits(int(known.sum()))]
         for k in np.flatnonzero(~known).tolist():
@@ -320,14 +297,6 @@ class MapHypotheses(Checkpointed):
             for poses, (bias, turn_error) in zip(self.poses, self._calibration.tolist(), strict=True)
         ]
 
-    def _extend(self, problem: MapProblem) -> None:
-        """Continues all maps by odometry; the first one starts with the means of the calibration."""
-        since = self.poses.shape[1] - 1
-        if not since:
-            self._calibration = np.array([[problem.prior.bias, problem.prior.turn_error]])
-        onwards = [integrate(fit.corrected(problem.chain)[since:], fit.poses[-1]) for fit in self._fits(0)]
-        self.poses = np.concatenate([self.poses, np.stack(onwards)], axis=1)
-
 
 def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: int) -> list[MapFit]:
     """The cheapest maps after one more sequence.
@@ -338,10 +307,17 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
     known = known.copy()
     known[new] = True
     problem = case.measurements
-    part = problem._replace(closures=choose_sequences(problem.closures, known))
+    part = problem._replace(closures=problem.closures.of_sequences(known))
     at = int(known[:new].sum())
     system, maps = System(part), []
-    forcing = system.with_problem(part._replace(closures=_force(part.closures, at)))
+    # The same closures, of which those of the new sequence can hardly be refused.
+    factor = np.ones(len(part.closures.scale))
+    factor[at] = FORCED
+    scale = part.closures.scale * factor
+    limit = np.maximum(part.closures.cost_limit, np.where(factor > 1, 1.5 * scale, 0.0))
+    forcing = system.with_problem(
+        part._replace(closures=part.closures._replace(scale=scale, cost_limit=limit))
+    )
     for fit in fits:
         free = system.solve(fit, STEPS, FINE)
         maps.append(free)
@@ -351,7 +327,12 @@ def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: 
     costs = [system.robust_cost(fit) for fit in maps]
     different: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
-        if not any(_apart(maps[k], maps[other], part.closures) < ALIKE for other in different):
+        for other in different:  # the largest difference of a keyframe, standard deviations of a closure
+            apart = maps[k].poses - maps[other].poses
+            apart[:, 2] = wrap(apart[:, 2])
+            if float(np.sqrt((apart**2 / part.closures.variance).sum(axis=1).max())) < ALIKE:
+                break
+        else:
             different.append(k)
     if len(different) > 1:  # the views, dearer to ask, only where there is a choice
         different.sort(key=lambda k: costs[k] + case.views_cost(maps[k].poses))
@@ -367,19 +348,3 @@ def with_doubts(maps: list[MapFit]) -> list[MapFit]:
         if len(kept) < KEPT + DOUBTS and (shared & (map.weights < FITS)).any():
             kept.append(map)
     return kept
-
-
-def _force(closures: LoopClosures, sequence: int) -> LoopClosures:
-    """The closures, one sequence of which can hardly be refused."""
-    factor = np.ones(len(closures.scale))
-    factor[sequence] = FORCED
-    scale = closures.scale * factor
-    limit = np.maximum(closures.cost_limit, np.where(factor > 1, 1.5 * scale, 0.0))
-    return closures._replace(scale=scale, cost_limit=limit)
-
-
-def _apart(one: MapFit, other: MapFit, closures: LoopClosures) -> float:
-    """The largest difference of a keyframe, standard deviations of a closure."""
-    apart = one.poses - other.poses
-    apart[:, 2] = wrap(apart[:, 2])
-    return float(np.sqrt((apart**2 / closures.variance).sum(axis=1).max()))

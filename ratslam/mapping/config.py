@@ -88,11 +88,11 @@ class KeyframeMapConfig(Settings):
     may_be_carried: bool = False
     """Whether the robot may be carried during a session: only then the odometry is cut."""
     tie_log_odds: PositiveFloat = 6.5
-    """Log-odds at which a piece of the map is tied to another one, beyond the logarithm of the number of its
-    places; below half of them the tie is undone."""
+    """Log-odds at which a piece of the map is tied to another one, beyond the logarithm of the number of
+    its places; below half of them the tie is undone."""
     break_length: PositiveInt = 32
-    """Least number of candidates of a sequence that cuts the odometry of a robot that may be carried, without
-    selection."""
+    """Least number of candidates of a sequence that cuts the odometry of a robot that may be carried,
+    without selection."""
     break_score: PositiveFloat = 100.0
     """Least evidence of such a sequence."""
     sequence_agreement: NonNegativeFloat = 0.0
@@ -112,8 +112,8 @@ class KeyframeMapConfig(Settings):
     """Largest chi-square of a single closure in the selection."""
     merge_stood: NonNegativeInt = 4
     """Number of selections in a row that a sequence must stand before the keyframes it confirms are merged
-    with older ones at the same pose; without selections, that it must stand accepted, every 50 keyframes. 0,
-    and with `select_every` of 1 to 10: keyframes are not merged."""
+    with older ones at the same pose; without selections, that it must stand accepted, every 50 keyframes.
+    0, and with `select_every` of 1 to 10: keyframes are not merged."""
     merge_newest: PositiveInt = 1000
     """Number of newest keyframes that are not merged."""
     solve_every: PositiveInt = 20

@@ -1,12 +1,12 @@
 """Experiences: groups of keyframes, the places of the keyframe map.
 
-A new experience is created where none is near. A known one is reached by a confirmed closure, or by the map's
-pose shortly after such a closure; recall alone never joins two places.
+A new experience is created where none is near. A known one is reached by a confirmed closure, or by the
+map's pose shortly after such a closure; recall alone never joins two places.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,14 +18,6 @@ from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:
     import networkx
-
-
-class ExperienceChange(NamedTuple):
-    """The present experience, the one before, and the action that led to it."""
-
-    place: int
-    previous: int
-    action: Action
 
 
 class Experiences(Checkpointed):
@@ -46,14 +38,15 @@ class Experiences(Checkpointed):
         self._link_of: dict[tuple[int, int], int] = {}
         self._current = -1
 
-    def stay(self) -> ExperienceChange:
-        """The result of a step without a keyframe."""
-        return ExperienceChange(self._current, self._current, Action.NONE)
+    @property
+    def current(self) -> int:
+        """The experience of the newest keyframe, -1 before the first."""
+        return self._current
 
     def arrive(
         self, poses: np.ndarray, frame: int, matched: int, reliable: bool, begins: bool = False
-    ) -> ExperienceChange:
-        """The experience of a new keyframe.
+    ) -> tuple[int, int, Action]:
+        """The experience of a new keyframe, the one before, and the action that led to it.
 
         Args:
             poses: [N, 3] of all keyframes. matched: the keyframe of a confirmed closure, or -1.
@@ -61,7 +54,16 @@ class Experiences(Checkpointed):
                 with the keyframe: no link leads to its experience.
         """
         previous = -1 if begins else self._current
-        place = int(self._place.rows[matched]) if matched >= 0 else self._near(poses, frame, reliable)
+        place = int(self._place.rows[matched]) if matched >= 0 else -1
+        if matched < 0 and len(self._frame.rows):
+            # The current experience if in reach, else the nearest in reach if the pose is reliable.
+            held, offset = self._frame.rows, self._offset.rows
+            far = _measure_distances(poses, held, offset, frame, self.radius, self.heading)
+            best = int(np.argmin(far))
+            if self._current >= 0 and far[self._current] <= 1:
+                place = self._current
+            elif reliable and far[best] <= 1:
+                place = best
         action = Action.NONE
         if place < 0:
             place, action = len(self._frame.rows), Action.CREATE
@@ -77,7 +79,7 @@ class Experiences(Checkpointed):
                 self._link.append((previous, place, 0))
             self._link.rows[self._link_of[previous, place], 2] += 1
         self._current = place
-        return ExperienceChange(place, previous, action)
+        return place, previous, action
 
     def merge(self, source: np.ndarray, onto: np.ndarray, offset: np.ndarray) -> None:
         """Follows a merge of keyframes, see `MergedRows`.
@@ -94,8 +96,8 @@ class Experiences(Checkpointed):
 
         Args:
             row: [E] keyframe of the map that each keyframe ever taken is or is merged with; none is merged
-                thereafter. own: [N] number of each keyframe of the map among all ever taken. number: [E] new
-                number of each of these, -1 if it does not remain. poses: [E, 3] of all.
+                thereafter. own: [N] number of each keyframe of the map among all ever taken. number: [E]
+                new number of each of these, -1 if it does not remain. poses: [E, 3] of all.
         """
         place, taken = self._place.rows[row], np.flatnonzero(number >= 0)
         places, first = np.unique(place[taken], return_index=True)
@@ -117,12 +119,13 @@ class Experiences(Checkpointed):
         traversals.
 
         Args:
-            poses: [N, 3] of the keyframes. taken: [N] their numbers among all ever taken. piece: [N] of each.
+            poses: [N, 3] of the keyframes. taken: [N] their numbers among all ever taken. piece: [N] of
+            each.
         """
         import networkx  # slow to import
 
         graph: networkx.DiGraph = networkx.DiGraph()
-        places = self._poses(poses)
+        places = compose(poses[self._frame.rows], self._offset.rows)
         for place, frame in enumerate(self._frame.rows.tolist()):
             x, y, heading = map(float, places[place])
             keyframe = int(taken[frame])
@@ -134,21 +137,6 @@ class Experiences(Checkpointed):
             graph.add_edge(a, b, dx=dx, dy=dy, dtheta=dtheta, traversals=traversals)
         return graph
 
-    def _poses(self, poses: np.ndarray) -> np.ndarray:
-        """[E, 3] poses of the experiences."""
-        return compose(poses[self._frame.rows], self._offset.rows)
-
-    def _near(self, poses: np.ndarray, frame: int, reliable: bool) -> int:
-        """The current experience if in reach, else the nearest in reach if the pose is reliable, or -1."""
-        if not len(self._frame.rows):
-            return -1
-        held, offset = self._frame.rows, self._offset.rows
-        far = measure_distances(poses, held, offset, frame, self.radius, self.heading)
-        if self._current >= 0 and far[self._current] <= 1:
-            return self._current
-        best = int(np.argmin(far))
-        return best if reliable and far[best] <= 1 else -1
-
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
@@ -156,7 +144,7 @@ class Experiences(Checkpointed):
 
 
 @compiled
-def measure_distances(
+def _measure_distances(
     poses: np.ndarray, held: np.ndarray, offset: np.ndarray, frame: int, radius: float, turn: float
 ) -> np.ndarray:
     """[E] distances of a keyframe from the experiences at `offset` [E, 3] in the frames of keyframes `held`

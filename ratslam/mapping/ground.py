@@ -1,13 +1,10 @@
-"""The keyframes of a finished map as ground on which a session is placed.
+"""The keyframes of a map as ground, pose hypotheses that move over it, and the log-odds that they are right.
 
-Following a supposed pose through a session: how its views fit the ground that it would be on.
-
-Log-odds that a session is where it is supposed to be, learned from the map's own revisits.
-
-A view's *gain* at a supposed pose is its log-likelihood there less that at a new place. Gains of true poses
-are high; of false poses that happen to look alike they are lower and scattered. Both distributions are
-counted in the map itself: at revisits, and at the other places that look most alike for a while. So the odds
-need no constant of the sensor. The method is ours.
+A pose hypothesis is moved by odometry and corrected by the keyframes near by, weighted by the likelihoods
+of the view there (an extended Kalman filter; Smith & Cheeseman 1986). A view's *gain* at a pose is its
+log-likelihood there less that at a new place. Gains of true poses are high; of false poses that happen to
+look alike they are lower and scattered. Both distributions are counted in the map itself, at revisits and
+at the other places that look most alike for a while, so the odds need no constant of the sensor.
 """
 
 from __future__ import annotations
@@ -50,8 +47,8 @@ class Ground(NamedTuple):
 
     Attributes:
         poses: [N, 3] m, m, rad. turns: [S] heading of the robot less that of the keyframe at each sector
-            shift, rad. reach, reach_heading: m and rad. variance: [3] of a pose found by comparing views, m²,
-            m², rad². near_share: share of the reaches within which a view counts by its gain.
+            shift, rad. reach, reach_heading: m and rad. variance: [3] of a pose found by comparing views,
+            m², m², rad². near_share: share of the reaches within which a view counts by its gain.
     """
 
     poses: np.ndarray
@@ -139,13 +136,13 @@ def ground_of(
 
 
 DEVIATIONS = 2.0
-"""Standard deviations of a supposed pose by which the reach of the ground grows."""
+"""Standard deviations of a pose hypothesis by which the reach of the ground grows."""
 MOST_REACH, MOST_REACH_HEADING = 3.0, 2.0
 """Largest reaches, as multiples of those of the ground."""
 
 
-class Supposed(NamedTuple):
-    """A supposed pose in the map: mean [3] m, m, rad; covariance [3, 3]. Or P of them: [P, 3] and
+class PoseHypothesis(NamedTuple):
+    """A pose hypothesis in the map: mean [3] m, m, rad; covariance [3, 3]. Or P of them: [P, 3] and
     [P, 3, 3]."""
 
     pose: np.ndarray
@@ -165,6 +162,21 @@ class Supposed(NamedTuple):
         spread = self.covariance + np.diag(ground.variance)
         _, volume = np.linalg.slogdet(spread)
         return float(np.log(ground.variance).sum() - volume - error @ np.linalg.solve(spread, error)) / 2
+
+    def moved(self, by: Motion) -> PoseHypothesis:
+        """The pose moved by odometry, to first order in its noise (Smith and Cheeseman 1986)."""
+        if not by.motion.any() and not by.variance.any():
+            return self
+        turn, lever = np.zeros((2, *self.covariance.shape))
+        turn[..., 0, 0] = turn[..., 1, 1] = np.cos(self.pose[..., 2])
+        turn[..., 1, 0] = np.sin(self.pose[..., 2])
+        turn[..., 0, 1], turn[..., 2, 2] = -turn[..., 1, 0], 1.0
+        ahead = turn @ by.motion
+        lever[..., range(3), range(3)] = 1.0
+        lever[..., 0, 2], lever[..., 1, 2] = -ahead[..., 1], ahead[..., 0]
+        covariance = lever @ self.covariance @ np.swapaxes(lever, -1, -2)
+        covariance += (turn * by.variance) @ np.swapaxes(turn, -1, -2)
+        return PoseHypothesis(compose(self.pose, by.motion), covariance)
 
     def deviations(self) -> tuple[float, float]:
         """Standard deviations: of the position in the direction where it is largest, m; of the heading,
@@ -186,13 +198,14 @@ class Motion(NamedTuple):
         return Motion(inverse(self.motion), self.variance)
 
 
-STILL = Motion(np.zeros(3), np.zeros(3))
+NO_MOTION = Motion(np.zeros(3), np.zeros(3))
 
 
 def advance(
-    ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray | None
-) -> tuple[Supposed, float | None]:
-    """Moves a supposed pose, and corrects it by the keyframes near by, weighted by how well their views fit.
+    ground: Ground, at: PoseHypothesis, moved: Motion, gain: np.ndarray | None
+) -> tuple[PoseHypothesis, float | None]:
+    """Moves a pose hypothesis, and corrects it by the keyframes near by, weighted by how well their views
+    fit.
 
     Args:
         gain: [S, N] log-likelihood of the newest view at each keyframe less that at a new place, nat; None
@@ -202,7 +215,7 @@ def advance(
         the pose thereafter; the gain of the best keyframe near by, nat, NaN where no keyframe is near, None
         of a view that shows nothing.
     """
-    at = move(at, moved)
+    at = at.moved(moved)
     if gain is None:
         return at, None
     shift, frame = ground.near(at.pose, *_reaches(ground, *at.deviations()))
@@ -215,13 +228,20 @@ def advance(
     weight = np.exp(gains - best)
     error = ground.claims(shift, frame) - at.pose
     error[:, 2] = wrap(error[:, 2])
-    return _correct(at, (weight / weight.sum()) @ error, ground.variance), best
+    # The Kalman filter's update by the mean of the differences.
+    share = np.linalg.solve((at.covariance + np.diag(ground.variance)).T, at.covariance.T).T
+    pose = at.pose + share @ ((weight / weight.sum()) @ error)
+    pose[2] = wrap(pose[2])
+    covariance = at.covariance - share @ at.covariance
+    return PoseHypothesis(pose, (covariance + covariance.T) / 2), best
 
 
-def advance_all(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray) -> tuple[Supposed, np.ndarray]:
-    """`advance` for P supposed poses that move alike, and the gains [P], nat. Most of many poses fit
+def advance_all(
+    ground: Ground, at: PoseHypothesis, moved: Motion, gain: np.ndarray
+) -> tuple[PoseHypothesis, np.ndarray]:
+    """`advance` for P pose hypotheses that move alike, and the gains [P], nat. Most of many poses fit
     nowhere: only the others are corrected, one by one."""
-    pose, covariance = (each.copy() for each in move(at, moved))
+    pose, covariance = (each.copy() for each in at.moved(moved))
     (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(covariance, 0, -1)
     position = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
     one, shift, frame = ground.near_all(pose, *_reaches(ground, position, np.sqrt(heading)))
@@ -230,9 +250,9 @@ def advance_all(ground: Ground, at: Supposed, moved: Motion, gain: np.ndarray) -
     if len(near):
         best[near] = np.maximum.reduceat(gain[shift, frame].astype(float), first)
     for k in np.flatnonzero(best > 0).tolist():
-        corrected, _ = advance(ground, Supposed(at.pose[k], at.covariance[k]), moved, gain)
+        corrected, _ = advance(ground, PoseHypothesis(at.pose[k], at.covariance[k]), moved, gain)
         pose[k], covariance[k] = corrected
-    return Supposed(pose, covariance), best
+    return PoseHypothesis(pose, covariance), best
 
 
 def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
@@ -240,31 +260,6 @@ def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
     reach = np.minimum(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
     most = MOST_REACH_HEADING * ground.reach_heading
     return reach, np.minimum(ground.reach_heading + DEVIATIONS * heading, most)
-
-
-def move(at: Supposed, moved: Motion) -> Supposed:
-    """A pose moved by odometry, to first order in its noise (Smith and Cheeseman 1986)."""
-    if not moved.motion.any() and not moved.variance.any():
-        return at
-    turn, lever = np.zeros((2, *at.covariance.shape))
-    turn[..., 0, 0] = turn[..., 1, 1] = np.cos(at.pose[..., 2])
-    turn[..., 1, 0] = np.sin(at.pose[..., 2])
-    turn[..., 0, 1], turn[..., 2, 2] = -turn[..., 1, 0], 1.0
-    ahead = turn @ moved.motion
-    lever[..., range(3), range(3)] = 1.0
-    lever[..., 0, 2], lever[..., 1, 2] = -ahead[..., 1], ahead[..., 0]
-    covariance = lever @ at.covariance @ np.swapaxes(lever, -1, -2)
-    covariance += (turn * moved.variance) @ np.swapaxes(turn, -1, -2)
-    return Supposed(compose(at.pose, moved.motion), covariance)
-
-
-def _correct(at: Supposed, error: np.ndarray, variance: np.ndarray) -> Supposed:
-    """The Kalman filter's update by a measured difference [3] with this variance [3]."""
-    share = np.linalg.solve((at.covariance + np.diag(variance)).T, at.covariance.T).T
-    pose = at.pose + share @ error
-    pose[2] = wrap(pose[2])
-    covariance = at.covariance - share @ at.covariance
-    return Supposed(pose, (covariance + covariance.T) / 2)
 
 
 BINS = 24
@@ -277,7 +272,7 @@ more."""
 OUTLIERS = 0.04
 """Share of either distribution that is drawn from the other: something has changed, or was misread."""
 LEAVING = -2.0
-"""Log-odds of leaving mapped ground: false supposed poses do so more often than true ones."""
+"""Log-odds of leaving mapped ground: false pose hypotheses do so more often than true ones."""
 
 
 class GainPrior(NamedTuple):
@@ -309,8 +304,11 @@ PRIOR = GainPrior(true=(1.9, 0.8), false=(0.5, 1.6))
 def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIOR) -> GainOdds:
     """Log-odds of gains from those counted at true poses [n] and at false ones [m]."""
     from scipy.optimize import isotonic_regression  # slow to import
+    from scipy.special import ndtri
 
-    prior_true, prior_false = (_quantiles(*each) for each in prior)
+    # Both distributions of the prior as evenly spread quantiles.
+    share = (np.arange(64) + 0.5) / 64
+    prior_true, prior_false = (mean + deviation * ndtri(share) for mean, deviation in prior)
     pooled = np.concatenate([true, false, prior_true, prior_false])
     low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
     edges = np.linspace(low, high, BINS - 1)
@@ -326,14 +324,6 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIO
     return GainOdds(edges, odds, float(same @ odds))
 
 
-def _quantiles(mean: float, deviation: float) -> np.ndarray:
-    """Evenly spread quantiles of a normal distribution."""
-    from scipy.special import ndtri  # slow to import
-
-    share = (np.arange(64) + 0.5) / 64
-    return mean + deviation * ndtri(share)
-
-
 def _density(edges: np.ndarray, counted: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """[BINS] smoothed shares of the counted gains and of the prior."""
     count = np.bincount(np.searchsorted(edges, counted), minlength=BINS).astype(float)
@@ -343,7 +333,8 @@ def _density(edges: np.ndarray, counted: np.ndarray, prior: np.ndarray) -> np.nd
 
 
 GroundKey = tuple[int, int, int]
-"""What tells a ground from the others of a map: its number of keyframes, its first and its last keyframe."""
+"""What tells a ground from the others of a map: its number of keyframes, its first and its last
+keyframe."""
 
 
 class LearnedOdds(Checkpointed):
@@ -388,7 +379,7 @@ COMMON_OF_PIECE = 0.25
 """The same factor for a piece of a growing map."""
 
 
-class Weighing(NamedTuple):
+class GainWeighting(NamedTuple):
     """Attributes:
     weigh: from gains [..., S, N] of views on a whole ground to those that are counted. prior: of these.
     matching: mean of those before one above which a false pose still looks right, nat.
@@ -399,24 +390,20 @@ class Weighing(NamedTuple):
     matching: float
 
 
-def _as_they_are(gain: np.ndarray) -> np.ndarray:
-    return gain
-
-
 def less_where_common(gain: np.ndarray, share: float = COMMON) -> np.ndarray:
-    """Gains [..., S, N] of views on a ground, less where the whole ground fits a view: a view that fits many
-    places, or any wall, tells little of where the robot is, nor whether it is on this ground. Ours; a full
+    """Gains [..., S, N] of views on a ground, less where the whole ground fits a view: a view that fits
+    many places, or any wall, tells little of where the robot is, nor whether it is on this ground. A full
     Bayes filter would divide by the mean likelihood."""
     most = gain.max(axis=(-2, -1), keepdims=True, initial=-np.inf)
     mean = np.exp(gain - most).mean(axis=(-2, -1), keepdims=True)
     return gain - share * (most + np.log(mean))
 
 
-PLAIN = Weighing(_as_they_are, PRIOR, 1.0)
+MAP_WEIGHTING = GainWeighting(np.asarray, PRIOR, 1.0)
 """For two pieces of finished maps, of which many keyframes are compared."""
-PIECE = Weighing(
+PIECE_WEIGHTING = GainWeighting(
     partial(less_where_common, share=COMMON_OF_PIECE), GainPrior(true=(2.4, 0.8), false=(1.0, 1.6)), 1.5
 )
 """For the newest piece of a growing map."""
-DISTINCT = Weighing(less_where_common, GainPrior(true=(2.95, 0.8), false=(1.55, 1.6)), 2.0)
+SESSION_WEIGHTING = GainWeighting(less_where_common, GainPrior(true=(2.95, 0.8), false=(1.55, 1.6)), 2.0)
 """For a session of which few keyframes are known."""

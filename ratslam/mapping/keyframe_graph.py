@@ -1,10 +1,8 @@
 """The keyframes' poses and odometry, and the least-squares problem that joins them to the loop closures.
 
-Places of the pieces of a map that nothing joins: their poses are arbitrary, so they lie far apart.
-
-A keyframe may begin a piece: no odometry leads to it. Until closures join it, a piece lies in the frame of
-its first keyframe, which is `APART` cells from that of the piece before: nothing mistakes it for a part of
-the map. Once accepted closures join it, it is moved to where they claim.
+A keyframe may begin a piece of the map: no odometry leads to it. Until closures join it, a piece lies in the
+frame of its first keyframe, which is `APART` cells from that of the piece before, so that nothing mistakes it
+for a part of the map. Once accepted closures join it, it is moved to where they claim.
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ from ratslam.mapping.config import Ablation, KeyframeMapConfig
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.odometry_calibration import learn_heading_noise, starting_calibration, starting_noise
 from ratslam.mapping.optimizer import (
+    LOOSE,
     NO_LINKS,
     CalibrationPrior,
     LoopClosures,
@@ -35,8 +34,6 @@ from ratslam.mapping.optimizer import (
 from ratslam.mapping.pose_graph import Edges
 from tactile.base.se2 import between, compose, correct_heading, fit_rigid_motion, integrate, inverse
 
-LOOSE = 1e4
-"""Standard deviation of odometry across a break, cells and rad."""
 INTERRUPTED = int(np.iinfo(np.int64).max)
 """Value of `cut` where keyframes before were taken out of the map: no sequence shows the break."""
 NO_ROBUST_SCALE = 1e12
@@ -52,12 +49,13 @@ class KeyframeGraph(Checkpointed):
 
     Attributes:
         pose: [N, 3] in the map, m, m, rad. motion: [N, 3] odometry into each keyframe. length: [N] distance
-            travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure sequence
-            that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`. begins: [N]
-            a piece of the map begins with the keyframe, to which no odometry leads (`begin_piece`).
-            seam: [N] the motion into the keyframe is composed of that into merged ones too, and `links` count
-            in its place. taken: [N] number of the keyframe among all ever taken. bias: heading bias of the
-            odometry, rad/m. turn_error: correction of its turns, rad/rad. prior: of both.
+            travelled into it, m. turn: [N] sum of absolute turns into it, rad. cut: [N] the closure
+            sequence that shows a break of the odometry before the keyframe, -1 for none, or `INTERRUPTED`.
+            begins: [N] a piece of the map begins with the keyframe, to which no odometry leads
+            (`begin_piece`). seam: [N] the motion into the keyframe is composed of that into merged ones
+            too, and `links` count in its place. taken: [N] number of the keyframe among all ever taken.
+            bias: heading bias of the odometry, rad/m. turn_error: correction of its turns, rad/rad. prior:
+            of both.
         start: the prior before any view.
         heading_noise: factor on the variance of its turns. reckoned: [3] the newest keyframe by odometry
             with the calibration of the start.
@@ -90,7 +88,7 @@ class KeyframeGraph(Checkpointed):
         return len(self.pose.rows)
 
     @property
-    def ever(self) -> int:
+    def total(self) -> int:
         """Number of keyframes ever taken; the newest one is never merged."""
         return int(self.taken.rows[-1]) + 1 if self.count else 0
 
@@ -134,7 +132,7 @@ class KeyframeGraph(Checkpointed):
     def _append(
         self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float, *, begins: bool
     ) -> None:
-        self.taken.append(self.ever)
+        self.taken.append(self.total)
         self.pose.append(pose)
         self.motion.append(motion)
         self.length.append(length)
@@ -176,8 +174,8 @@ class KeyframeGraph(Checkpointed):
         return correct_heading(motion, length, self.bias, self.turn_error)
 
     def dead_reckoned(self, bias: float = 0.0, turn_error: float = 0.0) -> np.ndarray:
-        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's; each
-        piece from its own start."""
+        """[N, 3] poses by odometry with this calibration, rad/m and rad/rad, from the first keyframe's;
+        each piece from its own start."""
         first = self.pose.rows[:1]
         if not len(first):
             return first
@@ -188,6 +186,14 @@ class KeyframeGraph(Checkpointed):
     def dead_reckon(self) -> None:
         """Replaces all poses by odometry with the current calibration."""
         self.pose.rows[:] = self.dead_reckoned(self.bias, self.turn_error)
+
+    def adopt_prior(self, log: ClosureLog, prior: CalibrationPrior) -> None:
+        """Takes over a prior of the calibration; the poses follow its means until a closure fixes them."""
+        self.prior = prior
+        means = prior.bias, prior.turn_error
+        if not len(log.accepted_rows()) and (self.bias, self.turn_error) != means:
+            self.bias, self.turn_error = means
+            self.dead_reckon()
 
     def move_to(self, fit: MapFit, log: ClosureLog) -> None:
         """Takes over a fit, moved as a whole so that the keyframes move as little as possible; pieces that
@@ -227,7 +233,8 @@ class KeyframeGraph(Checkpointed):
         return self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
 
     def odometry(self, cut: GrowableArray) -> OdometryChain:
-        """The odometry between keyframes with its variances, loose at the breaks `cut` and between pieces."""
+        """The odometry between keyframes with its variances, loose at the breaks `cut` and between
+        pieces."""
         return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
@@ -242,12 +249,10 @@ class KeyframeGraph(Checkpointed):
         return (cut.rows >= 0) | self.begins.rows
 
     def own_variances(self) -> np.ndarray:
-        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
-        return self.odometry_variance(self.length.rows, self.turn.rows) / [
-            1.0,
-            1.0,
-            self.heading_noise.factor,
-        ]
+        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were
+        learned."""
+        learned = np.array([1.0, 1.0, self.heading_noise.factor])
+        return self.odometry_variance(self.length.rows, self.turn.rows) / learned
 
     def heading_variance(self, length: np.ndarray | float, turn: np.ndarray | float) -> np.ndarray | float:
         """Variance of heading by odometry over distances (m) and sums of absolute turns (rad), with the
@@ -288,19 +293,19 @@ class KeyframeGraph(Checkpointed):
         links = self.links._replace(variance=self.links.variance * [1.0, 1.0, self.heading_noise.factor])
         return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior(), links)
 
-    def unlikeness(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """See `Appearance.unlikeness`."""
+    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """See `Appearance.least_misfits`."""
         taken = self.taken.rows
-        return self.appearance.unlikeness(taken[frame], taken[others], reversed)
+        return self.appearance.misfits(taken[frame], taken[others], reversed)
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """See `Appearance.log_odds`."""
         taken = self.taken.rows
         return self.appearance.log_odds(taken[frame], taken[others], reversed)
 
-    def misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
-        """See `Appearance.misfit`."""
-        return self.appearance.misfit(int(self.taken.rows[frame]), self.taken.rows[near], reversed)
+    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
+        """See `Appearance.least_misfit`."""
+        return self.appearance.least_misfit(int(self.taken.rows[frame]), self.taken.rows[near], reversed)
 
     def solve(self, log: ClosureLog, iterations: int) -> MapFit:
         """The optimised map, from the current poses."""
@@ -384,7 +389,8 @@ class PiecePlacement(NamedTuple):
     """What joins the pieces of N keyframes.
 
     Attributes:
-        begins: [N] bool, a piece begins with the keyframe. i, j: [M] keyframes of accepted closures, of each
+        begins: [N] bool, a piece begins with the keyframe. i, j: [M] keyframes of accepted closures, of
+        each
             sequence the middle one first, and of odometry links. turn: [M] see `LoopClosures`; NaN for a
             link. cell: m.
     """
@@ -401,16 +407,9 @@ class PiecePlacement(NamedTuple):
         starts = np.flatnonzero(self.begins)
         if not len(starts):
             return poses
+        # A stretch is a run of keyframes from one beginning to the next. Joined stretches are moved together;
+        # `group` is the first stretch that each is joined to.
         poses, stretch = poses.copy(), np.cumsum(self.begins)
-        group = self._gather(poses, stretch)
-        for number in np.unique(group)[1:].tolist():
-            start, frames = starts[number - 1], group[stretch] == number
-            moved = compose(piece_start(number, self.cell), inverse(poses[start]))
-            poses[frames] = compose(moved, poses[frames])
-        return poses
-
-    def _gather(self, poses: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-        """Moves joined stretches together, in place; returns the first stretch that each is joined to."""
         group = np.arange(int(stretch[-1]) + 1)
         far = np.hypot(*(poses[self.i] - poses[self.j])[:, :2].T) > APART / 2 * self.cell
         for m in np.argsort(far, kind="stable").tolist():
@@ -419,18 +418,18 @@ class PiecePlacement(NamedTuple):
             if low == high:
                 continue
             if far[m] and np.isfinite(self.turn[m]):
-                frames = group[stretch] == high
-                poses[frames] = compose(self._motion(poses, m, bool(frames[j])), poses[frames])
+                frames, turn = group[stretch] == high, np.array([0.0, 0.0, self.turn[m]])
+                if frames[j]:  # keyframe j comes to where i claims it, or i to where j does
+                    moved = compose(compose(poses[i], turn), inverse(poses[j]))
+                else:
+                    moved = compose(compose(poses[j], -turn), inverse(poses[i]))
+                poses[frames] = compose(moved, poses[frames])
             group[group == high] = low
-        return group
-
-    def _motion(self, poses: np.ndarray, m: int, of_later: bool) -> np.ndarray:
-        """[3] the motion that brings the keyframe j of a closure to where i claims it, or i to j."""
-        i, j = int(self.i[m]), int(self.j[m])
-        turn = np.array([0.0, 0.0, self.turn[m]])
-        if of_later:
-            return compose(compose(poses[i], turn), inverse(poses[j]))
-        return compose(compose(poses[j], -turn), inverse(poses[i]))
+        for number in np.unique(group)[1:].tolist():
+            start, frames = starts[number - 1], group[stretch] == number
+            moved = compose(piece_start(number, self.cell), inverse(poses[start]))
+            poses[frames] = compose(moved, poses[frames])
+        return poses
 
 
 def number_pieces(broken: np.ndarray, closures: np.ndarray) -> np.ndarray:

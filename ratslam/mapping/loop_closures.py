@@ -1,7 +1,8 @@
 """Loop closures: candidates of recall in sequences that are accepted or refused as a whole.
 
-A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence. The
-map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its evidence.
+A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence.
+The map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its
+evidence.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import GrowableArray
-from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.mapping.optimizer import LoopClosures
 
@@ -23,8 +23,8 @@ CSV_COLUMNS = (
 )
 
 UNLIKELY = -1.5
-"""Log-odds below which the evidence of a sequence counts less; true ones of a young session, or of one whose
-odometry is noisier than foretold, reach it."""
+"""Log-odds below which the evidence of a sequence counts less; true ones of a young session, or of one
+whose odometry is noisier than its settings say, reach it."""
 CONFIRMED_WEIGHT = 0.5
 """Robust weight above which a sequence confirms what it joins."""
 
@@ -45,8 +45,8 @@ SIGNS = np.array([0, 1, -1])
 
 
 class Candidate(NamedTuple):
-    """A proposed closure: the keyframe, the older keyframe matched, the sector shift, the posterior mass, and
-    the log-likelihood ratio against novelty."""
+    """A proposed closure: the keyframe, the older keyframe matched, the sector shift, the posterior mass,
+    and the log-likelihood ratio against novelty."""
 
     keyframe: int
     match: int
@@ -55,17 +55,11 @@ class Candidate(NamedTuple):
     log_ratio: float
 
 
-def recalled_candidate(keyframe: int, evidence: Evidence) -> Candidate:
-    """The candidate that recall proposes for a keyframe."""
-    found = int(evidence.match), int(evidence.shift), float(evidence.posterior), float(evidence.log_ratio)
-    return Candidate(keyframe, *found)
-
-
 class ClosureLog(Checkpointed):
     """All candidates and closure sequences, in order of time."""
 
     def __init__(self) -> None:
-        self._candidate = GrowableArray((4,), np.int64)  # keyframe, match, shift, sequence (-1: struck out)
+        self._candidate = GrowableArray((4,), np.int64)  # keyframe, match, shift, sequence (-1: rejected)
         self._evidence = GrowableArray((2,), np.float64)  # posterior, log-likelihood ratio
         self._verdict = GrowableArray((), np.int64)
         self._distance = GrowableArray((), np.float64)
@@ -160,8 +154,8 @@ class ClosureLog(Checkpointed):
         """Whether candidates of a sequence belong to merged keyframes."""
         return bool(self._merged.rows[sequence, 1] > 0)
 
-    def stood(self) -> np.ndarray:
-        """[R] number of selections in a row after which every sequence had a confirming weight."""
+    def confirmations(self) -> np.ndarray:
+        """[R] number of selections in a row in which every sequence kept a confirming weight."""
         return self._stood.rows
 
     def count_selection(self) -> None:
@@ -170,7 +164,8 @@ class ClosureLog(Checkpointed):
         self._stood.rows[:] = np.where(strong, self._stood.rows + 1, 0)
 
     def confirm(self, times: int) -> None:
-        """Lets the sequences with a confirming weight count as confirmed by at least that many selections."""
+        """Lets the sequences with a confirming weight count as confirmed by at least that many
+        selections."""
         strong = (self._verdict.rows == Verdict.ACCEPTED) & (self._weight.rows > CONFIRMED_WEIGHT)
         self._stood.rows[strong] = np.maximum(self._stood.rows[strong], times)
 
@@ -178,7 +173,8 @@ class ClosureLog(Checkpointed):
         """Removes the candidates of merged keyframes; their evidence still counts for their sequence.
 
         Args:
-            gone: [N] bool, merged keyframes. onto: [N] new number of each keyframe, or of the one that it is
+            gone: [N] bool, merged keyframes. onto: [N] new number of each keyframe, or of the one that it
+            is
                 merged with. turned: [N] bool: faces opposite to that one.
         """
         rows, evidence = self._candidate.rows, self._evidence.rows
@@ -229,7 +225,7 @@ class ClosureLog(Checkpointed):
         self._lines = None
 
     def spans(self) -> np.ndarray:
-        """[R, 2] first and last keyframe of every sequence; first > last where all are struck out."""
+        """[R, 2] first and last keyframe of every sequence; first > last where all are rejected."""
         spans = np.tile(np.array([np.iinfo(np.int64).max, -1]), (self.sequences, 1))
         rows = self._candidate.rows[self._candidate.rows[:, 3] >= 0]
         np.minimum.at(spans[:, 0], rows[:, 3], rows[:, 0])
@@ -252,9 +248,9 @@ class ClosureLog(Checkpointed):
             self._distance.rows[sequence] = distance
         self._lines = None
 
-    def rate(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
-        """Stores the log odds [n] that sequences [n] are true; those of an accepted one do not fall, because
-        the map that it has bent foretells it no better."""
+    def raise_log_odds(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
+        """Stores the log odds [n] that sequences [n] are true; those of an accepted one do not fall,
+        because the map that it has bent says no more about it."""
         accepted = self._verdict.rows[sequences] == Verdict.ACCEPTED
         before = np.where(accepted, self._log_odds.rows[sequences], np.nan)
         self._log_odds.rows[sequences] = np.fmax(before, log_odds)
@@ -263,25 +259,25 @@ class ClosureLog(Checkpointed):
         """[R] log odds that every sequence is true, NaN where it is not judged."""
         return self._log_odds.rows
 
-    def rate_anew(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
+    def set_log_odds(self, sequences: np.ndarray, log_odds: np.ndarray) -> None:
         """Stores the log odds [n] that sequences [n] are true, NaN where nothing is said."""
         self._log_odds.rows[sequences] = log_odds
 
-    def strike(self, frame: int, spare: int) -> None:
-        """Strikes out the candidates of accepted sequences other than `spare` at `frame` and later, because
+    def reject(self, frame: int, spare: int) -> None:
+        """Rejects the candidates of accepted sequences other than `spare` at `frame` and later, because
         the odometry breaks before it."""
         rows = self._candidate.rows
         accepted = self._verdict.rows[rows[:, 3]] == Verdict.ACCEPTED
         rows[(rows[:, 0] >= frame) & accepted & (rows[:, 3] != spare) & (rows[:, 3] >= 0), 3] = -1
         self._lines = None
 
-    def strike_sequences(self, sequences: np.ndarray) -> None:
-        """Strikes out the candidates of sequences [n]."""
+    def reject_sequences(self, sequences: np.ndarray) -> None:
+        """Rejects the candidates of sequences [n]."""
         self._candidate.rows[np.isin(self._candidate.rows[:, 3], sequences), 3] = -1
         self._lines = None
 
-    def strike_across(self, cuts: np.ndarray) -> None:
-        """Strikes out candidates of sequences that lie across breaks of the odometry before keyframes `cuts`
+    def reject_across(self, cuts: np.ndarray) -> None:
+        """Rejects candidates of sequences that lie across breaks of the odometry before keyframes `cuts`
         [n], ascending: of each sequence all but those of the part with the most."""
         rows = self._candidate.rows
         part = np.searchsorted(cuts, rows[:, 0], side="right")
@@ -303,7 +299,8 @@ class ClosureLog(Checkpointed):
         return self._candidate.rows[self.accepted_rows(), :2]
 
     def judged(self) -> np.ndarray:
-        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
+        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all
+        candidates."""
         sign = np.where(
             self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
         )
@@ -326,7 +323,8 @@ class ClosureLog(Checkpointed):
         """The accepted closures, for the optimiser.
 
         Args:
-            angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of a
+            angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of
+            a
                 sequence's evidence, least scale, largest scale.
         """
         rows = self._candidate.rows[self.accepted_rows()]

@@ -1,11 +1,11 @@
-"""The keyframe map: every remembered view is a keyframe, loop closures are verified, the pose graph is
-optimised.
+"""The keyframe map: every remembered view is a keyframe; closures are verified, the poses optimised.
 
-Recall proposes candidates. Consecutive candidates that agree with the odometry form a closure sequence; it is
-accepted if it has enough evidence and lies where the map's covariance allows. Accepted sequences keep a
-robust weight, so that other closures can still outvote them. Only for a robot that may be carried
-(`may_be_carried`), a long sequence that contradicts the map shows a break of the odometry: the odometry is
-cut where the views indicate it, and the sequence joins the parts. The rules are ours."""
+Recall proposes candidates. Consecutive candidates that agree with the odometry form a closure sequence; it
+is accepted if it has enough evidence and lies where the covariance of the map allows (`acceptance`). An
+accepted sequence keeps a robust weight, so that other closures can still outvote it. Only for a robot that
+may be carried (`may_be_carried`) can a long sequence that contradicts the map show a break of the odometry:
+the odometry is cut where the views indicate it, and the sequence joins the parts.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ import numpy as np
 
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.estimates import Estimate
+from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.archive import MOST_SOLVED, Archive, KeyframeMerger
 from ratslam.mapping.carried_solution import is_retraced, kept_part, retraced_solution
 from ratslam.mapping.closure_judge import doubt_of_closures
 from ratslam.mapping.config import FULL, Ablation, KeyframeMapConfig
-from ratslam.mapping.experiences import ExperienceChange, Experiences
+from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.ground import LearnedOdds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import ClosureLog, Verdict, recalled_candidate, write_closures
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict, write_closures
 from ratslam.mapping.map_solution import (
     DOUBTED,
     MapSolution,
@@ -37,10 +37,10 @@ from ratslam.mapping.map_solution import (
     worse_than_odometry,
 )
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
-from ratslam.mapping.piece_ties import FindTie, no_tie, tie_newest_piece
+from ratslam.mapping.piece_ties import FindTie, tie_newest_piece
 from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
-from ratslam.mapping.step_record import HALT, LiveFilter, StepRecord, Travel, leading_to
+from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, Travel, leading_to
 from ratslam.mapping.verification import continues_sequence, has_same_heading
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
@@ -53,15 +53,27 @@ DOUBT_EVERY = 50
 
 
 class KeyframeMap(Checkpointed, Map):
-    """The map of the recall backend.
+    """The map of the recall backend: a pose graph of keyframes, as in graph SLAM (Grisetti et al. 2010).
+
+    Each step `update` adds the odometry to the motion since the newest keyframe. If recall has stored the
+    view, that is a new keyframe: it is placed by odometry, a recalled match is logged as a candidate and
+    judged, the map is optimised where that is due, and the keyframe gets an experience. `solution` is the
+    map as it would be if the session ended now; it is solved when it is asked for, and changes nothing.
 
     Args:
-        cell: size of a pose cell, m. appearance: of the keyframes, empty. guard: number of newest keyframes,
-            never recalled. closures: False for a map of odometry alone. ablation: parts turned off by a
-            study. acceptance: makes the rule for closure sequences. find_tie: see `FindTie`.
+        config: settings; lengths in pose cells.
+        cell: size of a pose cell, m.
+        appearance: the views of the keyframes, empty.
+        acceptance: makes the rule for closure sequences.
+        guard: number of newest keyframes, never recalled.
+        closures: False for a map of odometry alone.
+        ablation: parts turned off by a study.
+        find_tie: places the newest piece of the map on the others; None: pieces stay apart.
 
     Attributes:
-        log: of the kept keyframes. archive, appearance: of all. merger, selection: at work.
+        log: candidates and sequences of the keyframes that are not merged.
+        archive, appearance: of all keyframes ever taken.
+        merger, selection: merge keyframes and select closures beside the session.
     """
 
     VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
@@ -80,7 +92,7 @@ class KeyframeMap(Checkpointed, Map):
         guard: int = 20,
         closures: bool = True,
         ablation: Ablation = FULL,
-        find_tie: FindTie = no_tie,
+        find_tie: FindTie | None = None,
     ) -> None:
         self.config, self.cell, self.closes_loops = config, cell, closures
         self.appearance = appearance
@@ -92,7 +104,7 @@ class KeyframeMap(Checkpointed, Map):
         self._acceptance, self._find_tie = acceptance(self._graph, self.archive), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
-        self._travel = HALT
+        self._travel = NO_TRAVEL
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece
         self._solved = (-1, -1)  # sequence and number of the keyframe of the last optimisation
@@ -172,8 +184,8 @@ class KeyframeMap(Checkpointed, Map):
         return self._given().pieces(self.keyframes())
 
     def candidates(self) -> np.ndarray:
-        """[n, 10] all candidates, of recall and then along a retraced map, see `ClosureLog.table`; open where
-        odometry is given."""
+        """[n, 10] all candidates, of recall and then along a retraced map, see `ClosureLog.table`; open
+        where odometry is given."""
         return self._given().log.table()
 
     def covariance(self) -> np.ndarray:
@@ -191,7 +203,14 @@ class KeyframeMap(Checkpointed, Map):
     def kept_solution(self) -> MapSolution:
         """The final map of the keyframes that are not merged."""
         if self._kept is None:
-            kept = self._solve_finally().placed(self._graph)
+            graph, log, selected = self._graph, self.log, None
+            if not self.closes_loops:
+                found = solved_map(graph, log)
+            else:
+                if self.config.select_every:
+                    selected = selected_solution(graph, log, deepcopy(self.selection.hypotheses))
+                found = selected or self._acceptance.solution(graph, log)
+            kept = found.placed(graph)
             if self.closes_loops and is_retraced(self.keyframes()):
                 whole = self.archive.solve(kept, self._graph)
                 self._solution = retraced_solution(self.keyframes(), whole)
@@ -205,18 +224,24 @@ class KeyframeMap(Checkpointed, Map):
         return self._experiences.graph(self._given().fit.poses[taken], taken, self.keyframe_pieces()[taken])
 
     def edges(self) -> Edges:
-        """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with their
-        robust weights."""
+        """Pose graph of the keyframes that are not merged: odometry without its bias, and closures with
+        their robust weights."""
         return self._graph.edges(*self.kept_solution())
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """Functions that write files, by name: experiences as node-link JSON, keyframes as a g2o graph, the
         closures with their evidence, and, where the map is not doubted, the calibration of the odometry."""
-        calibrated = self.final_doubt() <= DOUBTED
-        calibration = {"calibration.yaml": self._write_calibration} if calibrated else {}
-        return calibration | {
+        graph, kept = self._graph, self.kept_solution()
+        # Of several pieces, the first keyframe of each is fixed: nothing else determines where it lies.
+        pieces, first = np.unique(self.keyframe_pieces()[graph.taken.rows], return_index=True)
+        fixed = first.tolist() if len(pieces) > 1 else ()
+        noise = graph.heading_noise if self.config.select_every else None
+        calibration: dict[str, Callable[[Path], None]] = {
+            "calibration.yaml": lambda path: write_calibration(path, graph.calibration(*kept), noise)
+        }
+        return (calibration if self.final_doubt() <= DOUBTED else {}) | {
             "map.json": lambda path: write_json(path, self.graph()),
-            "map.g2o": self._write_g2o,
+            "map.g2o": lambda path: write_g2o(path, kept.fit.poses, graph.edges(*kept), fixed=fixed),
             "closures.csv": lambda path: write_closures(path, self.candidates(), self.keyframe_steps()),
         }
 
@@ -230,7 +255,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def keyframe_steps(self) -> np.ndarray:
         """[N] the step at which each keyframe was taken."""
-        return self._steps.first_steps(self._graph.ever)
+        return self._steps.first_steps(self._graph.total)
 
     @property
     def travel(self) -> Travel:
@@ -239,9 +264,9 @@ class KeyframeMap(Checkpointed, Map):
 
     def begin_piece(self) -> None:
         """The next keyframe begins a piece; steps until then lead to it."""
-        self._steps.settle(self._graph.ever)
+        self._steps.settle(self._graph.total)
         self._begins = self._graph.count > 0
-        self._travel = HALT
+        self._travel = NO_TRAVEL
         self._since = self._turned = 0.0
 
     def merge(self) -> MergedRows | None:
@@ -253,25 +278,32 @@ class KeyframeMap(Checkpointed, Map):
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
-        self._travel = self._travel.onwards(observation.odometry)
-        change = self._experiences.stay()
+        graph, self._travel = self._graph, self._travel.onwards(observation.odometry)
+        place = previous = self._experiences.current
+        action = Action.NONE
         if int(evidence.keyframe) >= 0:
             self._append(observation)
-            self._learn(evidence)
-            matched = self._consider(evidence)
-            self._select()
-            map = self._graph, self.log, self.archive, self._tie_odds
-            if self.closes_loops and tie_newest_piece(*map, self._find_tie):
-                self._optimise()
-            self._judge()
-            change = self._arrive(matched)
-        ever = self._graph.ever
+            shown = self.appearance.learn(evidence, lambda: self.archive.confirmed_pairs(graph, self.log))
+            if self.closes_loops and np.isfinite(shown.error) and self.config.bias_from_views:
+                prior = calibration_from_views(self.config, self.cell, graph.start, shown)
+                self._acceptance.learn_bias(graph, self.log, prior)
+            matched = self._judge_candidate(evidence)
+            if self.closes_loops:
+                self._maintain()
+            # The pose may find a known experience while the drift since the last closure is small.
+            drift = graph.heading_variance(self._since, self._turned)
+            reliable = self._since <= 5 * self.cell and bool(drift <= self.config.place_heading**2)
+            poses, begins = graph.pose.rows, bool(graph.begins.rows[-1])
+            place, previous, action = self._experiences.arrive(
+                poses, len(poses) - 1, matched, reliable, begins
+            )
+        count = graph.total
         moved = np.array(observation.odometry[:3], float)
-        moved = self._graph.calibrated(moved, float(np.hypot(*moved[:2])))
-        frame = leading_to(ever) if self._begins or not ever else ever - 1
+        moved = graph.calibrated(moved, float(np.hypot(*moved[:2])))
+        frame = leading_to(count) if self._begins or not count else count - 1
         self._steps.append(frame, self._travel, moved if np.isfinite(moved).all() else np.zeros(3))
         self._forget_solution()
-        return estimate._replace(place=change.place, previous=change.previous, action=change.action)
+        return estimate._replace(place=place, previous=previous, action=action)
 
     def undo(self, sequence: int) -> None:
         """Removes the closures of a sequence and optimises without them.
@@ -285,93 +317,64 @@ class KeyframeMap(Checkpointed, Map):
         self.log.judge(sequence, Verdict.UNDONE)
         self._optimise()
 
-    def _solve_finally(self) -> MapSolution:
-        graph, log, selected = self._graph, self.log, None
-        if not self.closes_loops:
-            return solved_map(graph, log)
-        if self.config.select_every:
-            selected = selected_solution(graph, log, deepcopy(self.selection.hypotheses))
-        return selected or self._acceptance.solution(graph, log)
-
     def _append(self, observation: Observation) -> None:
         motion, length, turn = self._travel
         if self._begins or not self._graph.count:
-            self._steps.arrive(self._graph.ever, self._travel)
+            self._steps.arrive(self._graph.total, self._travel)
         if self._begins:
             self._graph.begin_piece()
-            motion, length, turn = HALT
+            motion, length, turn = NO_TRAVEL
         else:
             self._graph.append(self._graph.pose_after(motion, length), motion, length, turn)
         self.archive.append(self._graph)
         self._live.advance(self._graph)
         self._since, self._turned = self._since + length, self._turned + turn
-        self._travel, self._begins = HALT, False
+        self._travel, self._begins = NO_TRAVEL, False
         self.appearance.append(observation, motion[2], length)
 
-    def _arrive(self, matched: int) -> ExperienceChange:
-        poses, begins = self._graph.pose.rows, bool(self._graph.begins.rows[-1])
-        return self._experiences.arrive(poses, len(poses) - 1, matched, self._is_pose_reliable(), begins)
-
-    def _learn(self, evidence: Evidence) -> None:
-        """Updates the view metric, and the prior of the heading bias from ordered views."""
-        shown = self.appearance.learn(evidence, lambda: self.archive.confirmed_pairs(self._graph, self.log))
-        if self.closes_loops and np.isfinite(shown.error) and self.config.bias_from_views:
-            prior = calibration_from_views(self.config, self.cell, self._graph.start, shown)
-            self._acceptance.learn_bias(self._graph, self.log, prior)
-
-    def _consider(self, evidence: Evidence) -> int:
-        """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or -1."""
+    def _judge_candidate(self, evidence: Evidence) -> int:
+        """Logs and judges a candidate; returns the keyframe that it confirms as the present place, or
+        -1."""
         if int(evidence.match) < 0 or float(evidence.posterior) <= self.config.candidate_posterior:
             return -1
-        candidate = recalled_candidate(self._graph.count - 1, evidence)
-        follows = continues_sequence(self._graph, self.log, candidate)
-        sequence = self.log.add(candidate, follows)
-        self.archive.add(candidate, follows, self._graph)
-        changed = self.closes_loops and self._acceptance.judge(self._graph, self.log, sequence, candidate)
-        if self.log.verdict(sequence) == Verdict.ACCEPTED:
-            weight = self.log.sequence_weights()[sequence]
-            self._graph.pose.rows[-1] = self._live.correct(self._graph, candidate, weight)
-        if changed or self._is_solution_due(sequence):
-            self._solved = sequence, self._graph.ever
+        graph, log, config = self._graph, self.log, self.config
+        found = int(evidence.match), int(evidence.shift), float(evidence.posterior), float(evidence.log_ratio)
+        candidate = Candidate(graph.count - 1, *found)
+        follows = continues_sequence(graph, log, candidate)
+        sequence = log.add(candidate, follows)
+        self.archive.add(candidate, follows, graph)
+        changed = self.closes_loops and self._acceptance.judge(graph, log, sequence, candidate)
+        due = False  # whether the map is optimised for one more member of an accepted sequence
+        if log.verdict(sequence) == Verdict.ACCEPTED:
+            weight = log.sequence_weights()[sequence]
+            graph.pose.rows[-1] = self._live.correct(graph, candidate, weight)
+            strayed = not config.select_every and self._live.strayed > config.solve_strayed
+            long_ago = graph.total - self._solved[1] >= config.solve_every
+            due = sequence != self._solved[0] or long_ago or strayed
+        if changed or due:
+            self._solved = sequence, graph.total
             self._optimise()
-            if changed and self._acceptance.review(self._graph, self.log):
+            if changed and self._acceptance.review(graph, log):
                 self._optimise()
-        if self.log.verdict(sequence) != Verdict.ACCEPTED:
+        if log.verdict(sequence) != Verdict.ACCEPTED:
             return -1
         self._since = self._turned = 0.0
-        return candidate.match if has_same_heading(self._graph, candidate) else -1
+        return candidate.match if has_same_heading(graph, candidate) else -1
 
-    def _is_solution_due(self, sequence: int) -> bool:
-        """Whether the map is optimised for one more member of an accepted sequence."""
-        if self.log.verdict(sequence) != Verdict.ACCEPTED:
-            return False
-        config = self.config
-        strayed = not config.select_every and self._live.strayed > config.solve_strayed
-        long_ago = self._graph.ever - self._solved[1] >= config.solve_every
-        return sequence != self._solved[0] or long_ago or strayed
-
-    def _is_pose_reliable(self) -> bool:
-        """Whether the drift since the last closure is small enough to find a known experience by pose."""
-        variance = self._graph.heading_variance(self._since, self._turned)
-        return self._since <= 5 * self.cell and bool(variance <= self.config.place_heading**2)
-
-    def _select(self) -> None:
-        """Takes over the map with the closures selected meanwhile, and begins the next selection."""
-        if not self.closes_loops:
-            return
-        if self.selection.finish(self._graph, self.log):
-            self.merger.note_selection(self._graph)
+    def _maintain(self) -> None:
+        """Takes up a finished selection and begins the next, ties the newest piece, judges the map."""
+        graph, log = self._graph, self.log
+        if self.selection.finish(graph, log):
+            self.merger.note_selection(graph)
             self._forget_solution()
-        self.selection.begin(self._graph, self.log)
-        self.merger.select(self._graph, self.log)
-
-    def _judge(self) -> None:
-        """Every `DOUBT_EVERY` keyframes, judges the present map. Without selections, sequences stand this."""
-        graph = self._graph
-        if self.closes_loops and graph.ever % DOUBT_EVERY == 0:
-            self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), self.log, graph.cut))
-            if not self.config.select_every:
-                self.log.count_selection()
+        self.selection.begin(graph, log)
+        self.merger.select(graph, log)
+        if self._find_tie and tie_newest_piece(graph, log, self.archive, self._tie_odds, self._find_tie):
+            self._optimise()
+        if graph.total % DOUBT_EVERY == 0:
+            self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), log, graph.cut))
+            if not self.config.select_every:  # sequences are then confirmed by each judgement instead
+                log.count_selection()
                 self.merger.note_selection(graph)
 
     def _given(self) -> MapSolution:
@@ -384,16 +387,6 @@ class KeyframeMap(Checkpointed, Map):
     def _by_odometry(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
         """See `MapSolution.by_odometry`; graph: the keyframes of the solution."""
         return solution.by_odometry(graph, self._steps.odometry[self.keyframe_steps()[graph.taken.rows]])
-
-    def _write_g2o(self, path: Path) -> None:
-        """Of several pieces, the first keyframe of each is fixed: nothing else determines where it lies."""
-        taken, fit = self._graph.taken.rows, self.kept_solution().fit
-        pieces, first = np.unique(self.keyframe_pieces()[taken], return_index=True)
-        write_g2o(path, fit.poses, self.edges(), fixed=first.tolist() if len(pieces) > 1 else ())
-
-    def _write_calibration(self, path: Path) -> None:
-        noise = self._graph.heading_noise if self.config.select_every else None
-        write_calibration(path, self._graph.calibration(*self.kept_solution()), noise)
 
     def _forget_solution(self) -> None:
         self._solution = self._kept = self._worse = None

@@ -1,30 +1,17 @@
-"""The final map: the optimised poses, the closure sequences selected, and the odometry breaks.
+"""The final map: its poses, the closure sequences selected, the breaks of the odometry, and how healthy it
+is.
 
-A second selection of closures where the odometry seems noisier than it was taken to be.
+*Noise.* A false sequence accepted early bends the map, the bent map raises the noise learned, and with more
+noise further false sequences fit. So where the noise seems too large, the sequences are selected once more
+from dead reckoning with the noise at the start. Refusing closures can hide truly noisy odometry: a refused
+sequence costs its whole evidence here, and ties keep the map that explains more closures (MacKay 1992).
 
-A false sequence that is accepted early bends the map, the bent map raises the noise that is learned, and with
-more noise further false sequences fit: two halves of a maze that look alike become one. Among maps of one
-noise the bent one is then the cheapest. So the sequences are selected once more from dead reckoning with the
-noise at the start, and the more probable map is kept, each with the noise learned from it.
+*Claimed revisits.* A keyframe near older ones that face alike claims a revisit. Where it is right, the view
+fits better there than elsewhere; where it is wrong, it does so by chance. The comparison is by ranks, so no
+constant is in units of the sensor.
 
-Odometry that is honestly noisy is explained with little noise if only the closures are refused. So a refused
-sequence costs its whole evidence here, beside its bounded cost in the selection: in doubt the map stays that
-explains more of what was recognised. The rule is ours; the evidence is that of MacKay 1992, see
-`odometry_noise`.
-
-Revisits that the poses of a map claim, and whether the views bear them out.
-
-A keyframe near older ones that face alike claims a revisit: one of each pass of the robot there, so that a
-pass that is right does not hide one that is wrong. Where a claim is right, the view is more like those near
-it than like views elsewhere; where it is wrong, it is so by chance. The comparison is by ranks: no constant
-is in units of the sensor, and views that are alike everywhere count little. The rules are ours.
-
-Health of a map: the probability that its error is worse than odometry's, told without truth.
-
-Map and odometry are compared as predictors of revisits (`claimed_revisits`) and of the closure sequences that
-the map refused; a map that bends odometry is suspect where odometry itself foretells revisits well. A
-logistic regression on these statistics was fitted to maps with known error (`python -m ratslam reproduce
-tables health`). The statistics are ours.
+*Health.* A logistic regression on these claims, the strain of the odometry and the refused sequences gives
+the probability that the map is worse than odometry (`python -m ratslam reproduce tables health`).
 """
 
 from __future__ import annotations
@@ -72,27 +59,28 @@ CONTROLS = np.arange(1, 9) / 9
 JUDGED = 150
 """Largest number of keyframes by whose claims a map is compared with others."""
 SHAPE, DOUBTFUL = 4.0, 0.05
-"""The likeness of right claims has the density `SHAPE` u^(`SHAPE` - 1), and a share of uniform ones."""
+"""The rank u of right claims has the density `SHAPE` u^(`SHAPE` - 1), and a share of uniform ones."""
 ALONE = 5.0
 """Number of successive keyframes whose views count as one, because they are alike."""
 
 
-class ClaimedRevisits(NamedTuple):
+class _ClaimedRevisits(NamedTuple):
     """n claims by `examined` keyframes.
 
     Attributes:
-        frame: [n] keyframe. match: [n] the first of the older keyframes near it, of one pass. likeness: [n]
-            share of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by chance. A
+        frame: [n] keyframe. match: [n] the first of the older keyframes near it, of one pass. rank: [n]
+        share
+            of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by chance. A
             control is as many keyframes elsewhere among the older ones, in the same order.
     """
 
     frame: np.ndarray
     match: np.ndarray
-    likeness: np.ndarray
+    rank: np.ndarray
     examined: int
 
 
-def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> ClaimedRevisits:
+def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> _ClaimedRevisits:
     """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly."""
     first, count = graph.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
@@ -101,28 +89,28 @@ def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> Clai
     row, near = np.nonzero(facing if whiskers else facing > 0)
     frame, reversed = frames[row], facing[row, near] < 0
     if not len(frame):
-        return ClaimedRevisits(frame, near, np.zeros(0), len(frames))
+        return _ClaimedRevisits(frame, near, np.zeros(0), len(frames))
     shares = np.concatenate([[0.0], CONTROLS])
     older = (frame - graph.guard)[:, None]
     others = (near[:, None] + (older * shares).astype(int)) % older
     repeated = len(shares)
-    unlike = graph.unlikeness(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
+    misfits = graph.misfits(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
     passes = np.flatnonzero(np.diff(near, prepend=-1 - graph.guard) > graph.guard)
     passes = np.union1d(passes, np.flatnonzero(np.diff(frame, prepend=-1)))
-    best = np.minimum.reduceat(unlike.reshape(others.shape), passes, axis=0)
+    best = np.minimum.reduceat(misfits.reshape(others.shape), passes, axis=0)
     here, elsewhere = best[:, :1], best[:, 1:]
-    likeness = (here < elsewhere).mean(axis=1) + (here == elsewhere).mean(axis=1) / 2
-    return ClaimedRevisits(frame[passes], near[passes], likeness, len(frames))
+    rank = (here < elsewhere).mean(axis=1) + (here == elsewhere).mean(axis=1) / 2
+    return _ClaimedRevisits(frame[passes], near[passes], rank, len(frames))
 
 
 def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
     """What the views say against poses [N, 3] of the keyframes, chi-square: -2 times the log ratio of the
-    density of the likenesses where claims are right to that where they are wrong (uniform), for as many
+    density of the ranks where claims are right to that where they are wrong (uniform), for as many
     independent views as there are times `ALONE` keyframes."""
     claims = claimed_revisits(graph, poses, JUDGED)
     if not len(claims.frame):
         return 0.0
-    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * claims.likeness ** (SHAPE - 1)
+    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * claims.rank ** (SHAPE - 1)
     _, frame = np.unique(claims.frame, return_inverse=True)
     each = np.bincount(frame, np.log(right)) / np.bincount(frame)
     return float(-2 * each.sum() * len(poses) / (claims.examined * ALONE))
@@ -149,8 +137,8 @@ class MapSolution(NamedTuple):
     cut: GrowableArray
 
     def placed(self, graph: KeyframeGraph) -> MapSolution:
-        """The map with the pieces of `graph` where they belong, see `PiecePlacement`; the fit may have moved
-        them."""
+        """The map with the pieces of `graph` where they belong, see `PiecePlacement`; the fit may have
+        moved them."""
         poses = graph.placement(self.log).place(self.fit.poses)
         return self._replace(fit=self.fit._replace(poses=poses))
 
@@ -224,8 +212,9 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
-    """The map with the closure sequences that are best accepted together; None if none has the evidence of an
-    accepted one: weak sequences count only beside it, as images without information give a few of them."""
+    """The map with the closure sequences that are best accepted together; None if none has the evidence of
+    an accepted one: weak sequences count only beside it, as images without information give a few of
+    them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
     candidates = sequences_to_select(graph, log)
     if not (candidates & (log.scores() >= config.min_score)).any():
@@ -236,8 +225,19 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
     earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
     cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
-    case = selection_case(graph, log, cut, sequences, place)
-    return selected_map(graph, log, cut, sequences, _select(graph, case, sequences, earlier, hypotheses))
+    problem = selection_problem(graph, log, cut, sequences, place)
+    # From the current map and from the hypotheses; odometry is cut only if the robot may be carried.
+    present = graph.fit()._replace(poses=graph.pose.rows.copy())
+    starts = [present, *hypotheses.follow(problem, sequences)]
+    if config.may_be_carried:
+        selected = select_closures_and_cuts(problem, starts, partial(find_break, graph), earlier)
+    else:
+        selected = select_closures(problem, starts)
+        noise, start = graph.heading_noise, starting_noise(config)
+        if noise.log_factor - start.log_factor > NOISY * noise.sd:  # surely above that of the start
+            reckoned = _dead_reckoned(graph, problem.measurements.prior, place)
+            selected = reselect(problem, selected, reckoned, noise, start)
+    return selected_map(graph, log, cut, sequences, selected)
 
 
 def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
@@ -248,7 +248,7 @@ def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     return enough & possible & ~spans_pieces(graph, log)
 
 
-def selection_case(
+def selection_problem(
     graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, place: Place
 ) -> SelectionProblem:
     """The problem of a selection among sequences [R], which the log then holds for accepted, with the
@@ -276,28 +276,6 @@ def selected_map(
     return MapSolution(fit, log, cut)
 
 
-def _select(
-    graph: KeyframeGraph,
-    case: SelectionProblem,
-    sequences: np.ndarray,
-    earlier: tuple[tuple[int, int], ...],
-    hypotheses: MapHypotheses,
-) -> Selection:
-    """Selects among the sequences `sequences`, starting from the current map and from the hypotheses. The
-    odometry is cut only if the robot may be carried."""
-    present = graph.fit()._replace(poses=graph.pose.rows.copy())
-    starts = [present, *hypotheses.follow(case, sequences)]
-    if not graph.config.may_be_carried:
-        # A selection, or the one from dead reckoning where that is more probable with less noise.
-        found = select_closures(case, starts)
-        noise, start = graph.heading_noise, starting_noise(graph.config)
-        if not seems_noisy(noise, start):
-            return found
-        reckoned = _dead_reckoned(graph, case.measurements.prior, case.place)
-        return reconsidered(case, found, reckoned, noise, start)
-    return select_closures_and_cuts(case, starts, partial(find_break, graph), earlier)
-
-
 def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior, place: Place) -> MapFit:
     """Odometry corrected by the mean of a calibration, from the first keyframe, its pieces placed."""
     poses = place(graph.dead_reckoned(prior.bias, prior.turn_error))
@@ -312,35 +290,27 @@ SETTLED = 0.05
 """Change of the log of the noise below which both are known."""
 
 
-class Settled(NamedTuple):
-    """A selection with the noise learned from it, and its log probability, up to a constant."""
-
-    selection: Selection
-    log_probability: float
-
-
-def seems_noisy(noise: HeadingNoise, start: HeadingNoise) -> bool:
-    """Whether the learned noise of the odometry is surely above that of the start."""
-    return noise.log_factor - start.log_factor > NOISY * noise.sd
-
-
-def reconsidered(
+def reselect(
     case: SelectionProblem, found: Selection, reckoned: MapFit, noise: HeadingNoise, start: HeadingNoise
 ) -> Selection:
     """The more probable of a selection and of that from dead reckoning.
 
     Args:
         case: with the learned noise. found: the selection with it, without cuts. reckoned: dead reckoning.
-            noise: the learned one. start: that of the first map.
+        noise: the learned one. start: that of the first map.
     """
     factor = float(np.exp(start.log_factor - noise.log_factor))
     afresh = case._replace(measurements=case.measurements.with_heading_noise(factor))
-    kept, other = _settle(case, found.fit, noise, start), _settle(afresh, reckoned, start, start)
-    return other.selection if other.log_probability > kept.log_probability else found
+    _, kept = _fit_noise(case, found.fit, noise, start)
+    selection, other = _fit_noise(afresh, reckoned, start, start)
+    return selection if other > kept else found
 
 
-def _settle(case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: HeadingNoise) -> Settled:
-    """The selection from a fit, with the noise that is learned from it."""
+def _fit_noise(
+    case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: HeadingNoise
+) -> tuple[Selection, float]:
+    """The selection from a fit, with the noise that is learned from it, and its log probability, up to a
+    constant."""
     for _ in range(ROUNDS):
         selection = select_closures(case, [fit])
         fit, before = selection.fit, noise
@@ -351,18 +321,18 @@ def _settle(case: SelectionProblem, fit: MapFit, noise: HeadingNoise, start: Hea
             break
     seen = log_posterior(noise.log_factor - start.log_factor, fit, System(case.measurements))
     refused = case.evidence[fit.weights <= ACCEPTED_WEIGHT].sum()
-    return Settled(selection, seen - case.views_cost(fit.poses) / 2 - float(refused))
+    return selection, seen - case.views_cost(fit.poses) / 2 - float(refused)
 
 
 INTERCEPT = -0.69
 WEIGHTS = np.array([-1.22, -0.03, 0.46, 0.91, 5.19])
-"""Of `HealthFeatures`, in order; printed by `python -m ratslam reproduce tables health --sessions 3`."""
+"""Of `health_features`, in order; printed by `python -m ratslam reproduce tables health --sessions 3`."""
 DOUBTED = 0.7
 """Probability above which odometry is given instead; good maps where odometry hardly drifts reach 0.6."""
 EXAMINED = 300
 """Largest number of keyframes whose claims are examined."""
 LEAST_CLAIMS = 0.03
-"""Added to the claims borne out and contradicted by each keyframe, so that few claims say little."""
+"""Added to the claims that views confirm and contradict, by keyframe, so that few claims say little."""
 WINDOW = 20
 """Keyframes over which the strain of the odometry is summed."""
 LEAST_SCORE, LEAST_LENGTH = 2.0, 2
@@ -375,61 +345,44 @@ NEUTRAL = 3.0
 """Evidence added to that of the refused sequences, half of it explained."""
 
 
-class HealthFeatures(NamedTuple):
-    """Statistics of a map.
-
-    Attributes:
-        gain: log ratio of borne-out to contradicted claims of revisits, the map's minus odometry's. odometry:
-            the same log ratio of odometry. strain: log10 of the largest chi-square of the odometry within
-            `WINDOW` keyframes. contested: strain times that log ratio of odometry. unexplained: share of the
-            evidence of refused sequences that the map does not explain, minus odometry's share.
-    """
-
-    gain: float
-    odometry: float
-    strain: float
-    contested: float
-    unexplained: float
-
-
 def worse_than_odometry(graph: KeyframeGraph, solution: MapSolution) -> float:
     """Probability that the map's error is worse than odometry's; NaN without closures."""
     if not len(solution.log.accepted_rows()):
         return np.nan
-    return float(expit(INTERCEPT + WEIGHTS @ np.array(health_features(graph, solution))))
+    return float(expit(INTERCEPT + WEIGHTS @ health_features(graph, solution)))
 
 
-def health_features(graph: KeyframeGraph, solution: MapSolution) -> HealthFeatures:
-    """The statistics of a map; of at least two keyframes."""
+def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
+    """[5] the statistics of a map of at least two keyframes.
+
+    Returns:
+        0: log ratio of confirmed to contradicted claims of revisits, the map's minus odometry's. 1: the
+        same log ratio of odometry. 2, strain: log10 of the largest chi-square of the odometry within
+        `WINDOW` keyframes. 3: strain times the log ratio of odometry. 4: share of the evidence of refused
+        sequences that the map does not explain, minus odometry's share.
+    """
     reckoned = graph.dead_reckoned()
     of_map = _claims_ratio(graph, solution.fit.poses)
     of_odometry = _claims_ratio(graph, reckoned)
-    strain, angle = _strain(graph, solution), graph.sector_angle
-    unexplained, before = (
-        _unexplained(solution.log, poses, angle, graph.cell) for poses in (solution.fit.poses, reckoned)
-    )
-    return HealthFeatures(
-        of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before
-    )
-
-
-def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
-    """Log ratio of the claims of revisits that the views bear out to those that they contradict."""
-    claims = claimed_revisits(graph, poses, EXAMINED)
-    sides = 2 * claims.likeness - 1
-    each = max(claims.examined, 1)
-    agreed, contradicted = np.maximum(sides, 0).sum() / each, np.maximum(-sides, 0).sum() / each
-    return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
-
-
-def _strain(graph: KeyframeGraph, solution: MapSolution) -> float:
     chain, poses = graph.odometry(solution.cut), solution.fit.poses
-    measured = solution.fit.corrected(chain)
-    error = between(poses[:-1], poses[1:]) - measured
+    error = between(poses[:-1], poses[1:]) - solution.fit.corrected(chain)
     error[:, 2] = wrap(error[:, 2])
     sums = np.cumsum((error**2 / chain.variance).sum(axis=1))
     window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
-    return float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
+    strain = float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
+    unexplained, before = (
+        _unexplained(solution.log, each, graph.sector_angle, graph.cell) for each in (poses, reckoned)
+    )
+    return np.array([of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before])
+
+
+def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
+    """Log ratio of the claims of revisits that the views confirm to those that they contradict."""
+    claims = claimed_revisits(graph, poses, EXAMINED)
+    sides = 2 * claims.rank - 1
+    each = max(claims.examined, 1)
+    agreed, contradicted = np.maximum(sides, 0).sum() / each, np.maximum(-sides, 0).sum() / each
+    return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
 
 
 def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) -> float:

@@ -1,10 +1,8 @@
 """Merging of keyframes, so that a map grows with the ground and not with time.
 
 Keyframes of ground that closures have confirmed in several selections are merged with an older keyframe at
-the same pose: they keep their pose relative to it, and their odometry joins the keyframes that remain.
-Source: the reduced pose graph of Johannsson et al. 2013; which keyframes are merged is ours.
-
-The odometry between keyframes after others were merged.
+the same pose: they keep their pose relative to it, and their odometry becomes links between the keyframes
+that remain. Source: the reduced pose graph of Johannsson et al. 2013.
 """
 
 from __future__ import annotations
@@ -38,6 +36,11 @@ class Merge(NamedTuple):
     onto: np.ndarray
     offset: np.ndarray
 
+    @classmethod
+    def of_none(cls, count: int) -> Merge:
+        """All of `count` keyframes remain."""
+        return cls(np.arange(count), np.arange(count), np.zeros((count, 3)))
+
     def is_kept(self) -> np.ndarray:
         """[N] bool."""
         kept = np.zeros(len(self.onto), bool)
@@ -47,11 +50,6 @@ class Merge(NamedTuple):
     def turned(self) -> np.ndarray:
         """[N] bool: keyframes that face opposite to the one they are merged with."""
         return np.cos(self.offset[:, 2]) < 0
-
-
-def no_merge(count: int) -> Merge:
-    """All of `count` keyframes remain."""
-    return Merge(np.arange(count), np.arange(count), np.zeros((count, 3)))
 
 
 def find_merge(graph: KeyframeGraph, log: ClosureLog, newest: int) -> Merge | None:
@@ -83,7 +81,12 @@ def find_merge(graph: KeyframeGraph, log: ClosureLog, newest: int) -> Merge | No
 
 def _confirmed_ground(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     """[N] bool: keyframes between confirmed ones, whose odometry is not strained."""
-    held = _confirmed_keyframes(graph, log)
+    # Confirmed are keyframes of sequences kept by several selections, and both ends of seams.
+    held = graph.seam.rows.copy()
+    held[:-1] |= graph.seam.rows[1:]
+    rows = log.table()[log.accepted_rows()]
+    kept = log.confirmations()[rows[:, 5].astype(int)] >= graph.config.merge_stood
+    held[rows[kept & (rows[:, 8] > CONFIRMED_WEIGHT), 0].astype(int)] = True
     reach = REACH * graph.cell
     # No way leads from one piece to the next.
     where, way = np.flatnonzero(held), np.cumsum(np.where(graph.begins.rows, 2 * reach, graph.length.rows))
@@ -98,29 +101,15 @@ def _confirmed_ground(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     broken = graph.is_broken(graph.cut)
     sure &= ~broken
     sure[:-1] &= ~broken[1:]
-    tense = _strained(graph)
-    sure[1:] &= ~tense
-    sure[:-1] &= ~tense
-    return sure
-
-
-def _confirmed_keyframes(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
-    """[N] bool: keyframes of sequences that stood several selections, and both ends of seams."""
-    held = graph.seam.rows.copy()
-    held[:-1] |= graph.seam.rows[1:]
-    rows = log.table()[log.accepted_rows()]
-    stood = log.stood()[rows[:, 5].astype(int)] >= graph.config.merge_stood
-    held[rows[stood & (rows[:, 8] > CONFIRMED_WEIGHT), 0].astype(int)] = True
-    return held
-
-
-def _strained(graph: KeyframeGraph) -> np.ndarray:
-    """[N - 1] bool: the odometry from one keyframe to the next, or near by, is strained."""
+    # Odometry from one keyframe to the next that is strained, or near such; never at seams, which are loose.
     fit, chain = graph.fit(), graph.odometry(graph.cut)
     error = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
     error[:, 2] = wrap(error[:, 2])
-    tense = (error**2 / chain.variance).sum(axis=1) > TENSE  # never at seams, which are loose
-    return np.convolve(tense, np.ones(2 * AROUND + 1), "same") > 0.5
+    tense = (error**2 / chain.variance).sum(axis=1) > TENSE
+    tense = np.convolve(tense, np.ones(2 * AROUND + 1), "same") > 0.5
+    sure[1:] &= ~tense
+    sure[:-1] &= ~tense
+    return sure
 
 
 ATTACHED = 0.1
@@ -129,8 +118,47 @@ ATTACHED = 0.1
 
 def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     """Removes the merged keyframes from the graph: their odometry joins the keyframes that remain, and
-    odometry over a row of merged ones is composed (a seam), where it no longer counts."""
-    links = _links(graph, merge)
+    odometry over a row of merged ones is composed (a seam), where it no longer counts.
+
+    The links are those so far and the odometry from and to merged keyframes, parallel ones fused by their
+    information. Variances of headings are those without learned noise.
+    """
+    old, kept = graph.links, merge.is_kept()
+    broken = graph.seam.rows | graph.is_broken(graph.cut)
+    later = np.flatnonzero((~kept[1:] | ~kept[:-1]) & ~broken[1:]) + 1
+    attached = (ATTACHED * graph.cell) ** 2 * np.array([1.0, 1.0, 0.0])
+    variance = np.concatenate([graph.own_variances()[later] + attached, old.variance])
+    motion = np.concatenate([graph.motion.rows[later], old.motion])
+    length = np.concatenate([graph.length.rows[later], old.length])
+    turn = np.concatenate([graph.motion.rows[later, 2], old.turn])
+    i, j = np.concatenate([later - 1, old.i]), np.concatenate([later, old.j])
+    motion = compose(compose(merge.offset[i], motion), inverse(merge.offset[j]))
+    i, j = merge.onto[i], merge.onto[j]
+    # From the lower to the higher keyframe; keyframes merged into one have no link.
+    swapped = i > j
+    motions = np.where(swapped[:, None], inverse(motion), motion)
+    turn, length = np.where(swapped, -turn, turn), np.where(swapped, -length, length)
+    i, j = np.minimum(i, j), np.maximum(i, j)
+    apart = i != j
+    size = int(j.max(initial=0)) + 1
+    pairs, first, group = np.unique(i[apart] * size + j[apart], return_index=True, return_inverse=True)
+    # Means weighted by information, of the deviations from the first of the parallel links.
+    information = 1 / variance[apart]
+    total = _summed(group, information, len(pairs))
+    reference = motions[apart][first]
+    off = motions[apart] - reference[group]
+    off[:, 2] = wrap(off[:, 2])
+    mean = reference + _summed(group, information * off, len(pairs)) / total
+    mean[:, 2] = wrap(mean[:, 2])
+    by_heading = information[:, 2] / total[group, 2]
+    links = OdometryLinks(
+        pairs // size,
+        pairs % size,
+        mean,
+        np.bincount(group, by_heading * length[apart], len(pairs)),
+        np.bincount(group, by_heading * turn[apart], len(pairs)),
+        1 / total,
+    )
     skipped = take_keyframes(graph, merge.kept)
     graph.seam.rows[skipped] = True
     graph.links = links
@@ -156,57 +184,6 @@ def take_keyframes(graph: KeyframeGraph, rows: np.ndarray) -> np.ndarray:
     graph.turn.replace(turn)
     graph.take(rows)
     return after + 1
-
-
-def _links(graph: KeyframeGraph, merge: Merge) -> OdometryLinks:
-    """Links between the remaining keyframes: those so far, and the odometry from and to merged ones; parallel
-    ones as one. Variances of headings are those without learned noise."""
-    old, kept = graph.links, merge.is_kept()
-    broken = graph.seam.rows | graph.is_broken(graph.cut)
-    later = np.flatnonzero((~kept[1:] | ~kept[:-1]) & ~broken[1:]) + 1
-    attached = (ATTACHED * graph.cell) ** 2 * np.array([1.0, 1.0, 0.0])
-    own = graph.own_variances()[later] + attached
-    motion = np.concatenate([graph.motion.rows[later], old.motion])
-    i, j = np.concatenate([later - 1, old.i]), np.concatenate([later, old.j])
-    motion = compose(compose(merge.offset[i], motion), inverse(merge.offset[j]))
-    i, j = merge.onto[i], merge.onto[j]
-    return _fused(
-        OdometryLinks(
-            i,
-            j,
-            motion,
-            np.concatenate([graph.length.rows[later], old.length]),
-            np.concatenate([graph.motion.rows[later, 2], old.turn]),
-            np.concatenate([own, old.variance]),
-        )
-    )
-
-
-def _fused(links: OdometryLinks) -> OdometryLinks:
-    """The links from the lower to the higher keyframe, parallel ones as one by their information."""
-    swapped = links.i > links.j
-    motion = np.where(swapped[:, None], inverse(links.motion), links.motion)
-    turn, length = np.where(swapped, -links.turn, links.turn), np.where(swapped, -links.length, links.length)
-    i, j = np.minimum(links.i, links.j), np.maximum(links.i, links.j)
-    apart = i != j
-    size = int(j.max(initial=0)) + 1
-    pairs, first, group = np.unique(i[apart] * size + j[apart], return_index=True, return_inverse=True)
-    information = 1 / links.variance[apart]
-    total = _summed(group, information, len(pairs))
-    reference = motion[apart][first]
-    off = motion[apart] - reference[group]
-    off[:, 2] = wrap(off[:, 2])
-    mean = reference + _summed(group, information * off, len(pairs)) / total
-    mean[:, 2] = wrap(mean[:, 2])
-    by_heading = information[:, 2] / total[group, 2]
-    return OdometryLinks(
-        pairs // size,
-        pairs % size,
-        mean,
-        np.bincount(group, by_heading * length[apart], len(pairs)),
-        np.bincount(group, by_heading * turn[apart], len(pairs)),
-        1 / total,
-    )
 
 
 def _summed(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

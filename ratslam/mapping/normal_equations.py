@@ -1,17 +1,11 @@
-"""Symmetric positive definite equations over nodes with three unknowns each, factorised by blocks.
+"""The normal equations of the keyframes' poses and of the odometry's calibration, and their factorisation.
 
-The order of elimination and the sparsity of the factor are computed once for a graph and used for all
-matrices on it.
-
-Compiled loops of the sparse factorisation L D L^T of a symmetric matrix of 3 x 3 blocks.
-
-The matrix is given by its diagonal blocks [n, 3, 3] and the blocks above the diagonal, by columns: block p
-with start[k] <= p < start[k + 1] stands at (row[p], k). Source: the up-looking LDL^T of Davis 2005 (ACM TOMS
-849), with blocks in the place of numbers.
-
-The normal equations of the keyframes' poses, which stand in blocks, and of the odometry's calibration.
-
-Keyframe 0 is fixed. Keyframes without a number among the unknowns, position -1, add nothing to the equations.
+The matrix of the poses is symmetric positive definite, with 3 x 3 blocks for the nodes (x, y, heading) and
+for the edges between them. It is factorised as L D L^T, up-looking, by blocks (Davis 2005, ACM TOMS 849);
+the order of elimination (minimum degree) and the sparsity of the factor are computed once for a graph. The
+calibration, one or two dense columns, is the border of the matrix and is solved for by its Schur
+complement. Keyframe 0 is fixed: nodes without a number among the unknowns, position -1, add nothing to the
+equations.
 """
 
 from __future__ import annotations
@@ -45,9 +39,9 @@ class BlockPattern:
         keys, self.slot = np.unique(ends[:, 1] * count + ends[:, 0], return_inverse=True)
         self.row = keys % max(count, 1)
         self.start = np.searchsorted(keys, np.arange(count + 1) * count)
-        self._layout = lay_out_factor(self.start, self.row)
+        self._layout = _lay_out_factor(self.start, self.row)
 
-    def factorise(self, diagonal: np.ndarray, above: np.ndarray) -> BlockFactor | None:
+    def factorise(self, diagonal: np.ndarray, above: np.ndarray) -> _BlockFactor | None:
         """The factor of a matrix; None if it is not positive definite.
 
         Args:
@@ -55,10 +49,10 @@ class BlockPattern:
         """
         layout = self._layout
         regular, blocks, inverse, logarithm = factorise(self.start, self.row, diagonal, above, layout)
-        return BlockFactor(layout.first, layout.rows, blocks, inverse, float(logarithm)) if regular else None
+        return _BlockFactor(*layout[:2], blocks, inverse, float(logarithm)) if regular else None
 
 
-class BlockFactor:
+class _BlockFactor:
     """The factor L D L^T of a matrix.
 
     Attributes:
@@ -79,13 +73,13 @@ class BlockFactor:
     def solve(self, right: np.ndarray) -> np.ndarray:
         """[n, 3, C] the solutions for the right-hand sides [n, 3, C], in the order of elimination."""
         solution = np.array(right, np.float64, order="C")
-        solve_in_place(*self._parts, solution)
+        _solve_in_place(*self._parts, solution)
         return solution
 
 
 def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n] the position of each of n nodes with edges from a [M] to b [M]: SuperLU's minimum-degree order for
-    low fill-in."""
+    """[n] the position of each of n nodes with edges from a [M] to b [M]: SuperLU's minimum-degree order
+    for low fill-in."""
     if not count:
         return np.zeros(0, np.int64)
     start, row = neighbours(count, a, b)
@@ -111,10 +105,10 @@ def neighbours(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np
         start[k + 1] += start[k] + 1
     rows, end = np.empty(start[count], np.int32), start[:count].copy()
     for k in range(count):
-        insert(rows, start[k], end, k, k)
+        _insert(rows, start[k], end, k, k)
     for m in range(len(a)):
-        insert(rows, start[a[m]], end, a[m], b[m])
-        insert(rows, start[b[m]], end, b[m], a[m])
+        _insert(rows, start[a[m]], end, a[m], b[m])
+        _insert(rows, start[b[m]], end, b[m], a[m])
     kept = 0
     for k in range(count):
         first, start[k] = start[k], kept
@@ -126,9 +120,9 @@ def neighbours(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np
 
 
 @compiled
-def insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int) -> None:
-    """Puts a row into its place among the ascending `rows` of a column, which begin at `first` and end before
-    end[column], unless it is there."""
+def _insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int) -> None:
+    """Puts a row into its place among the ascending `rows` of a column, which begin at `first` and end
+    before end[column], unless it is there."""
     p = end[column]
     while p > first and rows[p - 1] > row:
         p -= 1
@@ -140,29 +134,20 @@ def insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int)
     end[column] += 1
 
 
-class FactorLayout(NamedTuple):
-    """Where the m blocks of L stand.
-
-    Attributes:
-        first: [n + 1] where each column begins. rows: [m] of the blocks, by columns. begin: [n + 1] where
-            each row begins in `columns` and `slots`. columns: [m] of each row, in an order in which they can
-            be eliminated. slots: [m] place of these blocks among those by columns.
-    """
-
-    first: np.ndarray
-    rows: np.ndarray
-    begin: np.ndarray
-    columns: np.ndarray
-    slots: np.ndarray
+_Layout = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Where the m blocks of L stand: [n + 1] where each column begins; [m] rows of the blocks, by columns; [n +
+1] where each row begins in the last two; [m] columns of each row, in an order in which they can be
+eliminated; [m] place of these blocks among those by columns."""
 
 
 @compiled
-def lay_out_factor(start: np.ndarray, row: np.ndarray) -> FactorLayout:
+def _lay_out_factor(start: np.ndarray, row: np.ndarray) -> _Layout:
     """The layout of the factor of a matrix with blocks above the diagonal at `row` [B] of the columns that
     begin at `start` [n + 1]."""
     n = len(start) - 1
     parent, seen = np.full(n, -1), np.full(n, -1)  # of the elimination tree; the last row it was found in
     first, begin = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.int64)
+    # Row k of L: from each block of column k up the elimination tree, to where this row has been before.
     for k in range(n):
         seen[k] = k
         for p in range(start[k], start[k + 1]):
@@ -178,6 +163,7 @@ def lay_out_factor(start: np.ndarray, row: np.ndarray) -> FactorLayout:
     rows, columns, slots = np.empty((3, first[n]), np.int64)
     filled, path = first[:n].copy(), np.empty(n, np.int64)
     seen[:] = -1
+    # The same again, writing each row from its end: the paths up the tree in an order of elimination.
     for k in range(n):
         seen[k] = k
         top = begin[k + 1]
@@ -197,11 +183,11 @@ def lay_out_factor(start: np.ndarray, row: np.ndarray) -> FactorLayout:
             slots[t] = filled[i]
             rows[filled[i]] = k
             filled[i] += 1
-    return FactorLayout(first, rows, begin, columns, slots)
+    return first, rows, begin, columns, slots
 
 
 @compiled
-def invert(a: np.ndarray, inverse: np.ndarray, k: int) -> float:
+def _invert(a: np.ndarray, inverse: np.ndarray, k: int) -> float:
     """inverse[k] = the inverse of the symmetric a [3, 3]; returns its determinant, or 0 if it is not
     positive."""
     m00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
@@ -224,15 +210,16 @@ def invert(a: np.ndarray, inverse: np.ndarray, k: int) -> float:
 
 @compiled
 def factorise(
-    start: np.ndarray, row: np.ndarray, diagonal: np.ndarray, above: np.ndarray, layout: FactorLayout
+    start: np.ndarray, row: np.ndarray, diagonal: np.ndarray, above: np.ndarray, layout: _Layout
 ) -> tuple[bool, np.ndarray, np.ndarray, float]:
     """Whether the matrix is positive definite; the blocks [m, 3, 3] of L by columns; the inverse blocks
     [n, 3, 3] of D; the logarithm of the determinant."""
-    n, first, rows = len(diagonal), layout.first, layout.rows
+    n, (first, rows, begin, columns, slots) = len(diagonal), layout
     blocks, inverse = np.empty((first[n], 3, 3)), np.empty((n, 3, 3))
     column, pivot = np.zeros((n, 3, 3)), np.empty((3, 3))
     logarithm = 0.0
     for k in range(n):
+        # Column k of the matrix above the diagonal, scattered; its diagonal block becomes the pivot.
         for p in range(start[k], start[k + 1]):
             i = row[p]
             for r in range(3):
@@ -241,12 +228,12 @@ def factorise(
         for r in range(3):
             for c in range(3):
                 pivot[r, c] = diagonal[k, r, c]
-        for t in range(layout.begin[k], layout.begin[k + 1]):
-            i, end = layout.columns[t], layout.slots[t]
+        for t in range(begin[k], begin[k + 1]):
+            i, end = columns[t], slots[t]
             y00, y01, y02 = column[i, 0, 0], column[i, 0, 1], column[i, 0, 2]
             y10, y11, y12 = column[i, 1, 0], column[i, 1, 1], column[i, 1, 2]
             y20, y21, y22 = column[i, 2, 0], column[i, 2, 1], column[i, 2, 2]
-            for p in range(first[i], end):
+            for p in range(first[i], end):  # forward substitution by column i of L
                 j = rows[p]
                 for r in range(3):
                     b0, b1, b2 = blocks[p, r, 0], blocks[p, r, 1], blocks[p, r, 2]
@@ -265,7 +252,7 @@ def factorise(
             for r in range(3):
                 for c in range(3):
                     column[i, r, c] = 0.0
-        determinant = invert(pivot, inverse, k)
+        determinant = _invert(pivot, inverse, k)
         if determinant == 0.0:
             return False, blocks, inverse, -np.inf
         logarithm += np.log(determinant)
@@ -273,19 +260,19 @@ def factorise(
 
 
 @compiled
-def solve_in_place(
+def _solve_in_place(
     first: np.ndarray, rows: np.ndarray, blocks: np.ndarray, inverse: np.ndarray, right: np.ndarray
 ) -> None:
     """Replaces the right-hand sides [n, 3, C] by the solutions."""
     n, columns = len(right), right.shape[2]
-    for k in range(n):
+    for k in range(n):  # L z = right
         for p in range(first[k], first[k + 1]):
             j = rows[p]
             for c in range(columns):
                 x, y, z = right[k, 0, c], right[k, 1, c], right[k, 2, c]
                 for r in range(3):
                     right[j, r, c] -= blocks[p, r, 0] * x + blocks[p, r, 1] * y + blocks[p, r, 2] * z
-    for k in range(n - 1, -1, -1):
+    for k in range(n - 1, -1, -1):  # L^T x = D^-1 z
         for c in range(columns):
             x, y, z = right[k, 0, c], right[k, 1, c], right[k, 2, c]
             for r in range(3):
@@ -322,27 +309,18 @@ class Measurements(NamedTuple):
     slot: np.ndarray
 
 
-class Blocks(NamedTuple):
-    """The equations of n poses and K calibration parameters.
-
-    Attributes:
-        diagonal [n, 3, 3], above [B, 3, 3]: of the poses. right: [n, 3, 1 + K] negative gradient of the
-            poses, and the border between poses and calibration. corner [K, K], slope [K]: of the calibration.
-    """
-
-    diagonal: np.ndarray
-    above: np.ndarray
-    right: np.ndarray
-    corner: np.ndarray
-    slope: np.ndarray
+Blocks = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""The equations of n poses and K calibration parameters: of the poses the blocks on the diagonal [n, 3, 3]
+and above it [B, 3, 3]; right-hand sides [n, 3, 1 + K], the negative gradient of the poses and the border
+between poses and calibration; of the calibration the matrix [K, K] and the gradient [K]."""
 
 
 @compiled
 def measurement_errors(
     edges: Measurements, poses: np.ndarray, bias: float, turn_error: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The measurements [M, 3] without the systematic errors of the odometry, their errors [M, 3] (m, m, rad),
-    and their chi-squares [M]."""
+    """The measurements [M, 3] without the systematic errors of the odometry, their errors [M, 3] (m, m,
+    rad), and their chi-squares [M]."""
     count = len(edges.i)
     measured, error, chi2 = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     for m in range(count):
@@ -406,8 +384,8 @@ def add_measurements(
     """Adds the measurements, each with its information times `trust` [M], to the equations.
 
     With c and s of the heading of keyframe i, the errors have the derivatives [-c -s p], [s -c q], [0 0 -1]
-    by the pose of keyframe i, and [c s 0], [-s c 0], [0 0 1] by that of keyframe j. The products are written
-    out, because loops over their many zeros take several times as long.
+    by the pose of keyframe i, and [c s 0], [-s c 0], [0 0 1] by that of keyframe j. The products are
+    written out, because loops over their many zeros take several times as long.
     """
     diagonal, above, right, corner, slope = blocks
     parameters = len(slope)
@@ -418,7 +396,7 @@ def add_measurements(
         w0 = edges.information[m, 0] * trust[m]
         w1 = edges.information[m, 1] * trust[m]
         w2 = edges.information[m, 2] * trust[m]
-        e0, e1, e2 = w0 * error[m, 0], w1 * error[m, 1], w2 * error[m, 2]
+        e0, e1, e2 = w0 * error[m, 0], w1 * error[m, 1], w2 * error[m, 2]  # weighted errors
         xx, xy, yy = w0 * c * c + w1 * s * s, (w0 - w1) * c * s, w0 * s * s + w1 * c * c
         xh, yh = w1 * s * q - w0 * c * p, -w0 * s * p - w1 * c * q
         pulled_x, pulled_y = c * e0 - s * e1, s * e0 + c * e1
@@ -456,7 +434,7 @@ def add_measurements(
             else:
                 above[slot, 0, 2] -= xh
                 above[slot, 1, 2] -= yh
-        for k in range(parameters):
+        for k in range(parameters):  # derivative d of the errors by the calibration, at its border
             share = edges.regressors[m, k]
             if share == 0.0:  # of closures
                 continue
@@ -482,11 +460,11 @@ class Equations(NamedTuple):
 
     Attributes:
         factor: of the block of the poses, None where it is singular. place: [n] position of each free
-            keyframe among the unknowns. right: see `Blocks`. corner [K, K], slope [K]: of the calibration,
-            its prior included. weights: [R] robust weights of the closure sequences.
+            keyframe among the unknowns. right: see `Blocks`. corner [K, K], slope [K]: matrix and gradient
+            of the calibration, its prior included. weights: [R] robust weights of the closure sequences.
     """
 
-    factor: BlockFactor | None
+    factor: _BlockFactor | None
     place: np.ndarray
     right: np.ndarray
     corner: np.ndarray
@@ -497,7 +475,8 @@ class Equations(NamedTuple):
         """Steps of the poses [N, 3] and of the calibration [K]."""
         if self.factor is None:
             return None
-        solved, border = self.factor.solve(self.right), self._border()
+        solved = self.factor.solve(self.right)
+        border = np.ascontiguousarray(self.right[:, :, 1:]).reshape(-1, len(self.slope))  # [3 n, K]
         free, bent = solved[:, :, 0].ravel(), solved[:, :, 1:].reshape(border.shape)
         change = np.linalg.solve(self.corner - border.T @ bent, -self.slope - border.T @ free)
         step = free - bent @ change
@@ -512,22 +491,18 @@ class Equations(NamedTuple):
         return self.factor.log_determinant + float(np.linalg.slogdet(self.bent()[1])[1])
 
     def bent(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 3, K] poses per calibration parameter, in the order of elimination, and [K, K] its information
-        with the poses integrated out; infinite and 0 where the equations are singular."""
+        """[n, 3, K] poses per calibration parameter, in the order of elimination, and [K, K] its
+        information with the poses integrated out; infinite and 0 where the equations are singular."""
         border = np.ascontiguousarray(self.right[:, :, 1:])
         if self.factor is None:
             return np.full(border.shape, np.inf), np.zeros(self.corner.shape)
         bent = self.factor.solve(border)
         return bent, self.corner - np.tensordot(border, bent, axes=((0, 1), (0, 1)))
 
-    def _border(self) -> np.ndarray:
-        """[3 n, K]"""
-        return np.ascontiguousarray(self.right[:, :, 1:]).reshape(-1, len(self.slope))
-
 
 def empty_blocks(pattern: BlockPattern, parameters: int) -> Blocks:
     """Equations without measurements."""
-    return Blocks(
+    return (
         np.zeros((pattern.count, 3, 3)),
         np.zeros((len(pattern.row), 3, 3)),
         np.zeros((pattern.count, 3, 1 + parameters)),

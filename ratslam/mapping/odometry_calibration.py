@@ -1,20 +1,14 @@
-"""The calibration of the odometry: what a map starts from, and what a finished one knows.
+"""The calibration of the odometry: heading bias and heading noise, learned from views and closures.
 
-The heading noise of the odometry, learned from the loop closures of the map.
+*Heading noise*, a factor on the variance of every turn: its evidence is the probability of odometry and
+closures with the poses integrated out (Laplace; MacKay 1992). The factor has a log-normal prior and moves
+by at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`:
+closures are accepted for agreeing with odometry, so odometry that is believed too much refuses true ones
+and looks good.
 
-The noise is a factor on the variance of every turn. Its evidence is the probability of odometry and closures
-with the poses integrated out, to second order around the map (Laplace; MacKay 1992). A factor too small
-makes the closures costly, one too large wastes the odometry. The factor has a log-normal prior, and moves by
-at most `LARGEST_STEP` at a time, because the map changes with it. It does not fall below `LEAST_FACTOR`:
-closures are accepted for agreeing with odometry, so odometry that is believed too much refuses true ones and
-looks good.
-
-Views of ordered sectors: whether the sectors are ordered, their width, and the heading bias they show.
-
-When the robot turns, the values of a laser or sonar view shift by the turn; those of an unordered view do
-not. So consecutive views show whether sectors are ordered and how wide they are. The shifts then measure the
-turns better than wheels do, which gives the heading bias: the odometry's heading error per metre. No ground
-truth is used. The estimators are ours.
+*Ordered sectors*: when the robot turns, the values of a laser or sonar view shift by the turn. So
+consecutive views show whether sectors are ordered and how wide they are, and their shifts measure the turns
+better than wheels do, which gives the heading bias: the odometry's heading error per metre.
 """
 
 from __future__ import annotations
@@ -35,8 +29,8 @@ FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 2
 MIN_SIGNIFICANCE = 3.0
 """Significance of the improvement by a shift, standard errors, from which sectors count as ordered."""
 MIN_IMPROVEMENT = 0.1
-"""Least share of the unshifted difference that the shift must explain, because a significant improvement may
-still be small."""
+"""Least share of the unshifted difference that the shift must explain, because a significant improvement
+may still be small."""
 MIN_COUNT = 20
 """Turns before the field of view is estimated, and pairs of views before the bias is."""
 LAGS = (1, 2)
@@ -88,56 +82,46 @@ class SectorFan(Checkpointed):
         self._view.append(view)
         self._step.append((turn, length))
         if len(self._view.rows) > 1:
-            gain, still = self._gains()
+            # For each field of view [F]: decrease of the difference of the newest two views if shifted.
+            old, now = self._view.rows[-2:]
+            gain, still = _field_gains(now, old, self._step.rows[-1, 0], FIELDS_OF_VIEW)
             self._gain.append(gain)
             self._still.append(still)
 
     def estimate(self) -> BiasEstimate:
         """The heading bias that the views show, to be added to the odometry's turn."""
-        self._estimate_angle()
+        # The sector angle is set once shifts by the turn explain the views significantly better than no
+        # shift; that is repeated whenever the number of views has doubled.
+        gain = self._gain.rows
+        if not self.given and len(gain) >= self._due:
+            total, count = gain.sum(axis=0), (gain != 0).sum(axis=0)
+            sure = total / np.sqrt(np.maximum((gain**2).sum(axis=0), 1e-300))
+            best = int(np.argmax(np.where(count >= MIN_COUNT, total, -np.inf)))
+            plain = total[best] > MIN_IMPROVEMENT * self._still.rows[:, best].sum()
+            if count[best] >= MIN_COUNT and sure[best] > MIN_SIGNIFICANCE and plain:
+                self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
+                self._due = 2 * len(gain)
+                self._pairs = _no_pairs()
         if not self._angle or len(self._view.rows) < 2 * MIN_COUNT:
             return NO_ESTIMATE
-        answers = [_slope(self._heading_errors(lag), abs(self._angle)) for lag in LAGS]
+        for lag, pairs in self._pairs.items():  # of keyframes `lag` apart, those added since
+            done, count = len(pairs.rows), len(self._view.rows) - lag
+            if count > done:
+                for row in self._measure_turns(np.arange(done, count) + lag, lag):
+                    pairs.append(row)
+        answers = [_fit_slope(self._pairs[lag].rows, abs(self._angle)) for lag in LAGS]
         value = float(np.mean([answer.value for answer in answers]))
         error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
         return BiasEstimate(value, float(np.sqrt(error)))
 
-    def _estimate_angle(self) -> None:
-        """Sets the sector angle once shifts by the turn explain the views significantly better than no shift;
-        repeated whenever the number of views has doubled."""
-        gain = self._gain.rows
-        if self.given or len(gain) < self._due:
-            return
-        total, count = gain.sum(axis=0), (gain != 0).sum(axis=0)
-        sure = total / np.sqrt(np.maximum((gain**2).sum(axis=0), 1e-300))
-        best = int(np.argmax(np.where(count >= MIN_COUNT, total, -np.inf)))
-        plain = total[best] > MIN_IMPROVEMENT * self._still.rows[:, best].sum()
-        if count[best] >= MIN_COUNT and sure[best] > MIN_SIGNIFICANCE and plain:
-            self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
-            self._due = 2 * len(gain)
-            self._pairs = _no_pairs()
-
-    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """[F] decrease of the difference between the newest two views when they are shifted for each field of
-        view, and their unshifted difference; 0 for fields of view without a shift."""
-        old, now = self._view.rows[-2:]
-        return field_gains(now, old, self._step.rows[-1, 0], FIELDS_OF_VIEW)
-
-    def _heading_errors(self, lag: int) -> np.ndarray:
-        """[P, 3] heading error (rad), its weight, distance (m) of pairs of keyframes `lag` apart."""
-        pairs = self._pairs[lag]
-        done, count = len(pairs.rows), len(self._view.rows) - lag
-        if count > done:
-            for row in self._measure_turns(np.arange(done, count) + lag, lag):
-                pairs.append(row)
-        return pairs.rows
-
     def _measure_turns(self, at: np.ndarray, lag: int) -> np.ndarray:
+        """[n, 3] heading error (rad), its weight, and distance (m) of keyframes `at` [n] and those `lag`
+        before."""
         angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
         turn, length = (step[at] - step[at - lag]).T
         view, offset = self._view.rows, SCAN * abs(angle)
         shift = -(turn + offset[:, None]) / angle
-        errors = fractional_differences(view[at], view[at - lag], shift)
+        errors = _fractional_differences(view[at], view[at - lag], shift)
         blind = np.isnan(errors).any(axis=0)
         errors = np.where(blind, 1.0, errors)
         best, row = errors.argmin(axis=0), np.arange(len(at))
@@ -161,7 +145,7 @@ def _no_pairs() -> dict[int, GrowableArray]:
 
 
 @compiled
-def field_gains(
+def _field_gains(
     now: np.ndarray, old: np.ndarray, turn: float, fields: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """[F] decrease of the mean absolute difference of two views when they are shifted by a turn, rad, for
@@ -180,7 +164,7 @@ def field_gains(
 
 
 @compiled
-def fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+def _fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     """[F, P] mean absolute differences of P pairs of views [P, size] for fractional shifts [F, P], by
     interpolation; NaN with less than half overlap."""
     pairs, size = now.shape
@@ -200,7 +184,7 @@ def fractional_differences(now: np.ndarray, old: np.ndarray, shifts: np.ndarray)
     return found
 
 
-def _slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
+def _fit_slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
     """Robust line through the origin (Huber, a quarter sector) and its jackknife error over blocks."""
     turned, trust, length = pairs.T
     if np.count_nonzero(trust) < MIN_COUNT:

@@ -58,56 +58,47 @@ class OdometryScan:
         if found is None:
             if len(self._near) > 1:  # of one prior, as near and wide
                 self._near.clear()
-            found = self._near[prior, reach] = self._find_near(prior, reach)
+            bias, turn_error = np.abs(self.grid - (prior.bias, prior.turn_error)).T
+            third = float(np.sort(np.abs(self._biases - prior.bias))[2])
+            apart = bias / max(reach * prior.bias_sd, third)
+            if prior.turn_error_sd > 0:
+                apart = np.hypot(apart, turn_error / (reach * prior.turn_error_sd))
+            found = self._near[prior, reach] = np.flatnonzero(apart <= 1)
         return found
-
-    def _find_near(self, prior: CalibrationPrior, reach: float) -> np.ndarray:
-        bias, turn_error = np.abs(self.grid - (prior.bias, prior.turn_error)).T
-        third = float(np.sort(np.abs(self._biases - prior.bias))[2])
-        apart = bias / max(reach * prior.bias_sd, third)
-        if prior.turn_error_sd > 0:
-            apart = np.hypot(apart, turn_error / (reach * prior.turn_error_sd))
-        return np.flatnonzero(apart <= 1)
 
     def log_ratios(self, graph: KeyframeGraph, member: np.ndarray, near: np.ndarray) -> np.ndarray:
         """[G] log of the probability density that odometry gave to the place of a closure, over its mean
         density at all keyframes that could be recalled.
 
         Args:
-            graph: of all keyframes so far, which grow from call to call. member: keyframe, match and
-                shift of the closure. near: points of the grid to compute; elsewhere
-                NaN.
+            graph: of all keyframes so far, which grow from call to call. member: keyframe, match and shift
+            of
+                the closure. near: points of the grid to compute; elsewhere NaN.
         """
-        self._extend(graph)
+        # Keyframes added since are dead reckoned one at a time: every path has the same bits whenever it is
+        # computed.
+        held = len(self._total)
+        if graph.count > held:
+            size = max(256, 2 * graph.count) - held
+            self._total = np.pad(self._total, ((0, size), (0, 0)))
+            self._path = np.pad(self._path, ((0, 0), (0, 0), (0, size)))
+        motion, length = graph.motion.rows, graph.length.rows
+        _extend_paths(self._path, self._total, self.grid, motion, length, self._count, self._end)
+        self._count = max(graph.count, 1)
         config = graph.config
         j, i, shift = (int(value) for value in member[:3])
         variance = np.ascontiguousarray(graph.variances(graph.cut)[i + 1 : j + 1, 1:])
         gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
         turned, old = shift * graph.sector_angle, max(j - graph.guard, 1)
         ratios = np.full(len(self.grid), np.nan)
-        compute_log_ratios(
+        _compute_log_ratios(
             self._path, self._total, self.grid, near, variance, i, j, turned, old, gate, ratios
         )
         return ratios
 
-    def _extend(self, graph: KeyframeGraph) -> None:
-        """Dead reckons the keyframes added since the last call, one at a time, so that every path has the
-        same bits whenever it is computed."""
-        self._reserve(graph.count)
-        motion, length = graph.motion.rows, graph.length.rows
-        extend_paths(self._path, self._total, self.grid, motion, length, self._count, self._end)
-        self._count = max(graph.count, 1)
-
-    def _reserve(self, count: int) -> None:
-        held = len(self._total)
-        if count > held:
-            size = max(256, 2 * count) - held
-            self._total = np.pad(self._total, ((0, size), (0, 0)))
-            self._path = np.pad(self._path, ((0, 0), (0, 0), (0, size)))
-
 
 @compiled
-def extend_paths(
+def _extend_paths(
     path: np.ndarray,
     total: np.ndarray,
     grid: np.ndarray,
@@ -123,7 +114,7 @@ def extend_paths(
         total[k, 0], total[k, 2] = total[k - 1, 0] + turn, total[k - 1, 2] + turn
         total[k, 1] = total[k - 1, 1] + length[k]
         driven, turned = total[k - 1, 1] + length[k] / 2, total[k - 1, 2] + turn / 2
-        for g in range(len(grid)):
+        for g in range(len(grid)):  # the heading in the middle of the step, with each calibration
             middle = total[k - 1, 0] + driven * grid[g, 0] + turned * grid[g, 1]
             c, s = np.cos(middle), np.sin(middle)
             end[g, 0] += c * motion[k, 0] - s * motion[k, 1]
@@ -132,7 +123,7 @@ def extend_paths(
 
 
 @compiled
-def compute_log_ratios(
+def _compute_log_ratios(
     path: np.ndarray,
     total: np.ndarray,
     grid: np.ndarray,
@@ -148,7 +139,8 @@ def compute_log_ratios(
     """Writes the log ratios of a closure of keyframe j with keyframe i, see `OdometryScan.log_ratios`.
 
     Args:
-        path, total: see `extend_paths`. points: of the grid [G, 2]. variance: [j - i, 2] along and of heading
+        path, total: see `_extend_paths`. points: of the grid [G, 2]. variance: [j - i, 2] along and of
+        heading
             into each keyframe between. turned: by which the match is turned, rad. old: number of keyframes
             that could be recalled. gate: variance of position and heading added. ratios: [G].
     """
@@ -174,16 +166,17 @@ def log_ratio(
     gate: tuple[float, float],
     apart: np.ndarray,
 ) -> float:
-    """The log ratio of a closure of keyframe j with keyframe i along one path, see `OdometryScan.log_ratios`.
+    """The log ratio of a closure of keyframe j with keyframe i along one path, see
+    `OdometryScan.log_ratios`.
 
     Args:
         x, y, heading: of the path, m, m, rad. apart: [old] for the squared distances of the keyframes that
-            could be recalled. The others: see `compute_log_ratios`.
+            could be recalled. The others: see `_compute_log_ratios`.
     """
     end_x, end_y, end = np.float64(x[j]), np.float64(y[j]), heading[j] + turned
-    xx, xy, yy, xh, yh, hh = invert_covariance(x, y, variance, i, end_x, end_y, gate)
+    xx, xy, yy, xh, yh, hh = _invert_covariance(x, y, variance, i, end_x, end_y, gate)
     xy, xh, yh, share, old = 2 * xy, 2 * xh, 2 * yh, 1 / TURN, len(apart)
-    for k in range(old):
+    for k in range(old):  # squared Mahalanobis distance of each keyframe from the end of the path
         dx, dy, turn = x[k] - end_x, y[k] - end_y, heading[k] - end
         turn -= TURN * np.floor(turn * share + 0.5)
         apart[k] = dx * (xx * dx + xy * dy + xh * turn) + dy * (yy * dy + yh * turn) + hh * turn * turn
@@ -195,7 +188,7 @@ def log_ratio(
 
 
 @compiled
-def invert_covariance(
+def _invert_covariance(
     x: np.ndarray,
     y: np.ndarray,
     variance: np.ndarray,
@@ -204,8 +197,8 @@ def invert_covariance(
     end_y: float,
     gate: tuple[float, float],
 ) -> tuple[float, float, float, float, float, float]:
-    """The information xx, xy, yy, xh, yh, hh of the motion from keyframe i to the end of a path, in the frame
-    of the path, with the gate; arguments as of `compute_log_ratios`."""
+    """The information xx, xy, yy, xh, yh, hh of the motion from keyframe i to the end of a path, in the
+    frame of the path, with the gate; arguments as of `_compute_log_ratios`."""
     along, heading, sum_x, sum_y, sum_xx, sum_yy, sum_xy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(variance)):
         lever_x, lever_y, spread = end_x - x[i + 1 + k], end_y - y[i + 1 + k], variance[k, 1]

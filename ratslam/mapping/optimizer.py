@@ -1,13 +1,18 @@
-"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's calibration.
+"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's
+calibration.
 
 A constant turn of the odometry to one side, the heading bias (rad/m), and the share by which its turns are
 wrong, the turn error (rad/rad), are solved for with the poses. Each closure sequence has one robust weight,
-because its closures are right or wrong together. Keyframe 0 is fixed. Sources: Geman & McClure 1985 (the
-kernel); Kuemmerle et al. 2011 (the error); the calibration and the weights by sequence are ours."""
+because its closures are right or wrong together. Keyframe 0 is fixed.
+
+With errors e and information W of odometry, links and calibration prior, and of each sequence s its number
+of closures n, mean chi-square c and scale mu, the cost is sum e' W e + sum over s of n mu c / (mu + c). The
+error of a measurement is that of Kuemmerle et al. 2011 (g2o), the kernel that of Geman & McClure 1985.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import NamedTuple
 
@@ -26,6 +31,8 @@ from tactile.base.se2 import bend_motion, correct_heading, wrap
 
 HALVINGS = 10
 """Number of lengths tried of a step."""
+LOOSE = 1e4
+"""Standard deviation of odometry across a break, cells and rad; while cuts are tried, m and rad."""
 ROUNDING = 1e-9
 """Share by which rounding may raise the cost of a solved map."""
 
@@ -70,10 +77,10 @@ class LoopClosures(NamedTuple):
 
     Attributes:
         i, j: [M] keyframes. turn: [M] rad. sequence: [M] the sequence of each, 0..R - 1. variance: [3] of
-            each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score, size: [R]
-            evidence and number of closures, those of merged keyframes included. credit: [R] share of that
-            evidence that counts. cost_limit: largest chi-square of one closure, [R] by sequence or one for
-            all.
+            each. scale: [R] mean chi-square at which the weight of a sequence is a quarter. score, size:
+            [R] evidence and number of closures, those of merged keyframes included. credit: [R] share of
+            that evidence that counts. cost_limit: largest chi-square of one closure, [R] by sequence or one
+            for all.
     """
 
     i: np.ndarray
@@ -86,6 +93,19 @@ class LoopClosures(NamedTuple):
     size: np.ndarray = np.zeros(0)
     credit: np.ndarray = np.zeros(0)
     cost_limit: np.ndarray | float = np.inf
+
+    def of_sequences(self, sequences: np.ndarray) -> LoopClosures:
+        """The closures of the sequences marked in [R] bool."""
+        rows = sequences[self.sequence]
+        number = np.cumsum(sequences) - 1
+        return self._replace(
+            i=self.i[rows],
+            j=self.j[rows],
+            turn=self.turn[rows],
+            sequence=number[self.sequence[rows]],
+            scale=self.scale[sequences],
+            cost_limit=np.broadcast_to(self.cost_limit, self.scale.shape)[sequences],
+        )
 
 
 class CalibrationPrior(NamedTuple):
@@ -112,6 +132,14 @@ class MapProblem(NamedTuple):
         chain = self.chain._replace(variance=self.chain.variance * by)
         return self._replace(chain=chain, links=self.links._replace(variance=self.links.variance * by))
 
+    def cut_at(self, frames: Sequence[int]) -> MapProblem:
+        """The problem with loose odometry before keyframes [n]."""
+        if not len(frames):
+            return self
+        variance = self.chain.variance.copy()
+        variance[[frame - 1 for frame in frames]] = LOOSE**2
+        return self._replace(chain=self.chain._replace(variance=variance))
+
 
 class MapFit(NamedTuple):
     """Poses [N, 3], heading bias (rad/m), the robust weight [R] of each sequence, and the turn error
@@ -132,13 +160,19 @@ class MapFit(NamedTuple):
 
 
 def solve(start: MapFit, problem: MapProblem, iterations: int, tolerance: float = 1e-4) -> MapFit:
-    """Gauss-Newton with one robust weight per sequence, from the poses and calibration of `start`.
+    """Gauss-Newton with one robust weight per sequence (iteratively reweighted least squares).
+
+    Args:
+        start: poses and calibration from which the search begins; its weights are not used.
+        problem: odometry, closures, links and the prior of the calibration.
+        iterations: largest number of steps.
+        tolerance: largest change of a pose at convergence, m and rad.
 
     Returns:
         the fit after the first step that changes every pose by less than the tolerance (m, rad), or after
         `iterations` steps; the last fit before the equations become singular. Steps that together raise the
-        cost are taken anew, each halved until it does not: a closure that turns a long chain by radians moves
-        its end along an arc, and the tangent can lead far away (Nocedal & Wright 2006, section 3.1).
+        cost are taken anew, each halved until it does not: a closure that turns a long chain by radians
+        moves its end along an arc, and the tangent can lead far away (Nocedal & Wright 2006, section 3.1).
     """
     return System(problem).solve(start, iterations, tolerance)
 
@@ -164,7 +198,7 @@ def _calibration(fit: MapFit, prior: CalibrationPrior) -> tuple[np.ndarray, np.n
 
 class MapCovariance:
     """The exact marginals of the linearised problem, the calibration included: it moves distant keyframes
-    together."""
+    together. Columns of the inverse are solved for as they are asked for (Kaess & Dellaert 2009)."""
 
     def __init__(self, fit: MapFit, problem: MapProblem) -> None:
         self._poses, self._equations = fit.poses, System(problem).linearise(fit)
@@ -260,8 +294,8 @@ class System:
         return fit
 
     def _descend(self, fit: MapFit, poses: np.ndarray, calibration: np.ndarray) -> tuple[MapFit, float]:
-        """The fit after a Gauss-Newton step, halved until it does not raise the robust cost, and the share of
-        the step; the same fit and 0 where no halving helps."""
+        """The fit after a Gauss-Newton step, halved until it does not raise the robust cost, and the share
+        of the step; the same fit and 0 where no halving helps."""
         cost = self.robust_cost(fit)
         for halvings in range(HALVINGS):
             share = 0.5**halvings
@@ -281,9 +315,9 @@ class System:
         return float(chi2[:chained].sum() + lost.sum() + (tight * off**2).sum())
 
     def log_evidence(self, fit: MapFit) -> float:
-        """Log probability of odometry and closures with poses and calibration integrated out, to second order
-        around a fit that solves the problem (Laplace's method); up to a constant that does not depend on the
-        variances of the odometry. -inf where the equations are singular."""
+        """Log probability of odometry and closures with poses and calibration integrated out, to second
+        order around a fit that solves the problem (Laplace's method); up to a constant that does not depend
+        on the variances of the odometry. -inf where the equations are singular."""
         information = self.linearise(fit).log_determinant()
         measured = self._problem.chain.variance, self._problem.links.variance
         spread = sum(float(np.log(variance).sum()) for variance in measured)
@@ -293,15 +327,15 @@ class System:
         poses = np.ascontiguousarray(fit.poses)
         measured, error, chi2 = self._errors(fit)
         trust, weights, _ = weigh_closures(chi2, *self._closures)
-        blocks = empty_blocks(self._pattern, self._parameters)
-        add_measurements(self._edges, poses, measured, error, trust, blocks)
+        diagonal, above, right, corner, slope = empty_blocks(self._pattern, self._parameters)
+        add_measurements(self._edges, poses, measured, error, trust, (diagonal, above, right, corner, slope))
         off, tight = _calibration(fit, self._problem.prior)
         return Equations(
-            self._pattern.factorise(blocks.diagonal, blocks.above),
+            self._pattern.factorise(diagonal, above),
             self._pattern.place,
-            blocks.right,
-            blocks.corner + np.diag(tight),
-            blocks.slope + tight * off,
+            right,
+            corner + np.diag(tight),
+            slope + tight * off,
             weights,
         )
 

@@ -1,6 +1,7 @@
 """Ties of the newest piece of a map to older keyframes, by a rule that the map is given.
 
-A tie is tried again while its piece is young: one that the views of later keyframes contradict is undone."""
+A tie is tried again while its piece is young: one that the views of later keyframes contradict is
+undone."""
 
 from __future__ import annotations
 
@@ -35,20 +36,15 @@ class Tie(NamedTuple):
 
 
 FindTie = Callable[[KeyframeGraph, ClosureLog, Archive, LearnedOdds], Tie | None]
-"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the odds
-that it learns for these; None without any."""
-
-
-def no_tie(graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds) -> Tie | None:
-    """The rule by which pieces stay apart."""
-    return None
+"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the
+odds that it learns for these; None without any."""
 
 
 def tie_newest_piece(
     graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds, find: FindTie
 ) -> bool:
-    """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the views
-    contradict it.
+    """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the
+    views contradict it.
 
     Args:
         odds: of the map's pieces, learned so far.
@@ -57,30 +53,22 @@ def tie_newest_piece(
         whether the map has changed.
     """
     starts = np.flatnonzero(graph.begins.rows)
-    if graph.ever % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
+    if graph.total % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
         return False
-    tie, across = find(graph, log, archive, odds), _across(graph, log)
+    tie, begins = find(graph, log, archive, odds), graph.begins.rows.copy()
+    # Accepted sequences between keyframes before the newest beginning and since.
+    begins[: starts[-1]] = False
+    across = np.flatnonzero(spans_beginnings(begins, log) & (log.verdicts() == Verdict.ACCEPTED))
     if not len(across):
         if tie is None or tie.log_odds < graph.config.tie_log_odds:
             return False
-        _accept(graph, log, archive, tie.closures)
+        for k, candidate in enumerate(tie.closures):
+            sequence = log.add(candidate, k > 0)
+            archive.add(candidate, k > 0, graph)
+            log.judge(sequence, Verdict.ACCEPTED)
     elif tie is not None and tie.log_odds >= graph.config.tie_log_odds / 2:
         return False
     for sequence in across.tolist():
         log.judge(sequence, Verdict.UNDONE)
     graph.place_pieces(log)
     return True
-
-
-def _across(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
-    """Accepted sequences between keyframes before the newest beginning and since."""
-    begins = graph.begins.rows.copy()
-    begins[: np.flatnonzero(begins)[-1]] = False
-    return np.flatnonzero(spans_beginnings(begins, log) & (log.verdicts() == Verdict.ACCEPTED))
-
-
-def _accept(graph: KeyframeGraph, log: ClosureLog, archive: Archive, closures: Sequence[Candidate]) -> None:
-    for k, candidate in enumerate(closures):
-        sequence = log.add(candidate, k > 0)
-        archive.add(candidate, k > 0, graph)
-        log.judge(sequence, Verdict.ACCEPTED)

@@ -1,8 +1,8 @@
-"""Edges of a pose graph and their error functions.
+"""SE(2) pose graphs of the classic map: edges, robust nonlinear least squares, g2o and node-link JSON files.
 
-Robust nonlinear least squares over SE(2) pose graphs: Levenberg-Marquardt from an initial guess.
-
-Pose graphs as g2o files, and graphs as node-link JSON.
+The error of an edge is that of g2o (Kuemmerle et al. 2011). The cost, with the robust kernel of Huber or of
+Geman & McClure, is minimised from an initial guess by a damped Newton's method (Levenberg-Marquardt), with
+the curvature of the kernels (Triggs et al. 2000) and the block factorisation of `normal_equations`.
 """
 
 from __future__ import annotations
@@ -43,11 +43,6 @@ class Edges(NamedTuple):
     information: np.ndarray
 
 
-ErrorFunction = Callable[[np.ndarray, Edges], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Errors [E, 3] of poses [N, 3], and their Jacobians [E, 3, 3] by the poses of i and of j. An error must
-depend only on the pose of j in the frame of i."""
-
-
 def difference_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The error of g2o: the pose of j in the frame of i, minus the measured one, in the measured frame.
 
@@ -77,27 +72,7 @@ def _differences(
     return error, by_a, by_b
 
 
-def logmap_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The error of gtsam: the SE(2) logarithm of `difference_error`."""
-    error, by_a, by_b = difference_error(poses, edges)
-    angle, x, y = error[:, 2], error[:, 0].copy(), error[:, 1].copy()
-    half = angle / 2
-    small = np.abs(angle) < 1e-4
-    tangent = np.tan(np.where(small, 1.0, half))
-    sine = np.sin(np.where(small, 1.0, half))
-    scale = np.where(small, 1 - angle**2 / 12, half / tangent)
-    slope = np.where(small, -angle / 6, 0.5 / tangent - half / (2 * sine**2))
-    outer = np.zeros((len(x), 3, 3))
-    outer[:, 0, 0] = outer[:, 1, 1] = scale
-    outer[:, 0, 1], outer[:, 1, 0] = half, -half
-    outer[:, 0, 2] = slope * x + y / 2
-    outer[:, 1, 2] = slope * y - x / 2
-    outer[:, 2, 2] = 1.0
-    log = np.stack([scale * x + half * y, scale * y - half * x, angle], axis=1)
-    return log, outer @ by_a, outer @ by_b
-
-
-def information_matrices(information: np.ndarray) -> np.ndarray:
+def _information_matrices(information: np.ndarray) -> np.ndarray:
     """[E, 3, 3] information in either form as matrices."""
     return information if information.ndim == 3 else information[:, :, None] * np.eye(3)
 
@@ -138,12 +113,23 @@ class GraphEquations:
         nodes, parent = breadth_first_order(ties, 0, directed=False)
         self._tree = nodes[1:].astype(np.int64), parent[nodes[1:]].astype(np.int64)
 
-    def step(self, at: _Evaluation, information: np.ndarray, damping: float) -> np.ndarray | None:
-        """The damped step of Newton's method [N, 3], or None if the equations are singular."""
+    def step(
+        self,
+        errors: tuple[np.ndarray, np.ndarray, np.ndarray],
+        information: np.ndarray,
+        weights: np.ndarray,
+        curvature: np.ndarray,
+        damping: float,
+    ) -> np.ndarray | None:
+        """The damped step of Newton's method [N, 3], or None if the equations are singular.
+
+        Args:
+            errors: see `difference_error`. information: [E, 3, 3]. weights, curvature: [E], see `Kernel`.
+        """
         n = self.pattern.count
         diagonal, right = np.zeros((n, 3, 3)), np.zeros((n, 3, 1))
         above = np.zeros((len(self.pattern.row), 3, 3))
-        _add_edges(self._ends, at.errors, information, at.weights, at.curvature, (diagonal, above, right))
+        _add_edges(self._ends, errors, information, weights, curvature, (diagonal, above, right))
         scale = np.diagonal(diagonal, axis1=1, axis2=2)
         diagonal[:, range(3), range(3)] += damping * np.where(scale > 0, scale, 1.0) + (scale == 0)
         factor = self.pattern.factorise(diagonal, above)
@@ -153,8 +139,8 @@ class GraphEquations:
         return np.concatenate([np.zeros((1, 3)), change]) if np.isfinite(change).all() else None
 
     def move(self, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The poses after a step [N, 3], taken in the poses of the nodes relative to each other along a tree:
-        where a node turns, the nodes behind it go round it, not along the tangent."""
+        """The poses after a step [N, 3], taken in the poses of the nodes relative to each other along a
+        tree: where a node turns, the nodes behind it go round it, not along the tangent."""
         moved = poses + change
         _move_along_tree(*self._tree, poses, change, moved)
         moved[:, 2] = wrap(moved[:, 2])
@@ -189,7 +175,8 @@ def _add_edges(
     (J' W e) (J' W e)', and the weight times -J' W e; see `Kernel`.
 
     Args:
-        ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above the
+        ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above
+        the
             diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
     """
     (at_i, at_j, slot), (error, by_i, by_j), (diagonal, above, right) = ends, errors, blocks
@@ -251,7 +238,8 @@ no_kernel = Kernel(np.ones_like, lambda chi2: chi2, np.zeros_like)
 
 
 def huber(scale: float) -> Kernel:
-    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber 1964)."""
+    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber
+    1964)."""
     return Kernel(
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
@@ -260,7 +248,8 @@ def huber(scale: float) -> Kernel:
 
 
 def geman_mcclure(mu: float) -> Kernel:
-    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman 1985)."""
+    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman
+    1985)."""
 
     def curvature(chi2: np.ndarray) -> np.ndarray:
         weight = (mu / (mu + chi2)) ** 2
@@ -280,7 +269,8 @@ class Termination(Enum):
 
 
 class Solution(NamedTuple):
-    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the edges."""
+    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the
+    edges."""
 
     poses: np.ndarray
     termination: Termination
@@ -295,7 +285,6 @@ def least_squares(
     *,
     kernel: Kernel = no_kernel,
     robust: np.ndarray | None = None,
-    error: ErrorFunction = difference_error,
     iterations: int = 50,
     tolerance: float = 1e-9,
     equations: GraphEquations | None = None,
@@ -316,19 +305,62 @@ def least_squares(
     if len(edges.i) == 0 or len(poses) < 2:
         return Solution(poses, Termination.CONVERGED, 0, 0.0, unit)
     robust = np.ones(len(edges.i), bool) if robust is None else np.asarray(robust, bool)
-    problem = _Problem(edges, information_matrices(edges.information), kernel, robust, error)
-    start = problem.evaluate(poses)
-    if not np.isfinite(start.cost):
+    information = _information_matrices(edges.information)
+    problem = edges, information, kernel, robust
+    errors, weights, curvature, cost = _evaluate(poses, *problem)
+    if not np.isfinite(cost):
         return Solution(poses, Termination.NOT_FINITE, 0, np.inf, unit)
     equations = equations or GraphEquations(len(poses), edges, len(edges.i))
-    return _minimise(problem, equations, poses, start, iterations, tolerance)
+    # Damped steps until one ends the search; damping rises after a step that raises the cost.
+    damping, taken = INITIAL_DAMPING, 0
+    termination = Termination.ITERATION_LIMIT
+    while taken < iterations:
+        step = equations.step(errors, information, weights, curvature, damping)
+        if step is None:
+            termination = Termination.SINGULAR
+            break
+        moved = poses + step
+        moved[:, 2] = wrap(moved[:, 2])
+        small, trial = np.abs(step).max() < tolerance, _evaluate(moved, *problem)
+        if not small and not trial[-1] <= cost:
+            moved = equations.move(poses, step)
+            trial = _evaluate(moved, *problem)
+        if trial[-1] <= cost * (1 + 1e-12) + 1e-300:
+            taken += 1
+            small = small or cost - trial[-1] <= 1e-12 * cost
+            poses, damping = moved, max(damping / DAMPING_FACTOR, LEAST_DAMPING)
+            errors, weights, curvature, cost = trial
+        elif not small:
+            damping = max(damping, FIRST_DAMPING) * DAMPING_FACTOR
+        if small:
+            termination = Termination.CONVERGED
+            break
+        if damping > MOST_DAMPING:
+            termination = Termination.NO_DECREASE
+            break
+    return Solution(poses, termination, taken, cost, weights)
+
+
+def _evaluate(
+    poses: np.ndarray, edges: Edges, information: np.ndarray, kernel: Kernel, robust: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray, float]:
+    """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
+    errors = difference_error(poses, edges)
+    with np.errstate(over="ignore", invalid="ignore"):
+        chi2 = _chi_squares(errors[0], information)
+        among, weights, curvature = chi2[robust], np.ones(len(chi2)), np.zeros(len(chi2))
+        weights[robust] = kernel.weight(among)
+        curvature[robust] = kernel.curvature(among)
+        chi2[robust] = kernel.loss(among)
+    return errors, weights, curvature, float(chi2.sum())
 
 
 class GrowingGraph:
     """What can be kept of the equations of a graph to which nodes and edges are added.
 
-    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges up
-    to a number that follows from their number now: so a graph that was loaded is solved to the same bits.
+    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges
+    up to a number that follows from their number now: so a graph that was loaded is solved to the same
+    bits.
     """
 
     def __init__(self) -> None:
@@ -344,82 +376,16 @@ class GrowingGraph:
         return self._last
 
 
-class _Evaluation(NamedTuple):
-    """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
-
-    errors: tuple[np.ndarray, np.ndarray, np.ndarray]
-    weights: np.ndarray
-    curvature: np.ndarray
-    cost: float
-
-
-class _Problem(NamedTuple):
-    """The cost to be minimised; see `least_squares`."""
-
-    edges: Edges
-    information: np.ndarray
-    kernel: Kernel
-    robust: np.ndarray
-    error: ErrorFunction
-
-    def evaluate(self, poses: np.ndarray) -> _Evaluation:
-        errors = self.error(poses, self.edges)
-        with np.errstate(over="ignore", invalid="ignore"):
-            chi2 = _chi_squares(errors[0], self.information)
-            among, weights, curvature = chi2[self.robust], np.ones(len(chi2)), np.zeros(len(chi2))
-            weights[self.robust] = self.kernel.weight(among)
-            curvature[self.robust] = self.kernel.curvature(among)
-            chi2[self.robust] = self.kernel.loss(among)
-        return _Evaluation(errors, weights, curvature, float(chi2.sum()))
-
-
-def _minimise(
-    problem: _Problem,
-    equations: GraphEquations,
-    poses: np.ndarray,
-    current: _Evaluation,
-    iterations: int,
-    tolerance: float,
-) -> Solution:
-    """Takes damped steps until one ends the search; damping rises after a step that raises the cost."""
-    damping, taken = INITIAL_DAMPING, 0
-    termination = Termination.ITERATION_LIMIT
-    while taken < iterations:
-        step = equations.step(current, problem.information, damping)
-        if step is None:
-            termination = Termination.SINGULAR
-            break
-        moved = poses + step
-        moved[:, 2] = wrap(moved[:, 2])
-        small, trial = np.abs(step).max() < tolerance, problem.evaluate(moved)
-        if not small and not trial.cost <= current.cost:
-            moved = equations.move(poses, step)
-            trial = problem.evaluate(moved)
-        if trial.cost <= current.cost * (1 + 1e-12) + 1e-300:
-            taken += 1
-            small = small or current.cost - trial.cost <= 1e-12 * current.cost
-            poses, current, damping = moved, trial, max(damping / DAMPING_FACTOR, LEAST_DAMPING)
-        elif not small:
-            damping = max(damping, FIRST_DAMPING) * DAMPING_FACTOR
-        if small:
-            termination = Termination.CONVERGED
-            break
-        if damping > MOST_DAMPING:
-            termination = Termination.NO_DECREASE
-            break
-    return Solution(poses, termination, taken, current.cost, current.weights)
-
-
 EXPECTED = "a map.json written by ratslam"
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
 
 def write_g2o(path: Path, poses: np.ndarray, edges: Edges, fixed: Sequence[int] = ()) -> None:
-    """Writes VERTEX_SE2 and EDGE_SE2 lines, and FIX lines for the vertices `fixed`; floats are exact (repr),
-    so equal graphs give equal bytes."""
+    """Writes VERTEX_SE2 and EDGE_SE2 lines, and FIX lines for the vertices `fixed`; floats are exact
+    (repr), so equal graphs give equal bytes."""
     lines = [f"VERTEX_SE2 {k} {_floats(pose)}" for k, pose in enumerate(poses)]
     lines += [f"FIX {k}" for k in fixed]
-    information = information_matrices(edges.information)
+    information = _information_matrices(edges.information)
     for i, j, motion, weight in zip(edges.i, edges.j, edges.motion, information, strict=True):
         lines.append(f"EDGE_SE2 {int(i)} {int(j)} {_floats(motion)} {_floats(weight[k] for k in UPPER)}")
     Path(path).write_text("".join(line + "\n" for line in lines), encoding="utf-8")

@@ -1,9 +1,9 @@
-"""Tracks: a supposed pose followed from keyframe to keyframe, and how well the views fit on the way.
+"""Tracks: a pose hypothesis followed from keyframe to keyframe, and how well the views fit on the way.
 
-The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
-on it; none is compared with keyframes of nearly the same time. The rule is that of
-`ratslam.mapping.ground` with variances of position and heading alone, in compiled loops, because
-hundreds of tracks are followed."""
+The keyframes of a map are the ground, and the same keyframes in order of time are the session that is
+placed on it; none is compared with keyframes of nearly the same time. The rule is that of
+`ratslam.mapping.ground` with variances of position and heading alone, in compiled loops, because hundreds
+of tracks are followed."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ class SelfTraverse(NamedTuple):
         return _spread_out(on.poses, on.turns, on.reach, on.reach_heading)
 
     def scan(self, frame: int, places: np.ndarray, length: int) -> np.ndarray:
-        """[C] how well the views of a keyframe and those after it, `length` together, fit if the keyframe is
-        at each of the places [C, 3]."""
+        """[C] how well the views of a keyframe and those after it, `length` together, fit if the keyframe
+        is at each of the places [C, 3]."""
         on, last = self.ground, min(frame + length, self.size)
         reach = on.reach, on.reach_heading
         return _scan(on.poses, on.turns, self.fits, self.motions, places, frame, last, *reach)
@@ -176,6 +176,7 @@ def _follow(
     pose, place, heading = start.copy(), spread[0], spread[2]  # with its variances
     inside, recent = True, 0.0
     for k in range(count):
+        # Prediction by odometry, position variance alike in all directions.
         c, s = np.cos(pose[2]), np.sin(pose[2])
         x, y = motions[k, 0], motions[k, 1]
         pose[0], pose[1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
@@ -185,7 +186,7 @@ def _follow(
         near = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
         turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
         fit, dx, dy, da = _look(ground, turns, fits[frames[k]], pose, near, turn)
-        if fit > 0:
+        if fit > 0:  # Kalman update by the mean of the poses that the views claim
             share, turned = place / (place + spread[0]), heading / (heading + spread[2])
             pose[0], pose[1] = pose[0] + share * dx, pose[1] + share * dy
             pose[2] = _turned(pose[2] + turned * da)

@@ -1,11 +1,8 @@
-"""Selection of closure sequences beside the session.
+"""Selection of closure sequences beside the session, on a thread of its own.
 
 A selection takes longer than a step. So a thread works on a copy of the map while the session goes on, and
-the result is taken up a fixed number of keyframes later, finished or not: the session then waits for it. Live
-and replay so take up the same result at the same keyframe.
-
-Work on a thread of its own whose result is taken up at a fixed keyframe, finished or not: the session then
-waits for it. Live and replay so take up the same result at the same keyframe.
+the result is applied a fixed number of keyframes later; if it is not ready by then, the session waits. So
+live and replay apply a result at the same keyframe.
 """
 
 from __future__ import annotations
@@ -89,8 +86,8 @@ class SelectedMap(Checkpointed):
     """The result of a selection among R sequences.
 
     Attributes:
-        found: whether any sequence had enough evidence; without one only the hypotheses count.
-        before: [R] verdicts before the selection. log: with the verdicts after it. poses [N, 3], calibration
+        found: whether any sequence had enough evidence; without one only the hypotheses count. before: [R]
+        verdicts before the selection. log: with the verdicts after it. poses [N, 3], calibration
             (rad/m, rad/rad), cut, noise: see `KeyframeGraph`.
     """
 
@@ -115,7 +112,8 @@ class SelectedMap(Checkpointed):
         return self
 
     def take_up(self, graph: KeyframeGraph, log: ClosureLog) -> None:
-        """Moves the map to the selected one, continued by the poses since; verdicts given since then stay."""
+        """Moves the map to the selected one, continued by the poses since; verdicts given since then
+        stay."""
         self.judge(log)
         size, (bias, turn_error) = len(self.poses), self.calibration
         graph.cut.rows[:size] = self.cut.rows
@@ -154,14 +152,14 @@ class SelectionWorker(Checkpointed):
 
     def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection if it is due."""
-        if self._every and graph.ever % self._every == 0:
+        if self._every and graph.total % self._every == 0:
             selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
-            due = graph.ever + min(DELAY, self._every)
+            due = graph.total + min(DELAY, self._every)
             self.job.begin(due, partial(selected.select, graph.copy()))
 
     def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
         """Takes up a selection if it is due; whether it changed the map."""
-        selected = self.job.take(graph.ever)
+        selected = self.job.take(graph.total)
         if selected is None:
             return False
         self.hypotheses = selected.hypotheses

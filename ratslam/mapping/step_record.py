@@ -1,8 +1,4 @@
-"""Where every step of a session was, relative to the keyframes.
-
-The odometry since the newest keyframe.
-
-The newest keyframe's pose between two optimisations of the map.
+"""Where every step of a session was, relative to the keyframes, and where the newest keyframe is.
 
 An optimisation costs time that grows with the map, so it does not follow every closure. In between, a
 Kalman filter moves the newest keyframe by the odometry, and corrects it by every closure of an accepted
@@ -33,8 +29,8 @@ class Travel(NamedTuple):
     turn: float
 
     def onwards(self, odometry: Any) -> Travel:
-        """With one more step, if that is finite: the kernel reports as an outcome what is not, and NaN would
-        spoil the whole map."""
+        """With one more step, if that is finite: the kernel reports as an outcome what is not, and NaN
+        would spoil the whole map."""
         moved = np.array([float(odometry.dx), float(odometry.dy), float(odometry.dtheta)])
         if not np.isfinite(moved).all():
             return self
@@ -42,15 +38,15 @@ class Travel(NamedTuple):
         return Travel(compose(self.motion, moved), length, self.turn + abs(moved[2]))
 
 
-HALT = Travel(np.zeros(3), 0.0, 0.0)
+NO_TRAVEL = Travel(np.zeros(3), 0.0, 0.0)
 
 
 class StepRecord(Checkpointed):
     """The keyframe of each of T steps and the motion from there; keyframes are numbered as they were taken.
 
-    The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from it
-    back to them. Number -1: from the origin, before any keyframe. The odometry is kept as it adds up from
-    step to step, so that a map without closures gives it to the bit.
+    The steps of a piece before its first keyframe k have number -2 - k (`leading_to`), and the motion from
+    it back to them. Number -1: from the origin, before any keyframe. The odometry is kept as it adds up
+    from step to step, so that a map without closures gives it to the bit.
     """
 
     def __init__(self) -> None:
@@ -133,7 +129,8 @@ class StepRecord(Checkpointed):
 
 
 def settled(frame: np.ndarray, count: int) -> np.ndarray:
-    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the newest."""
+    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the
+    newest."""
     return np.where(frame <= leading_to(count), count - 1, frame)
 
 
@@ -150,7 +147,8 @@ class LiveFilter(Checkpointed):
     """Covariance of the newest keyframe's pose against the keyframes that it was matched to.
 
     Attributes:
-        covariance: [3, 3] in the frame of the map, m, m, rad. strayed: sum of the corrections since the last
+        covariance: [3, 3] in the frame of the map, m, m, rad. strayed: sum of the corrections since the
+        last
             optimisation, standard deviations of a closure.
     """
 
@@ -160,15 +158,15 @@ class LiveFilter(Checkpointed):
         self.covariance, self.strayed = np.zeros((3, 3)), 0.0
 
     def advance(self, graph: KeyframeGraph) -> None:
-        """Adds the noise of the odometry into the newest keyframe of `graph`; all is forgotten where a piece
-        begins."""
+        """Adds the noise of the odometry into the newest keyframe of `graph`; all is forgotten where a
+        piece begins."""
         if graph.count < 2:
             return
         if graph.begins.rows[-1]:
             self.covariance = np.diag(graph.newest_variance())
             return
         before, after = graph.pose.rows[-2:]
-        self.covariance = moved_covariance(self.covariance, before, after, graph.newest_variance())
+        self.covariance = _moved_covariance(self.covariance, before, after, graph.newest_variance())
 
     def correct(self, graph: KeyframeGraph, candidate: Candidate, weight: float) -> np.ndarray:
         """[3] the newest keyframe's pose corrected by a closure of a sequence with this robust weight. The
@@ -176,13 +174,13 @@ class LiveFilter(Checkpointed):
         claimed, pose = graph.pose.rows[candidate.match], graph.pose.rows[candidate.keyframe]
         variance, turn = graph.closure_variance(), -candidate.shift * graph.sector_angle
         noise = variance / max(weight, LEAST_WEIGHT)
-        corrected, self.covariance, moved = corrected_pose(self.covariance, pose, claimed, turn, noise)
+        corrected, self.covariance, moved = _corrected_pose(self.covariance, pose, claimed, turn, noise)
         self.strayed += float(np.sqrt((moved**2 / variance).sum()))
         return corrected
 
 
 @compiled
-def corrected_pose(
+def _corrected_pose(
     covariance: np.ndarray, pose: np.ndarray, claimed: np.ndarray, turn: float, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A pose [3] with a covariance [3, 3] after a measurement of it with variances `noise` [3]: the pose
@@ -202,7 +200,7 @@ def corrected_pose(
 
 
 @compiled
-def moved_covariance(
+def _moved_covariance(
     covariance: np.ndarray, before: np.ndarray, after: np.ndarray, variance: np.ndarray
 ) -> np.ndarray:
     """[3, 3] covariance of a pose after a motion from `before` to `after` [3] with variances [3]; position

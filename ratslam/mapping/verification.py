@@ -1,13 +1,12 @@
-"""Tests of closure candidates: whether they continue a sequence, and whether a sequence fits the map.
+"""Tests of closure candidates against the map, and breaks of the odometry.
 
-Odometry breaks, where the robot was carried: located by the views, bridged by a closure sequence.
-
-Closure sequences between pieces of a map that nothing else joins.
+A candidate continues a sequence if it moved in memory as odometry did. A sequence fits the map if its
+squared Mahalanobis distance under the covariance of the map is small. Where the robot was carried, the
+odometry is cut at the keyframe from which the views fit better at the poses that a closure sequence claims.
+Sequences between pieces of the map, which no odometry joins, are recognised too.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,34 +14,6 @@ from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.optimizer import MapCovariance
 from tactile.base.se2 import between, compose, inverse, wrap
-
-
-class SequenceTest(NamedTuple):
-    """Result of a test of a closure sequence against the map.
-
-    Attributes:
-        fits: it is accepted. distance: squared Mahalanobis distance of its newest candidate. breaks_odometry:
-            it contradicts the map and is so long that the robot, if that is possible, was carried.
-    """
-
-    fits: bool
-    distance: float
-    breaks_odometry: bool
-
-
-class MapClaim(NamedTuple):
-    """How a map judges a claimed place.
-
-    Attributes:
-        log_ratio: log of the probability density that the map gives to the place, over its mean density at
-            all keyframes that could be recalled. distance: squared Mahalanobis distance from it.
-            position_sd, heading_sd: largest standard deviation of the map's own relative pose, m and rad.
-    """
-
-    log_ratio: float
-    distance: float
-    position_sd: float
-    heading_sd: float
 
 
 def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
@@ -58,35 +29,37 @@ def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candida
     remembered, travelled = _motions(graph, last, candidate)
     apart = np.hypot(*(remembered - travelled)[:2])
     allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
-    near = bool(apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading)
-    return near and _agrees_with_whole(graph, log, candidate)
-
-
-def verify_sequence(
-    graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate
-) -> SequenceTest | None:
-    """Tests a sequence whose newest member is `candidate`; None while its evidence is too small."""
-    config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
-    if length < config.min_length or score < config.min_score:
-        return None
-    distance = _distance(graph, log, candidate) if graph.ablation.verify else 0.0
-    fits = distance < config.max_distance and score - distance / 2 >= config.min_score
-    carried = config.may_be_carried and not config.select_every  # selection places its own cuts
-    broken = carried and length >= config.break_length and score >= config.break_score
-    return SequenceTest(fits, distance, not fits and broken and distance >= config.max_distance)
+    if not (apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading):
+        return False
+    if not config.sequence_agreement:
+        return True
+    # The motion from the first member of the newest sequence has to agree with odometry too.
+    frame, match, shift, _ = log.members(log.sequences - 1)[0]
+    remembered, travelled = _motions(graph, Candidate(frame, match, shift, 0.0, 0.0), candidate)
+    allowed = config.agreement * graph.cell + config.sequence_agreement * np.hypot(*travelled[:2])
+    rotation = abs(wrap(remembered[2] - travelled[2]))
+    return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
 
 
 def has_same_heading(graph: KeyframeGraph, candidate: Candidate) -> bool:
-    """Whether the headings of a closure agree by odometry: a robot that has turned is in another experience,
-    even if its view changes little with heading."""
+    """Whether the headings of a closure agree by odometry: a robot that has turned is in another
+    experience, even if its view changes little with heading."""
     pose, turn = graph.pose.rows, -candidate.shift * graph.sector_angle
     turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
     drift = abs(wrap(turned - turn))
     return bool(np.cos(turn) > 0 and drift < graph.config.agreement_heading * graph.config.max_turn)
 
 
-def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray) -> MapClaim:
-    """How the map judges the place of a closure (keyframe, match, shift)."""
+def judge_by_map(
+    graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray
+) -> tuple[float, float, float, float]:
+    """How the map judges the place of a closure (keyframe, match, shift).
+
+    Returns:
+        log of the probability density that the map gives to the place, over its mean density at all
+        keyframes that could be recalled; squared Mahalanobis distance from the place; largest standard
+        deviations of the map's own relative pose, of position (m) and heading (rad).
+    """
     j, i, shift = (int(value) for value in member[:3])
     config, poses, turn = graph.config, graph.pose.rows, -shift * graph.sector_angle
     own = covariance.relative(i, j, turn)
@@ -98,7 +71,7 @@ def judge_by_map(graph: KeyframeGraph, covariance: MapCovariance, member: np.nda
     error[:, 2] = wrap(error[:, 2])
     distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)
     among = np.log(max(np.exp(-distance / 2).sum(), 1.0))
-    return MapClaim(
+    return (
         float(np.log(len(error)) - distance[i] / 2 - among),
         float(distance[i]),
         float(np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max())),
@@ -116,19 +89,7 @@ def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tu
     return remembered, between(pose[first.keyframe], pose[candidate.keyframe])
 
 
-def _agrees_with_whole(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
-    """Whether the motion from the first member of the newest sequence agrees with odometry."""
-    config = graph.config
-    if not config.sequence_agreement:
-        return True
-    frame, match, shift, _ = log.members(log.sequences - 1)[0]
-    remembered, travelled = _motions(graph, Candidate(frame, match, shift, 0.0, 0.0), candidate)
-    allowed = config.agreement * graph.cell + config.sequence_agreement * np.hypot(*travelled[:2])
-    rotation = abs(wrap(remembered[2] - travelled[2]))
-    return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
-
-
-def _distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:
+def map_distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:
     """Squared Mahalanobis distance of the candidate's claim from the map."""
     turn = -candidate.shift * graph.sector_angle
     pose = graph.pose.rows
@@ -158,7 +119,7 @@ def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None
     at = _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
     graph.cut.rows[at] = sequence
     pose[at:] = compose(carried, pose[at:])
-    log.strike(at, sequence)
+    log.reject(at, sequence)
     log.judge(sequence, Verdict.ACCEPTED)
 
 
@@ -178,22 +139,16 @@ def _find_turning_point(
     Args:
         poses: [N, 3] of older keyframes. onwards: [n, 3] poses of `frames` by odometry.
     """
-    stays, goes = (
-        np.array(
-            [_misfit(graph, frame, pose, poses) for frame, pose in zip(frames.tolist(), rows, strict=True)]
-        )
-        for rows in (onwards, compose(carried, onwards))
-    )
+    misfits = np.zeros((2, len(frames)))  # of the keyframes where they stay and where they are carried
+    for row, own in zip(misfits, (onwards, compose(carried, onwards)), strict=True):
+        for k, (frame, pose) in enumerate(zip(frames.tolist(), own, strict=True)):
+            old = poses[: max(frame - graph.guard, 0)]
+            near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * graph.cell)
+            row[k] = graph.least_misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)
+    stays, goes = misfits
     # With a break before frames[k], those before k stay and the others are carried.
     cost = np.concatenate([[0], np.cumsum(stays)[:-1]]) + np.cumsum(goes[::-1])[::-1]
     return int(frames[len(cost) - 1 - np.argmin(cost[::-1])])
-
-
-def _misfit(graph: KeyframeGraph, frame: int, pose: np.ndarray, poses: np.ndarray) -> float:
-    """Misfit of a keyframe's view at `pose` [3] against the older keyframes near it, at poses [N, 3]."""
-    old = poses[: max(frame - graph.guard, 0)]
-    near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * graph.cell)
-    return graph.misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)
 
 
 def spans_pieces(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:

@@ -14,7 +14,7 @@ from jax import lax
 from ratslam.core.backend import Backend, Map
 from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.core.session import finite_values
-from ratslam.mapping.ground import DISTINCT
+from ratslam.mapping.ground import SESSION_WEIGHTING
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig
 from ratslam.methods.finished_map import map_file, restore_map
@@ -89,7 +89,7 @@ class LocaliseBackend(Backend):
         frames = map.kept_keyframes().taken.rows
         self._memory = views.freeze(frames, poses[frames])
         every = np.arange(len(poses))
-        odds = views.odds(every, poses, np.isin(every, frames), DISTINCT)
+        odds = views.odds(every, poses, np.isin(every, frames), SESSION_WEIGHTING)
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
         self._start = map.map_trajectory()[-1] if here else None
 

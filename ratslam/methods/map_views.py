@@ -17,12 +17,20 @@ from jax import lax
 
 from ratslam.core.session import capacity_at
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.ground import PIECE, PLAIN, GainOdds, Ground, LearnedOdds, Motion, Weighing, ground_of
+from ratslam.mapping.ground import (
+    MAP_WEIGHTING,
+    PIECE_WEIGHTING,
+    GainOdds,
+    GainWeighting,
+    Ground,
+    LearnedOdds,
+    Motion,
+    ground_of,
+)
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog
 from ratslam.mapping.piece_ties import Tie
 from ratslam.network.pose_cells import Belief, Network
-from ratslam.places.hypotheses import less_where_dependent
 from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from ratslam.recall import filter
@@ -109,7 +117,7 @@ class MapViews:
         frames: np.ndarray,
         poses: np.ndarray,
         held: np.ndarray | None = None,
-        weighing: Weighing = PLAIN,
+        weighing: GainWeighting = MAP_WEIGHTING,
     ) -> GainOdds:
         """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
         with each other.
@@ -276,7 +284,9 @@ def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.
 
     def learn() -> GainOdds:
         every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
-        return views.odds(every, archive.poses(graph.pose.rows)[every], np.isin(every, taken), PIECE)
+        return views.odds(
+            every, archive.poses(graph.pose.rows)[every], np.isin(every, taken), PIECE_WEIGHTING
+        )
 
     key = (len(frames), int(taken[0]), int(taken[-1]))
     return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), odds.of(key, learn))
@@ -292,10 +302,10 @@ def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
     motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
     compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
     places = float(np.log(max(on.ground.places(), 1.0)))
-    session = Traverse(compared._replace(gain=PIECE.weigh(compared.gain)), motions)
+    session = Traverse(compared._replace(gain=PIECE_WEIGHTING.weigh(compared.gain)), motions)
     return [
         Tie(
-            float(less_where_dependent(on.ground, path).sum()) - places,
+            float(path.independent_odds(on.ground).sum()) - places,
             [
                 Candidate(int(own[k]), int(on.frames[at.frame]), int(views.shifts[at.shift]), 1.0, at.gain)
                 for k, at in closures_along(on.ground, compared, path)

@@ -1,17 +1,11 @@
-"""Places where a session that is localised in a map no longer agrees with it.
+"""Places that have changed: where a session that is localised in a map no longer agrees with it.
 
-Signs, each a point with evidence for a change, are summed over all passes within a radius (a scan
-statistic, Kulldorff 1997). The map's own revisits tell which sums come by chance: the largest are taken as
-exponentially distributed, as those of scan statistics are (Karlin & Altschul 1990). No constant is in units
-of the sensor.
-
-What a localised session says about the map: places that have changed.
-
-Signs of a change from whisker images: contacts that a map does not expect, and expected ones that fail.
-
-Each pixel of an image is compared with those of the keyframes near by through the log-odds that recall
-learned (`ratslam.recall.whisker_likelihood`). The sign stands where the whisker touches, or where it touched
-in the map: at the wall, not at the robot.
+Signs are contacts of whiskers that the map does not expect, and expected ones that fail; each pixel of an
+image is compared with those of the keyframes near by through the log-odds that recall learned
+(`ratslam.recall.whisker_likelihood`). A sign stands at the wall where the whisker touches, or touched in
+the map, not at the robot. Signs are summed over all passes within a radius (a scan statistic, Kulldorff
+1997). The map's own revisits show which sums come by chance: the largest are taken as exponentially
+distributed (Karlin & Altschul 1990). No constant is in units of the sensor.
 """
 
 from __future__ import annotations
@@ -54,21 +48,6 @@ class Signs(NamedTuple):
     keyframes: int
 
 
-class Chance(NamedTuple):
-    """Sums of signs where nothing has changed.
-
-    Attributes:
-        rate: number of positive ones for each keyframe. height: their mean, nat.
-    """
-
-    rate: float
-    height: float
-
-    def expected(self, evidence: float, keyframes: int) -> float:
-        """Expected number of sums of at least this evidence in a session of `keyframes`."""
-        return float(self.rate * keyframes * np.exp(-evidence / self.height))
-
-
 class Change(NamedTuple):
     """A place that has changed.
 
@@ -94,26 +73,43 @@ class Change(NamedTuple):
         return "new" if self.appears > 0.5 else "gone" if self.appears < -0.5 else "different"
 
 
-def learn_chance(revisits: Signs, radius: float) -> Chance:
-    """The sums that come by chance, from signs at revisits in the map itself."""
+def learn_chance(revisits: Signs, radius: float) -> tuple[float, float]:
+    """The sums that come by chance where nothing has changed, from signs at revisits in the map itself:
+    number of positive ones for each keyframe, and their mean, nat."""
     heights = [height for _, height, _ in _peaks(revisits, radius)]
     count = len(heights) + PRIOR_PEAKS
     total = sum(heights) + PRIOR_PEAKS * PRIOR_HEIGHT
-    return Chance(count / (revisits.keyframes + PRIOR_KEYFRAMES), total / count)
+    return count / (revisits.keyframes + PRIOR_KEYFRAMES), total / count
 
 
-def find_changes(signs: Signs, chance: Chance, radius: float) -> list[Change]:
+def find_changes(signs: Signs, chance: tuple[float, float], radius: float) -> list[Change]:
     """The places that have changed, the surest first.
 
     Args:
-        radius: m, see `RADIUS`.
+        chance: see `learn_chance`. radius: m, see `RADIUS`.
     """
-    found = []
+    found, (rate, mean) = [], chance
     for _, height, near in _peaks(signs, radius):
-        alarms = chance.expected(height, signs.keyframes)
+        # Expected number of sums of at least this evidence by chance.
+        alarms = float(rate * signs.keyframes * np.exp(-height / mean))
         if alarms >= ALARMS:
             break
-        found.append(_change(signs, near, height, alarms))
+        for_it = near[signs.evidence[near] > 0]
+        weight = signs.evidence[for_it] / signs.evidence[for_it].sum()
+        position = weight @ signs.points[for_it]
+        apart = signs.points[for_it] - position
+        spread = np.linalg.eigvalsh((weight[:, None] * apart).T @ apart)[-1]
+        keyframes = np.unique(signs.keyframe[for_it])
+        change = Change(
+            position=position,
+            extent=float(np.sqrt(12 * max(spread, 0.0))),  # of an evenly covered line with this variance
+            evidence=height,
+            alarms=alarms,
+            appears=float(weight @ signs.appears[for_it]),
+            keyframes=keyframes,
+            passes=1 + int((np.diff(keyframes) > PASS).sum()),
+        )
+        found.append(change)
     return found
 
 
@@ -137,24 +133,6 @@ def _peaks(signs: Signs, radius: float) -> list[tuple[int, float, np.ndarray]]:
     return peaks
 
 
-def _change(signs: Signs, near: np.ndarray, height: float, alarms: float) -> Change:
-    for_it = near[signs.evidence[near] > 0]
-    weight = signs.evidence[for_it] / signs.evidence[for_it].sum()
-    position = weight @ signs.points[for_it]
-    apart = signs.points[for_it] - position
-    spread = np.linalg.eigvalsh((weight[:, None] * apart).T @ apart)[-1]
-    keyframes = np.unique(signs.keyframe[for_it])
-    return Change(
-        position=position,
-        extent=float(np.sqrt(12 * max(spread, 0.0))),  # length of an evenly covered line with this variance
-        evidence=height,
-        alarms=alarms,
-        appears=float(weight @ signs.appears[for_it]),
-        keyframes=keyframes,
-        passes=1 + int((np.diff(keyframes) > PASS).sum()),
-    )
-
-
 class Touch(NamedTuple):
     """How whisker images become points: the head, and the height (m) of pixel value 1 and of walls."""
 
@@ -169,16 +147,22 @@ def session_changes(place: Place, visits: Visits, touch: Touch) -> list[Change]:
     Args:
         visits: of the session; `Change.keyframes` number them.
     """
-    made = contacts_of(place, place.frames, touch)
+    made = _contacts_of(place, place.frames, touch)
     if made is None or not len(visits.step):
         return []
     radius = RADIUS * place.ground.reach
     known = np.full(len(visits.step), len(place.frames))
     signs = contact_signs(made, visits.pose, visits.view.astype(int), known)
-    return find_changes(signs, learn_chance(_revisits(place, touch), radius), radius)
+    # Signs in the map itself: its later two thirds, each keyframe compared with those long before it.
+    graph = place.map.keyframes()
+    every, late = np.arange(graph.count), np.arange(graph.count // 3, graph.count)
+    own = _contacts_of(place, every, touch)
+    assert own is not None
+    revisits = contact_signs(own, own.ground.poses[late], own.levels[late], late - graph.guard)
+    return find_changes(signs, learn_chance(revisits, radius), radius)
 
 
-def contacts_of(place: Place, frames: np.ndarray, touch: Touch) -> ContactMap | None:
+def _contacts_of(place: Place, frames: np.ndarray, touch: Touch) -> ContactMap | None:
     """The contacts of keyframes [n] of a map; None where its views are not images of the head's whiskers, or
     recall has not learned to compare them."""
     appearance = place.map.appearance
@@ -189,16 +173,6 @@ def contacts_of(place: Place, frames: np.ndarray, touch: Touch) -> ContactMap | 
         return None
     ground = place.ground._replace(poses=place.map.solution().fit.poses[frames])
     return contact_map(ground, levels, appearance.layout, appearance.metric().likeness, *touch)
-
-
-def _revisits(place: Place, touch: Touch) -> Signs:
-    """The signs in the map itself: its later two thirds, each keyframe compared with those long before it."""
-    graph = place.map.keyframes()
-    frames = np.arange(graph.count)
-    made = contacts_of(place, frames, touch)
-    assert made is not None
-    late = np.arange(len(frames) // 3, len(frames))
-    return contact_signs(made, made.ground.poses[late], made.levels[late], late - graph.guard)
 
 
 class ContactMap(NamedTuple):
@@ -247,7 +221,7 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
     points, touched = contact_points(poses, levels, made.head, made.tallest)
     found = [
         (k, *_compare(made, levels[k], points[k], touched[k], near))
-        for k, near in enumerate(near_keyframes(made.ground, poses, known))
+        for k, near in enumerate(_near_keyframes(made.ground, poses, known))
         if len(near[0])
     ]
     if not found:
@@ -258,7 +232,7 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
     return Signs(where, evidence, appears, number, len(poses))
 
 
-def near_keyframes(
+def _near_keyframes(
     ground: Ground, poses: np.ndarray, known: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """The sector shifts and keyframes with which a robot at each of the poses [K, 3] is compared, among the
@@ -278,7 +252,12 @@ def _compare(
     near: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [n, 2], evidence [n] and appearance [n] of the signs in one image."""
-    frame, pixel, log_odds = compared_pixels(made, level, near)
+    # Keyframes [n, 1], their pixels [n, D] with which each pixel of the image is compared, and the log-odds
+    # [n, D] that they show the same.
+    shift, frame = near[0], near[1][:, None]
+    reversed = np.cos(made.ground.turns[shift]) < 0
+    pixel = np.where(reversed[:, None], made.layout.opposite, np.arange(len(level)))
+    log_odds = made.log_odds[made.layout.group, level, made.levels[frame, pixel]]
     total = log_odds.sum(axis=1)
     weight = np.exp(total - total.max())
     weight = weight / weight.sum()
@@ -289,16 +268,3 @@ def _compare(
     here = touched | was
     where = np.where(touched[:, None], points, middle)
     return where[here], -(weight @ log_odds)[here], touched[here].astype(float) - was[here]
-
-
-def compared_pixels(
-    made: ContactMap, level: np.ndarray, near: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keyframes [n, 1], their pixels [n, D] that each pixel of an image of `level` [D] is compared with,
-    and the log-odds [n, D] that they show the same."""
-    shift, frame = near
-    own = np.arange(len(level))
-    reversed = np.cos(made.ground.turns[shift]) < 0
-    pixel = np.where(reversed[:, None], made.layout.opposite, own)
-    log_odds = made.log_odds[made.layout.group, level, made.levels[frame[:, None], pixel]]
-    return frame[:, None], pixel, log_odds

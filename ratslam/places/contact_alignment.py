@@ -48,7 +48,10 @@ class ContactCloud:
         thin = np.stack(sums, axis=1)[count >= 2] / count[count >= 2, None]
         self.points = thin if len(thin) else np.zeros((0, 2))
         self._tree = cKDTree(self.points)
-        self.normals = np.array([self._normal(k) for k in range(len(self.points))]).reshape(-1, 2)
+        self.normals = np.zeros((len(self.points), 2))  # unit vectors across the points around each
+        for k, point in enumerate(self.points):
+            near = self.points[self._tree.query_ball_point(point, AROUND)]
+            self.normals[k] = np.linalg.eigh(np.cov(near.T) if len(near) > 2 else np.eye(2))[1][:, 0]
 
     def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
         """The pose [3] near a given one from which points [m, 2] in base_link (m) fit best.
@@ -87,12 +90,6 @@ class ContactCloud:
             return float("nan")
         placed = compose(pose, _flat(points))[:, :2]
         return float((self._tree.query(placed)[0] <= NEAR).mean())
-
-    def _normal(self, k: int) -> np.ndarray:
-        """Unit vector across the points around a point."""
-        near = self.points[self._tree.query_ball_point(self.points[k], AROUND)]
-        _, vectors = np.linalg.eigh(np.cov(near.T) if len(near) > 2 else np.eye(2))
-        return vectors[:, 0]
 
 
 class RememberedContacts:

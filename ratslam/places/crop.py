@@ -10,7 +10,7 @@ from ratslam.mapping.keyframe_graph import INTERRUPTED, KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.merging import take_keyframes
-from ratslam.mapping.step_record import HALT, StepRecord, Travel
+from ratslam.mapping.step_record import NO_TRAVEL, StepRecord, Travel
 from ratslam.recall.memory import CroppedRows, MergedRows
 from tactile.base.se2 import between, compose, correct_heading, inverse
 
@@ -57,7 +57,11 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     row = map.archive.row.rows.copy() if map.archive.begun else np.arange(kept)
     graph, log = _unmerged(map)
     elsewhere = bool(graph.begins.rows[taken[-1] + 1 :].any())
-    since = HALT if elsewhere else _since(graph, int(taken[-1]))
+    since, last = NO_TRAVEL, int(taken[-1])
+    if not elsewhere:  # the odometry from the last keyframe that remains to the newest one
+        reckoned = graph.dead_reckoned()
+        sums = (float(values.rows[last + 1 :].sum()) for values in (graph.length, graph.turn))
+        since = Travel(between(reckoned[last], reckoned[-1]), *sums)
     own = map.arrays()
     arrays = {name: value for name, value in own.items() if not name.startswith(AFRESH)}
     arrays |= {name: value for name, value in blank.arrays().items() if name.startswith(AFRESH)}
@@ -73,7 +77,14 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
         arrays["merger/merge_due/0"] = np.array(map.config.merge_stood > 0)
     views = map.appearance.stored(taken)
     map.appearance.take(taken)
-    arrays |= _onwards(since, own) | {"solved/0": np.array(-1), "solved/1": np.array(-1)}
+    motion, length, turn = (own[f"travel/{k}"] for k in range(3))
+    arrays |= {
+        "travel/0": compose(since.motion, motion),
+        "travel/1": np.array(since.length + length),
+        "travel/2": np.array(since.turn + turn),
+        "solved/0": np.array(-1),
+        "solved/1": np.array(-1),
+    }
     parts = (
         ("graph/", graph), ("log/", log), ("steps/", steps), ("experiences/", experiences),
         ("appearance/", map.appearance),
@@ -82,7 +93,9 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
         arrays |= {prefix + name: value for name, value in part.arrays().items()}
     # The hypotheses of the selection begin at the first keyframe, so that the map stays where it was.
     arrays["selection/hypotheses/poses/0"] = graph.pose.rows[None, :1].copy()
-    arrays |= _acceptance(own, sequences)
+    compared = own.get("acceptance/log_ratio")  # with odometry, where the rule of acceptance does that
+    if compared is not None:
+        arrays["acceptance/log_ratio"] = compared[sequences[sequences < len(compared)]]
     map.restore(arrays)
     merged = MergedRows(row[taken], *views, np.maximum(number[before], 0), np.zeros((len(before), 3)))
     return CroppedRows(merged, inside[before], *since, elsewhere)
@@ -97,23 +110,6 @@ def _unmerged(map: KeyframeMap) -> tuple[KeyframeGraph, ClosureLog]:
     graph.bias, graph.turn_error = fit.bias, fit.turn_error
     graph.reckoned = map.kept_keyframes().reckoned
     return graph, log.copy()
-
-
-def _since(graph: KeyframeGraph, last: int) -> Travel:
-    """The odometry from a keyframe to the newest one."""
-    reckoned = graph.dead_reckoned()
-    length, turn = (float(values.rows[last + 1 :].sum()) for values in (graph.length, graph.turn))
-    return Travel(between(reckoned[last], reckoned[-1]), length, turn)
-
-
-def _onwards(since: Travel, own: Arrays) -> Arrays:
-    """The arrays of the odometry since the newest keyframe that remains."""
-    motion, length, turn = (own[f"travel/{k}"] for k in range(3))
-    return {
-        "travel/0": compose(since.motion, motion),
-        "travel/1": np.array(since.length + length),
-        "travel/2": np.array(since.turn + turn),
-    }
 
 
 def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, since: Travel) -> None:
@@ -133,11 +129,3 @@ def _take_graph(graph: KeyframeGraph, taken: np.ndarray, sequences: np.ndarray, 
     cut[skipped] = np.where(graph.begins.rows[skipped], -1, INTERRUPTED)
     cut[0], graph.begins.rows[0] = -1, False
     graph.taken.replace(np.arange(len(taken)))
-
-
-def _acceptance(own: Arrays, sequences: np.ndarray) -> Arrays:
-    """The array of the rule of acceptance, where it has one: what it compared with odometry."""
-    compared = own.get("acceptance/log_ratio")
-    if compared is None:
-        return {}
-    return {"acceptance/log_ratio": compared[sequences[sequences < len(compared)]]}

@@ -66,9 +66,12 @@ def difference(first: MapContent, second: MapContent) -> Difference:
         places[second.names[number]].append(number)
     pairs = [(number, places[name].pop()) for number, name in enumerate(first.names) if places.get(name)]
     a, b = np.array([a for a, _ in pairs], int), np.array([b for _, b in pairs], int)
-    ours, theirs = _pairs(first.closures, a, len(first.names)), _pairs(second.closures, b, len(second.names))
-    closures = len(ours & theirs)
-    moved, turned = _moved(first.poses[a], second.poses[b])
+    before, after = _pairs(first.closures, a, len(first.names)), _pairs(second.closures, b, len(second.names))
+    closures = len(before & after)
+    moved = turned = np.zeros(0)
+    if len(a):  # distances, m, and differences of heading, rad, after a motion of the second map as a whole
+        apart = compose(fit_rigid_motion(second.poses[b], first.poses[a]), second.poses[b]) - first.poses[a]
+        moved, turned = np.hypot(apart[:, 0], apart[:, 1]), np.abs(wrap(apart[:, 2]))
     return Difference(
         len(a),
         len(first.names) - len(a),
@@ -86,14 +89,6 @@ def _pairs(closures: np.ndarray, common: np.ndarray, count: int) -> set[tuple[in
     number = np.full(count, -1)
     number[common] = np.arange(len(common))
     return {(i, j) for i, j in number[closures.astype(int)].reshape(-1, 2).tolist() if min(i, j) >= 0}
-
-
-def _moved(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[n] distances, m, and differences of heading, rad, of poses [n, 3] moved as a whole."""
-    if not len(first):
-        return np.zeros(0), np.zeros(0)
-    apart = compose(fit_rigid_motion(second, first), second) - first
-    return np.hypot(apart[:, 0], apart[:, 1]), np.abs(wrap(apart[:, 2]))
 
 
 def _largest(values: np.ndarray) -> tuple[float, float]:

@@ -1,17 +1,13 @@
-"""Supposed poses of a session in a map, each with the log-odds of the whole session since its start.
+"""Pose hypotheses of a session in a map, each with the log-odds of the whole session since its start.
 
-Recall proposes poses. A proposed pose is followed back to the start of the session, and from then on with
-it: it has to explain all views, not only those that proposed it. The rule is ours; localisation with an
-unknown start by hypotheses is Fox et al. 1999.
+Recall proposes poses. A proposed pose is followed back to the start of the session, and from then on with it:
+it has to explain all views, not only those that proposed it (localisation with an unknown start by
+hypotheses: Fox et al. 1999). A path is a pose followed through many keyframes.
 
-Log-odds of a pose that is right although its views contradict the map for a while: the place has changed.
-
-A hidden Markov model with a state in which the views agree, and a changed state of bounded length in which
-they are as likely as at the other place that they resemble most. A short contradiction costs its prior,
-however strong it is; one that lasts, or views of another known place, are those of a wrong pose. The model is
-ours.
-
-Paths: a supposed pose followed through many keyframes of a session.
+A right pose may be contradicted for a while because the place has changed. A hidden Markov model has a state
+in which the views agree, and a changed state of bounded length in which they are as likely as at the other
+place that they resemble most. A short contradiction costs its prior, however strong it is; one that lasts, or
+views of another known place, are those of a wrong pose.
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.mapping.ground import LEAVING, GainOdds, Ground, Motion, Supposed, advance
+from ratslam.mapping.ground import LEAVING, GainOdds, Ground, Motion, PoseHypothesis, advance
 from tactile.base.se2 import wrap
 
 BESIDE = -1.0
@@ -38,22 +34,50 @@ BESIDE_SHARE = 0.3
 
 
 class Path(NamedTuple):
-    """A supposed pose followed through n keyframes: poses [n, 3], m, m, rad; covariances [n, 3, 3]; and
+    """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad; covariances [n, 3, 3]; and
     log-odds [n] of each keyframe, nat."""
 
     poses: np.ndarray
     covariances: np.ndarray
     odds: np.ndarray
 
+    def odds_beside(self, ground: Ground) -> np.ndarray:
+        """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the
+        first: a path beside the way stays there for some keyframes, and the map may be bent there."""
+        beside = np.array([ground.is_passed(pose) and not ground.is_near(pose) for pose in self.poses])
+        still = beside & np.concatenate([[False], beside[:-1]])
+        return np.where(still & (self.odds < 0), BESIDE_SHARE * self.odds, self.odds)
+
+    def at_undriven_headings(self, ground: Ground) -> np.ndarray:
+        """[n] bool: on the driven way, but at no heading that was driven there, so that a right pose and a
+        wrong one may both look unlike it."""
+        near = np.array([ground.is_near(pose) for pose in self.poses])
+        apart = np.array([np.hypot(*(ground.poses[:, :2] - pose[:2]).T).min() for pose in self.poses])
+        return ~near & (apart < ground.near_share * ground.reach)
+
+    def independent_odds(self, ground: Ground) -> np.ndarray:
+        """[n] the log-odds of each keyframe, nat, less where an earlier keyframe gave nearly the same
+        evidence.
+
+        A place elsewhere that is alike is alike at each visit, and often from every heading; one that is not,
+        contradicts at each.
+        """
+        apart = np.hypot(*(self.poses[:, None, :2] - self.poses[None, :, :2]).T)
+        keyframe = np.arange(len(apart))
+        earlier = keyframe[:, None] - keyframe >= AGAIN
+        again = (earlier & (apart < ground.near_share * ground.reach)).any(axis=1)
+        odds = self.odds_beside(ground)
+        return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)
+
 
 def follow(
     ground: Ground,
     odds: GainOdds,
-    at: Supposed,
+    at: PoseHypothesis,
     onwards: Iterable[tuple[Motion, np.ndarray | None]],
     least: float = -np.inf,
 ) -> Path:
-    """The path from a supposed pose on mapped ground; ends early once its log-odds are below `least`.
+    """The path from a pose hypothesis on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
         onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
@@ -79,7 +103,7 @@ def keyframe_odds(
     """Log-odds of one keyframe, nat, and whether it is on mapped ground.
 
     Args:
-        pose: [3] where it is supposed to be. gain: see `advance`.
+        pose: [3] of the hypothesis. gain: see `advance`.
         inside: whether the keyframe before is on mapped ground.
     """
     if gain is None:
@@ -93,42 +117,12 @@ def keyframe_odds(
     return 0.0, inside  # the pose is so uncertain that keyframes beyond the reach were compared
 
 
-def counted_beside(ground: Ground, path: Path) -> np.ndarray:
-    """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the first:
-    a path beside the way stays there for some keyframes, and the map may be bent there."""
-    beside = np.array([ground.is_passed(pose) and not ground.is_near(pose) for pose in path.poses])
-    still = beside & np.concatenate([[False], beside[:-1]])
-    return np.where(still & (path.odds < 0), BESIDE_SHARE * path.odds, path.odds)
-
-
-def at_undriven_headings(ground: Ground, path: Path) -> np.ndarray:
-    """[n] bool: on the driven way, but at no heading that was driven there, so that a right pose and a wrong
-    one may both look unlike it."""
-    near = np.array([ground.is_near(pose) for pose in path.poses])
-    apart = np.array([np.hypot(*(ground.poses[:, :2] - pose[:2]).T).min() for pose in path.poses])
-    return ~near & (apart < ground.near_share * ground.reach)
-
-
-def less_where_dependent(ground: Ground, path: Path) -> np.ndarray:
-    """[n] the log-odds of each keyframe, nat, less where a keyframe before has said nearly the same.
-
-    A place elsewhere that is alike is alike at each visit, and often from every heading; one that is not,
-    contradicts at each.
-    """
-    apart = np.hypot(*(path.poses[:, None, :2] - path.poses[None, :, :2]).T)
-    keyframe = np.arange(len(apart))
-    earlier = keyframe[:, None] - keyframe >= AGAIN
-    again = (earlier & (apart < ground.near_share * ground.reach)).any(axis=1)
-    odds = counted_beside(ground, path)
-    return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)
-
-
 SPAN = 400
 """Largest number of keyframes of the session that a proposed pose is followed back."""
-HOPELESS = -25.0
-"""Log-odds below which a supposed pose is dropped."""
+MIN_LOG_ODDS = -25.0
+"""Log-odds below which a pose hypothesis is dropped."""
 SAME_HEADING = 0.5
-"""Difference in heading within which two supposed poses are the same, rad; in position it is the ground's
+"""Difference in heading within which two hypotheses are the same, rad; in position it is the ground's
 reach."""
 
 
@@ -180,8 +174,8 @@ class SessionViews(Checkpointed):
         """[S, N] gains of the view of keyframe k, None if it shows nothing."""
         return self.gain.rows[k] if self.shows.rows[k] else None
 
-    def follow_back(self, ground: Ground, odds: GainOdds, at: Supposed, least: float = -np.inf) -> Path:
-        """The path to a supposed pose of the newest keyframe, from the newest to the oldest keyframe; ends
+    def follow_back(self, ground: Ground, odds: GainOdds, at: PoseHypothesis, least: float = -np.inf) -> Path:
+        """The path to a pose hypothesis of the newest keyframe, from the newest to the oldest keyframe; ends
         early once its log-odds are below `least`."""
         keyframes = range(self.count - 2, max(self.count - 1 - SPAN, -1), -1)
         back = ((self.moved(k + 1).reversed(), self.gains(k)) for k in keyframes)
@@ -190,7 +184,7 @@ class SessionViews(Checkpointed):
 
 class Hypotheses(Checkpointed):
     """Attributes:
-    pose: [h, 3], covariance: [h, 3, 3] of each supposed pose now. log_odds: [h] of the session so far.
+    pose: [h, 3], covariance: [h, 3, 3] of each hypothesis now. log_odds: [h] of the session so far.
     states: [h, 1 + LONGEST] log-odds since it was proposed if the ground may have changed, see
         `interruptions`. best: [h] the largest sum of these so far. inside: [h] bool, on mapped ground.
     """
@@ -205,12 +199,12 @@ class Hypotheses(Checkpointed):
 
     @property
     def count(self) -> int:
-        """Number of supposed poses."""
+        """Number of hypotheses."""
         return len(self.log_odds.rows)
 
-    def at(self, k: int) -> Supposed:
-        """A supposed pose."""
-        return Supposed(self.pose.rows[k], self.covariance.rows[k])
+    def at(self, k: int) -> PoseHypothesis:
+        """A pose hypothesis."""
+        return PoseHypothesis(self.pose.rows[k], self.covariance.rows[k])
 
     def advance(
         self,
@@ -220,7 +214,7 @@ class Hypotheses(Checkpointed):
         gain: np.ndarray | None,
         recalled: Recalled | None = None,
     ) -> None:
-        """Moves all supposed poses to the newest keyframe; drops hopeless ones, and the weaker of two that
+        """Moves all hypotheses to the newest keyframe; drops unlikely ones, and the weaker of two that
         have become one."""
         log_odds = np.zeros(self.count)
         for k in range(self.count):
@@ -235,18 +229,24 @@ class Hypotheses(Checkpointed):
             elsewhere = np.where(another, max(odds.of(recalled.gain), 0.0), 0.0)
         self.states.rows[:] = continue_states(self.states.rows, log_odds, elsewhere)
         self.best.rows[:] = np.maximum(self.best.rows, summed(self.states.rows))
-        self._drop(ground)
+        kept: list[int] = []
+        for k in self.ranked().tolist():
+            likely = self.log_odds.rows[k] >= MIN_LOG_ODDS
+            if likely and not same_pose(ground, self.pose.rows[kept], self.pose.rows[k]).any():
+                kept.append(k)
+        if len(kept) < self.count:
+            self._keep(np.isin(np.arange(self.count), kept))
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
-        """Adds a supposed pose [3] of the newest keyframe, with the log-odds of its own way back to the start
-        of the session, unless there is one like it."""
+        """Adds a pose hypothesis [3] of the newest keyframe, with the log-odds of its own way back to the
+        start of the session, unless there is one like it."""
         if same_pose(ground, self.pose.rows, pose).any():
             return
-        at = Supposed(pose, np.diag(ground.variance))
-        self._add_unless_hopeless(at, float(views.follow_back(ground, odds, at, HOPELESS).odds.sum()))
+        at = PoseHypothesis(pose, np.diag(ground.variance))
+        self._add_likely(at, float(views.follow_back(ground, odds, at, MIN_LOG_ODDS).odds.sum()))
 
     def continue_uncertain(self, ground: Ground, odds: GainOdds, recalled: Recalled) -> None:
-        """Supposes the recalled pose if it continues another one, which odometry has made uncertain: with the
+        """Adds the recalled pose if it continues another one, which odometry has made uncertain: with the
         log-odds of the likeliest of these, of being here, and of the view."""
         uncertain = [k for k in range(self.count) if not self.at(k).is_comparable(ground)]
         if not uncertain:
@@ -258,14 +258,14 @@ class Hypotheses(Checkpointed):
         if len(same):
             self.log_odds.rows[same] = np.maximum(self.log_odds.rows[same], log_odds)
         else:
-            self._add_unless_hopeless(Supposed(recalled.pose, np.diag(ground.variance)), log_odds)
+            self._add_likely(PoseHypothesis(recalled.pose, np.diag(ground.variance)), log_odds)
 
-    def _add_unless_hopeless(self, at: Supposed, log_odds: float) -> None:
-        if log_odds >= HOPELESS:
+    def _add_likely(self, at: PoseHypothesis, log_odds: float) -> None:
+        if log_odds >= MIN_LOG_ODDS:
             self.add(at, log_odds)
 
-    def add(self, at: Supposed, log_odds: float) -> None:
-        """Adds a supposed pose of the newest keyframe with the log-odds of the session so far."""
+    def add(self, at: PoseHypothesis, log_odds: float) -> None:
+        """Adds a pose hypothesis of the newest keyframe with the log-odds of the session so far."""
         self.pose.append(at.pose)
         self.covariance.append(at.covariance)
         self.log_odds.append(log_odds)
@@ -278,21 +278,12 @@ class Hypotheses(Checkpointed):
         self._keep(np.zeros(self.count, bool))
 
     def fall(self, k: int) -> float:
-        """By how much the log-odds of a supposed pose are below their best, changed ground allowed for."""
+        """By how much the log-odds of a pose hypothesis are below their best, changed ground allowed for."""
         return float(self.best.rows[k] - summed(self.states.rows[k : k + 1])[0])
 
     def ranked(self) -> np.ndarray:
-        """[h] the supposed poses by descending log-odds."""
+        """[h] the hypotheses by descending log-odds."""
         return np.argsort(-self.log_odds.rows, kind="stable")
-
-    def _drop(self, ground: Ground) -> None:
-        kept: list[int] = []
-        for k in self.ranked().tolist():
-            hopeless = self.log_odds.rows[k] < HOPELESS
-            if not hopeless and not same_pose(ground, self.pose.rows[kept], self.pose.rows[k]).any():
-                kept.append(k)
-        if len(kept) < self.count:
-            self._keep(np.isin(np.arange(self.count), kept))
 
     def _keep(self, rows: np.ndarray) -> None:
         for array in (self.pose, self.covariance, self.log_odds, self.states, self.best, self.inside):

@@ -1,16 +1,11 @@
-"""Joins two pieces of a map if the views of one, compared with the keyframes of the other, place it there
-beyond doubt.
+"""Joins two pieces of a map if the views of one, compared with the keyframes of the other, leave no doubt.
 
-A placement of one piece in the other has to explain all its views, be more likely than any other by far, and
-be found from either side. Its keyframes on common ground then give closure sequences, which are selected
-together with all others; the pieces are joined if most of their evidence stands. Anchoring whole sessions is
-Kim et al. 2010; the rule is ours.
-
-A piece of a finished map over the ground of another one.
-
-The piece is solved: as a whole it lies on the ground nearly as a rigid body. So where the robot comes back
-from a way that the other map does not have, its pose follows from all places confirmed so far, and not from a
-long way of odometry.
+A placement of one piece in the other has to explain all its views, be more likely than any other by far,
+and be found from either side. Its keyframes on common ground then give closure sequences, which are
+selected together with all others; the pieces are joined if most of their evidence is accepted. Anchoring
+whole sessions: Kim et al. 2010. A solved piece lies on the ground nearly as a rigid body (`MapTraverse`):
+where the robot comes back from a way that the other map does not have, its pose follows from all places
+confirmed so far, and not from a long way of odometry.
 """
 
 from __future__ import annotations
@@ -22,13 +17,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ratslam.mapping.closure_selection import MapHypotheses
-from ratslam.mapping.ground import STILL, GainOdds, Ground, Motion, Supposed, advance
+from ratslam.mapping.ground import NO_MOTION, GainOdds, Ground, Motion, PoseHypothesis, advance
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.mapping.optimizer import MapCovariance
-from ratslam.places.hypotheses import Path, at_undriven_headings, counted_beside, keyframe_odds
+from ratslam.places.hypotheses import Path, keyframe_odds
 from ratslam.places.placement import Comparison, Stretch, Traverse, closures_along, find_placements
 from ratslam.recall.memory import Memory
 from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
@@ -37,7 +32,7 @@ LOG_ODDS = 15.0
 """Least log-odds of a placement, beyond the logarithm of the number of places."""
 LEAST = 10
 """Least number of keyframes of a piece that is joined."""
-HOPELESS = -60.0
+MIN_LOG_ODDS = -60.0
 """Log-odds of the way to either end of a piece below which a placement is dropped."""
 SOLVED = 0.1
 """Variance of the motion between keyframes of a solved map, as a share of that of odometry."""
@@ -158,7 +153,12 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     graph = map.kept_keyframes()
     found = _place(map, views, one, other)
     back = found and _place(map, views, other, one)
-    if not found or not back or not _agree(graph, found, back):
+    if not found or not back:
+        return None
+    # Both placements, of either piece in the other, have to be the same.
+    own = graph.pose.rows[found.frames][found.on]
+    apart = between(compose(found.motion, own), compose(inverse(back.motion), own))
+    if not _is_small(found.ground, apart):
         return None
     if max(found.common, back.common) < COMMON:
         return None
@@ -166,7 +166,15 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     start = compose(found.motion, graph.pose.rows[other[0]])
     trial, log = graph.copy(), map.log.copy()
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
-    first, solution = log.sequences, _solve_with(trial, log, sequences)
+    # The map with these closures, selected together with all others where sequences are selected.
+    first, selected = log.sequences, None
+    _add(log, sequences)
+    trial.optimise(log)
+    if trial.config.select_every:
+        hypotheses = MapHypotheses()
+        hypotheses.begin(trial.fit(), log.sequences)
+        selected = selected_solution(trial, log, hypotheses)
+    solution = selected or solved_map(trial, log)
     new = np.arange(log.sequences) >= first
     standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
     scores = solution.log.scores()
@@ -174,21 +182,16 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
         return None
     _take_up(map, solution, sequences)
     middle = sequences[len(sequences) // 2][0]
-    covariance = _covariance(graph, map.log).relative(middle.match, middle.keyframe, 0.0)
+    # The pieces are held together here: what lies `LOOSE` apart cannot be compared in double precision.
+    problem, piece = graph.problem(map.log, graph.cut), graph.pieces(map.log)
+    joined = np.where((piece[1:] != piece[:-1])[:, None], 1.0, problem.chain.variance)
+    problem = problem._replace(chain=problem.chain._replace(variance=joined))
+    covariance = MapCovariance(graph.fit(), problem).relative(middle.match, middle.keyframe, 0.0)
     return Join(
         ((), ()), start, np.sqrt(np.diag(covariance)),
         (found.log_odds, back.log_odds), (found.needed, back.needed),
         sum(len(sequence) for sequence in sequences),
     )  # fmt: skip
-
-
-def _covariance(graph: KeyframeGraph, log: ClosureLog) -> MapCovariance:
-    """The covariance of a map, the pieces of which are held together: what lies `LOOSE` apart cannot be
-    compared in the precision of a computer."""
-    problem, piece = graph.problem(log, graph.cut), graph.pieces(log)
-    apart = piece[1:] != piece[:-1]
-    variance = np.where(apart[:, None], 1.0, problem.chain.variance)
-    return MapCovariance(graph.fit(), problem._replace(chain=problem.chain._replace(variance=variance)))
 
 
 def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
@@ -200,8 +203,14 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     poses = archive.poses(graph.pose.rows)[every]
     ground, odds = views.ground(poses), views.odds(every, poses)
     motions = _motions(graph, own)
-    session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, HOPELESS)
-    paths = [_weighed(ground, path) for path in find_placements(ground, odds, session)]
+    session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, MIN_LOG_ODDS)
+    paths = []
+    for path in find_placements(ground, odds, session):
+        # No evidence against it at headings that the other session never drove, and less in runs beside its
+        # way: two sessions drive different routes, and turn at different places.
+        counted = path.odds_beside(ground)
+        undriven = path.at_undriven_headings(ground)
+        paths.append(path._replace(odds=np.where(undriven, np.maximum(counted, 0.0), counted)))
     paths.sort(key=lambda path: -path.odds.sum())
     needed = LOG_ODDS + float(np.log(max(ground.places(), 1.0)))
     if not paths or paths[0].odds.sum() < needed:
@@ -218,11 +227,11 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
 
 
 def _compare(
-    graph: KeyframeGraph, views: Views, ever: np.ndarray, poses: np.ndarray, frames: np.ndarray
+    graph: KeyframeGraph, views: Views, taken: np.ndarray, poses: np.ndarray, frames: np.ndarray
 ) -> Comparison:
-    """The views of keyframes `frames` [n] on those `ever` [M] taken, at `poses` [M, 3]."""
+    """The views of keyframes `frames` [n] on those numbered `taken` [M] of all, at `poses` [M, 3]."""
     motion = np.array([moved.motion for moved in _motions(graph, graph.pose.rows[frames])])
-    return views.compare(views.freeze(ever, poses), graph.taken.rows[frames], motion)
+    return views.compare(views.freeze(taken, poses), graph.taken.rows[frames], motion)
 
 
 def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
@@ -230,20 +239,6 @@ def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
     motion = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
     variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
     return [Motion(*one) for one in zip(motion, variance, strict=True)]
-
-
-def _weighed(ground: Ground, path: Path) -> Path:
-    """A path without evidence against it at headings that the other session never drove, and with less in
-    runs beside its way: two sessions drive different routes, and turn at different places."""
-    odds = counted_beside(ground, path)
-    undriven = at_undriven_headings(ground, path)
-    return path._replace(odds=np.where(undriven, np.maximum(odds, 0.0), odds))
-
-
-def _agree(graph: KeyframeGraph, found: _Found, back: _Found) -> bool:
-    """Whether two placements, of either piece in the other, are the same."""
-    own = graph.pose.rows[found.frames][found.on]
-    return _is_small(found.ground, between(compose(found.motion, own), compose(inverse(back.motion), own)))
 
 
 def _is_small(ground: Ground, apart: np.ndarray) -> bool:
@@ -264,22 +259,18 @@ def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Ca
             continue
         if k - last > graph.config.max_gap:
             sequences.append([])
+        # The closure of the later with the earlier keyframe, which face `turn` (rad) from each other.
         frame, other = int(found.frames[k]), int(found.onto[match.frame])
-        turn = float(ground.turns[match.shift])
-        sequences[-1].append(_candidate(graph, frame, other, turn, match.gain))
+        turn, angle = float(ground.turns[match.shift]), graph.sector_angle
+        if frame < other:
+            frame, other, turn = other, frame, -turn
+        shift = round(-turn / angle) if angle else 0
+        if np.cos(angle) < 0:  # half a turn is the same either way
+            shift = abs(shift)
+        posterior = float(1 / (1 + np.exp(-match.gain)))
+        sequences[-1].append(Candidate(frame, other, shift, posterior, match.gain))
         last = k
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
-
-
-def _candidate(graph: KeyframeGraph, frame: int, match: int, turn: float, gain: float) -> Candidate:
-    """The closure between two keyframes, the first of which faces `turn` (rad) from the second."""
-    if frame < match:
-        frame, match, turn = match, frame, -turn
-    angle = graph.sector_angle
-    shift = round(-turn / angle) if angle else 0
-    if np.cos(angle) < 0:  # half a turn is the same either way
-        shift = abs(shift)
-    return Candidate(frame, match, shift, float(1 / (1 + np.exp(-gain))), gain)
 
 
 def _add(log: ClosureLog, sequences: list[list[Candidate]]) -> None:
@@ -287,19 +278,6 @@ def _add(log: ClosureLog, sequences: list[list[Candidate]]) -> None:
         for k, candidate in enumerate(sequence):
             log.add(candidate, k > 0)
         log.judge(log.sequences - 1, Verdict.ACCEPTED)
-
-
-def _solve_with(graph: KeyframeGraph, log: ClosureLog, sequences: list[list[Candidate]]) -> MapSolution:
-    """The map with further closure sequences, selected together with all others where sequences are selected;
-    changes graph and log."""
-    _add(log, sequences)
-    graph.optimise(log)
-    solution = None
-    if graph.config.select_every:
-        hypotheses = MapHypotheses()
-        hypotheses.begin(graph.fit(), log.sequences)
-        solution = selected_solution(graph, log, hypotheses)
-    return solution or solved_map(graph, log)
 
 
 def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candidate]]) -> None:
@@ -327,19 +305,19 @@ class MapTraverse(NamedTuple):
 
     Attributes:
         views: compared with the ground. poses: [n, 3] in the piece, m, m, rad. motions: [n] into each
-            keyframe, the first one's not used. hopeless: log-odds of the way to either end below which a
+            keyframe, the first one's not used. least: log-odds of the way to either end below which a
             placement is dropped.
     """
 
     views: Comparison
     poses: np.ndarray
     motions: list[Motion]
-    hopeless: float
+    least: float
 
     def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
         """The path with keyframe k at `pose` [3]: of the whole piece as a rigid body if many places agree on
-        one; else as odometry leads, as far as it is not hopeless."""
-        way = Traverse(self.views, self.motions, self.hopeless).follow(ground, odds, k, pose)
+        one; else as odometry leads, as far as it is likely enough."""
+        way = Traverse(self.views, self.motions, self.least).follow(ground, odds, k, pose)
         confirmed = np.flatnonzero(way.path.odds > 0)
         own, found = self.poses[way.first + confirmed], way.path.poses[confirmed]
         together = _largest_rigid_part(ground, own, found)
@@ -351,11 +329,11 @@ class MapTraverse(NamedTuple):
     def _along(self, ground: Ground, odds: GainOdds, moved: np.ndarray) -> Path:
         """The path of the piece moved by `moved` [3], corrected by the views."""
         rigid, loose = compose(moved, self.poses), np.diag(ground.variance)
-        at, inside, unconfirmed = Supposed(rigid[0], loose), False, UNCONFIRMED
+        at, inside, unconfirmed = PoseHypothesis(rigid[0], loose), False, UNCONFIRMED
         poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
         for k, motion in enumerate(self.motions):
             if unconfirmed >= UNCONFIRMED:
-                at, motion = Supposed(rigid[k], loose), STILL
+                at, motion = PoseHypothesis(rigid[k], loose), NO_MOTION
             at, gain = advance(ground, at, motion, self.views.gains(k))
             gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
             poses[k], covariances[k] = at

@@ -1,9 +1,8 @@
-"""Localisation of a session in a finished map, which does not change.
+"""Localisation of a session in a finished map, which does not change, and the odds of views that it needs.
 
-A map compared with itself: gains at revisits, and at other places that look alike.
-
-The later keyframes of the map play a session on the ground of the earlier ones. Each of some stretches is
-followed from its own pose, and from the poses elsewhere whose first views fit best.
+The log-odds that a view's gain is one of a true pose are learned from the map compared with itself: later
+keyframes are localised against earlier ones, each stretch from its own pose (true) and from the places
+elsewhere whose first views fit best (false).
 """
 
 from __future__ import annotations
@@ -19,21 +18,20 @@ from ratslam.core.backend import Evidence, Map
 from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Action, Estimate, Localisation, LocalisedPose, pieces_of, write_course
 from ratslam.mapping.ground import (
-    DISTINCT,
-    PLAIN,
-    STILL,
+    MAP_WEIGHTING,
+    NO_MOTION,
+    SESSION_WEIGHTING,
     GainOdds,
+    GainWeighting,
     Ground,
     Motion,
-    Supposed,
-    Weighing,
+    PoseHypothesis,
     advance_all,
     learn_gain_odds,
-    move,
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.step_record import HALT
+from ratslam.mapping.step_record import NO_TRAVEL
 from ratslam.places.hypotheses import LONGEST, Hypotheses, Recalled, SessionViews
 from ratslam.places.placement import NOTHING_RECALLED
 from tactile.base.se2 import between, wrap
@@ -45,7 +43,7 @@ if TYPE_CHECKING:
 
 UNEXPLAINED = 4.0
 """The session is not in the map if its views, were it there, would have given this multiple of the log-odds
-needed to be found, and the best supposed pose has less than half of these."""
+needed to be found, and the best hypothesis has less than half of these."""
 LARGEST_EXPONENT = 700.0
 """Of a double, rounded down."""
 HEADING_NOISE = 2.0
@@ -91,8 +89,8 @@ class Localiser(Checkpointed, Map):
 
     Args:
         place: the finished map. log_odds: above which a pose is found, after the logarithm of the number of
-            places is subtracted. start: [3] pose in the map at which the session is supposed to begin; it is
-            just believed, until views contradict it. None: unknown.
+            places is subtracted. start: [3] pose in the map at which the session begins; it is believed,
+            until views contradict it. None: unknown.
     """
 
     VALUES = (
@@ -106,7 +104,7 @@ class Localiser(Checkpointed, Map):
         self._needed = log_odds + self._places
         shifts, count = len(place.ground.turns), len(place.ground.poses)
         self._views, self._hypotheses = SessionViews(shifts, count), Hypotheses()
-        self._travel = HALT
+        self._travel = NO_TRAVEL
         self._state = int(Localisation.SEARCHING)
         self._recalled = NOTHING_RECALLED
         self._newest, self._covariance = np.zeros(3), np.zeros((3, 3))  # pose of the newest keyframe
@@ -119,21 +117,17 @@ class Localiser(Checkpointed, Map):
         size = place.map.appearance.stored(place.frames[:0])[0].shape[1]
         self._view = GrowableArray((size,), np.float64)  # its view
         if start is not None:
-            self._suppose(start)
-
-    def _suppose(self, start: np.ndarray) -> None:
-        """Believes a pose [3] at which the session begins, just enough to be found."""
-        at = Supposed(start.copy(), np.diag(self.place.ground.variance))
-        self._hypotheses.add(at, self._needed)
-        self._state = int(Localisation.FOUND)
-        self._newest, self._covariance = at
-        self._mass, self._log_odds = 0.5, self._needed - self._places
+            at = PoseHypothesis(start.copy(), np.diag(place.ground.variance))
+            self._hypotheses.add(at, self._needed)  # just likely enough to be found
+            self._state = int(Localisation.FOUND)
+            self._newest, self._covariance = at
+            self._mass, self._log_odds = 0.5, self._needed - self._places
 
     # Queries
 
     def localisation(self) -> LocalisedPose:
         """The robot's pose now, and whether it is known."""
-        now = move(Supposed(self._newest, self._covariance), self._moved())
+        now = PoseHypothesis(self._newest, self._covariance).moved(self._moved())
         state = Localisation(self._state)
         if state == Localisation.FOUND and not now.is_comparable(self.place.ground):
             state = Localisation.LOST  # nothing was seen for long
@@ -168,12 +162,15 @@ class Localiser(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the graph of the finished map."""
-        return {"localisation.csv": self._write, "map.json": self.place.map.files()["map.json"]}
+        return {
+            "localisation.csv": lambda path: write_course(path, self._states.rows, self._record.rows),
+            "map.json": self.place.map.files()["map.json"],
+        }
 
     # Changes
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
-        """Moves all supposed poses by one step, and compares them with the view of a keyframe."""
+        """Moves all hypotheses by one step, and compares them with the view of a keyframe."""
         self._travel = self._travel.onwards(observation.odometry)
         if int(evidence.keyframe) >= 0:
             self._view.append(self.place.map.appearance.view_of(observation))
@@ -182,7 +179,9 @@ class Localiser(Checkpointed, Map):
         spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
         self._pose.append(now.pose)
         self._states.append(int(now.state))
-        self._record.append((now.mass, now.log_odds, Supposed(now.pose, now.covariance).deviations()[0]))
+        self._record.append(
+            (now.mass, now.log_odds, PoseHypothesis(now.pose, now.covariance).deviations()[0])
+        )
         dtype = np.asarray(estimate.pose).dtype
         return estimate._replace(
             pose=now.pose.astype(dtype),
@@ -216,18 +215,22 @@ class Localiser(Checkpointed, Map):
         moved = self._moved()
         gain = None
         if bool(evidence.shows):
-            gain = DISTINCT.weigh(np.asarray(evidence.gain)[:, : len(ground.poses)])
+            gain = SESSION_WEIGHTING.weigh(np.asarray(evidence.gain)[:, : len(ground.poses)])
         self._views.append(moved, gain)
         self._frame.append(len(self._pose.rows))
-        recalled = self._recall(evidence, moved, gain)
+        shift, match = int(evidence.shift_row), int(evidence.match)
+        self._recalled = self._recalled.onwards(ground, moved, shift, match, float(evidence.posterior))
+        recalled = None
+        if gain is not None and self._recalled.now:
+            recalled = Recalled(self._recalled.pose, float(gain[shift, match]))
         confirmed = recalled if self._recalled.is_confirmed else None
         self._hypotheses.advance(ground, odds, moved, gain, confirmed)
         if recalled is not None:
             self._hypotheses.continue_uncertain(ground, odds, recalled)
         if confirmed is not None:
             self._hypotheses.propose(ground, odds, self._views, confirmed.pose)
-        self._travel = HALT
-        self._judge(moved)
+        self._travel = NO_TRAVEL
+        self._update_state(moved)
         known = self._state == Localisation.FOUND and gain is not None
         self._found.append(self._newest if known else np.full(3, np.nan))
 
@@ -238,22 +241,13 @@ class Localiser(Checkpointed, Map):
         variance[2] *= HEADING_NOISE * graph.heading_noise.further_factor
         return Motion(graph.correct(motion, length), variance)
 
-    def _recall(self, evidence: Evidence, moved: Motion, gain: np.ndarray | None) -> Recalled | None:
-        """The recalled pose of the newest keyframe."""
-        shift, match = int(evidence.shift_row), int(evidence.match)
-        ground, posterior = self.place.ground, float(evidence.posterior)
-        self._recalled = self._recalled.onwards(ground, moved, shift, match, posterior)
-        if gain is None or not self._recalled.now:
-            return None
-        return Recalled(self._recalled.pose, float(gain[shift, match]))
-
-    def _judge(self, moved: Motion) -> None:
+    def _update_state(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""
         known = self._hypotheses
         if not known.count:
-            self._newest, self._covariance = move(Supposed(self._newest, self._covariance), moved)
+            self._newest, self._covariance = PoseHypothesis(self._newest, self._covariance).moved(moved)
             self._mass, self._log_odds = 0.0, -self._places
-            self._judge_unknown(0.0)
+            self._update_unknown(0.0)
             return
         order = known.ranked()
         best, odds = int(order[0]), known.log_odds.rows
@@ -269,12 +263,12 @@ class Localiser(Checkpointed, Map):
         elif odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
             self._state = int(Localisation.FOUND)
         elif self._state != Localisation.FOUND:
-            self._judge_unknown(float(odds[best]))
+            self._update_unknown(float(odds[best]))
         elif fell:
             self._lose()
 
-    def _judge_unknown(self, best: float) -> None:
-        """The state while no pose is found, and the best supposed one has these log-odds."""
+    def _update_unknown(self, best: float) -> None:
+        """The state while no pose is found, and the best hypothesis has these log-odds."""
         if self._state == Localisation.FOUND:
             self._lose()
         possible = int(self._views.shows.rows.sum()) * self.place.odds.expected
@@ -292,9 +286,6 @@ class Localiser(Checkpointed, Map):
         self._hypotheses.clear()
         self._views.forget(0)
 
-    def _write(self, path: Path) -> None:
-        write_course(path, self._states.rows, self._record.rows)
-
 
 STRETCHES = 24
 """Number of stretches."""
@@ -310,25 +301,26 @@ Gains = Callable[[int, int], np.ndarray]
 Arguments: the keyframe, n."""
 
 
-class Stretch(NamedTuple):
-    """Consecutive keyframes: ground before them, their gains [n, S, M] on it, the motions between them, and
-    the pose [3] of the first."""
+def _follow(
+    ground: Ground, gains: np.ndarray, motions: list[Motion], poses: np.ndarray, count: int
+) -> np.ndarray:
+    """[P, count] gains of the first keyframes of a stretch that begins at each of `poses` [P, 3].
 
-    ground: Ground
-    gains: np.ndarray
-    motions: list[Motion]
-    start: np.ndarray
-
-    def follow(self, poses: np.ndarray, count: int) -> np.ndarray:
-        """[P, count] gains of the first keyframes, supposed to begin at each of `poses` [P, 3]."""
-        at, found = Supposed(poses, np.zeros((len(poses), 3, 3))), np.zeros((len(poses), count))
-        for k in range(count):
-            at, found[:, k] = advance_all(self.ground, at, self.motions[k], self.gains[k])
-        return found
+    Args:
+        gains: [n, S, M] of its views on the ground. motions: [n] into each keyframe.
+    """
+    at, found = PoseHypothesis(poses, np.zeros((len(poses), 3, 3))), np.zeros((len(poses), count))
+    for k in range(count):
+        at, found[:, k] = advance_all(ground, at, motions[k], gains[k])
+    return found
 
 
 def compare_with_itself(
-    ground: Ground, guard: int, gains: Gains, held: np.ndarray | None = None, weighing: Weighing = PLAIN
+    ground: Ground,
+    guard: int,
+    gains: Gains,
+    held: np.ndarray | None = None,
+    weighing: GainWeighting = MAP_WEIGHTING,
 ) -> GainOdds:
     """The log-odds of gains on this ground.
 
@@ -342,44 +334,31 @@ def compare_with_itself(
     true, false = [np.zeros(0)], [np.zeros(0)]
     if count > first + LENGTH + guard:
         for begin in np.linspace(first, count - LENGTH - 1, STRETCHES).astype(int).tolist():
-            stretch = _stretch(ground, begin, guard, gains, held)
-            stretch = stretch._replace(gains=weighing.weigh(stretch.gains))
-            here, *elsewhere = stretch.follow(np.stack([stretch.start, *_alike(stretch)]), LENGTH)
+            poses = ground.poses[begin : begin + LENGTH]
+            motions = [NO_MOTION, *(Motion(step, np.zeros(3)) for step in between(poses[:-1], poses[1:]))]
+            known = begin - guard
+            earlier = ground._replace(poses=ground.poses[:known][held[:known]])
+            seen = weighing.weigh(gains(begin, LENGTH)[:, :, : len(earlier.poses)])
+            # Poses elsewhere on the ground at which the beginning of the stretch fits best.
+            shift, frame = np.indices((len(ground.turns), len(earlier.poses))).reshape(2, -1)
+            claims = earlier.claims(shift, frame)
+            apart = np.hypot(*(claims - poses[0])[:, :2].T)
+            same = (apart < ELSEWHERE * ground.reach) & _facing(claims, poses[0], ground)
+            # Without those near an earlier one that faces alike.
+            claims = claims[~same]
+            kept: list[int] = []
+            for k, pose in enumerate(claims):
+                near = np.hypot(*(claims[kept] - pose)[:, :2].T) < ground.reach
+                if not (near & _facing(claims[kept], pose, ground)).any():
+                    kept.append(k)
+            claims = claims[kept]
+            fits = _follow(earlier, seen, motions, claims, FIRST)
+            fit = np.where(np.isfinite(fits), fits, -1.0).sum(axis=1)
+            alike = claims[np.argsort(fit, kind="stable")[::-1][:ALIKE]]
+            here, *elsewhere = _follow(earlier, seen, motions, np.stack([poses[0], *alike]), LENGTH)
             true.append(_continued(here, weighing.matching))
             false += [_continued(gain, weighing.matching) for gain in elsewhere]
     return learn_gain_odds(np.concatenate(true), np.concatenate(false), weighing.prior)
-
-
-def _stretch(ground: Ground, begin: int, guard: int, gains: Gains, held: np.ndarray) -> Stretch:
-    poses = ground.poses[begin : begin + LENGTH]
-    motions = [STILL, *(Motion(step, np.zeros(3)) for step in between(poses[:-1], poses[1:]))]
-    known = begin - guard
-    earlier = ground._replace(poses=ground.poses[:known][held[:known]])
-    found = gains(begin, LENGTH)[:, :, : len(earlier.poses)]
-    return Stretch(earlier, found, motions, poses[0])
-
-
-def _alike(stretch: Stretch) -> np.ndarray:
-    """Poses [n, 3] elsewhere on the ground at which the beginning of the stretch fits best."""
-    ground = stretch.ground
-    shift, frame = (index.reshape(-1) for index in np.indices((len(ground.turns), len(ground.poses))))
-    claims = ground.claims(shift, frame)
-    apart = np.hypot(*(claims - stretch.start)[:, :2].T)
-    same = (apart < ELSEWHERE * ground.reach) & _facing(claims, stretch.start, ground)
-    claims = _spread_out(claims[~same], ground)
-    gains = stretch.follow(claims, FIRST)
-    fits = np.where(np.isfinite(gains), gains, -1.0).sum(axis=1)
-    return claims[np.argsort(fits, kind="stable")[::-1][:ALIKE]]
-
-
-def _spread_out(poses: np.ndarray, ground: Ground) -> np.ndarray:
-    """The poses [n, 3] without those near an earlier one that faces alike."""
-    kept: list[int] = []
-    for k, pose in enumerate(poses):
-        near = np.hypot(*(poses[kept] - pose)[:, :2].T) < ground.reach
-        if not (near & _facing(poses[kept], pose, ground)).any():
-            kept.append(k)
-    return poses[kept]
 
 
 def _facing(poses: np.ndarray, pose: np.ndarray, ground: Ground) -> np.ndarray:

@@ -1,20 +1,19 @@
-"""Where a session is in a finished map: placements that recall proposes, and their evidence.
+"""Where a session, or a piece of another map, is in a finished map: placements and their evidence.
 
-A placement is followed through the whole session, to its start and to its end: it has to explain all views,
-not only those that proposed it. The rule is ours.
-
-The views of a session compared with a ground.
+Recall proposes a pose of one keyframe. It is followed by odometry and views (`hypotheses.follow`) through
+the whole session, to its start and to its end: a placement has to explain all views, not only those that
+proposed it. Its log-odds are the sum of those of all keyframes, as in multiple hypothesis localisation (Fox
+et al. 1999, with hypotheses in place of particles). The keyframes on common ground then give loop closures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ratslam.mapping.ground import GainOdds, Ground, Match, Motion, Supposed
-from ratslam.places.hypotheses import HOPELESS, Path, follow, same_pose
+from ratslam.mapping.ground import GainOdds, Ground, Match, Motion, PoseHypothesis
+from ratslam.places.hypotheses import MIN_LOG_ODDS, Path, follow, same_pose
 from tactile.base.se2 import between, compose
 
 
@@ -23,8 +22,8 @@ class Comparison(NamedTuple):
 
     Attributes:
         gain: [n, S, N] log-likelihood of each view at each sector shift and keyframe less that at a new
-            place. shows: [n] bool, whether the view can be compared. match, shift: [n] the keyframe that is
-            recalled, -1 for none, and the row of its sector shift. posterior: [n] of the places around it.
+        place. shows: [n] bool, whether the view can be compared. match, shift: [n] the keyframe that is
+        recalled, -1 for none, and the row of its sector shift. posterior: [n] of the places around it.
     """
 
     gain: np.ndarray
@@ -75,8 +74,8 @@ NOTHING_RECALLED = RecalledPose(np.full(3, np.nan), 0, False)
 """Before the first keyframe."""
 
 
-class Followed(Protocol):
-    """A session that can be followed from a supposed pose, see `Traverse`."""
+class _Followed(Protocol):
+    """A session that can be followed from a pose hypothesis, see `Traverse`."""
 
     @property
     def views(self) -> Comparison: ...
@@ -93,21 +92,21 @@ class Traverse(NamedTuple):
 
     Attributes:
         views: compared with the ground. motions: [n] into each keyframe, the first one's not used.
-        hopeless: log-odds of the way to either end below which a placement is dropped.
+        least: log-odds of the way to either end below which a placement is dropped.
     """
 
     views: Comparison
     motions: list[Motion]
-    hopeless: float = HOPELESS
+    least: float = MIN_LOG_ODDS
 
     def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
-        """The path with keyframe k at `pose` [3], to both ends of the session unless it is hopeless."""
-        at = Supposed(pose, np.diag(ground.variance))
+        """The path with keyframe k at `pose` [3], to both ends of the session while it is likely enough."""
+        at = PoseHypothesis(pose, np.diag(ground.variance))
         views, motions = self.views, self.motions
         back = ((motions[i + 1].reversed(), views.gains(i)) for i in range(k - 1, -1, -1))
-        before = follow(ground, odds, at, back, self.hopeless)
+        before = follow(ground, odds, at, back, self.least)
         onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
-        after = follow(ground, odds, at, onwards, self.hopeless)
+        after = follow(ground, odds, at, onwards, self.least)
         parts = (np.concatenate([one[:0:-1], other]) for one, other in zip(before, after, strict=True))
         return Stretch(k + 1 - len(before.poses), Path(*parts))
 
@@ -125,36 +124,41 @@ class Stretch(NamedTuple):
         return inside and bool(same_pose(ground, self.path.poses[row : row + 1], pose)[0])
 
 
-def find_placements(ground: Ground, odds: GainOdds, session: Followed) -> list[Path]:
-    """The different placements of a session that recall proposes and that are not hopeless, those with the
-    largest log-odds first."""
+def find_placements(ground: Ground, odds: GainOdds, session: _Followed) -> list[Path]:
+    """The different placements of a session that recall proposes and that remain likely to both its ends.
+
+    A pose is proposed at a keyframe when `CONFIRMING` recalled poses in a row agree with the odometry between
+    them, unless a path followed before passes it.
+
+    Args:
+        ground: keyframes of the map, with their poses.
+        odds: log-odds of gains on this ground.
+        session: its views compared with the ground, and its odometry.
+
+    Returns:
+        paths over all keyframes of the session, those with the largest log-odds first; of two that are
+        together at most keyframes, the first one found.
+    """
     tried: list[Stretch] = []
     found: list[Path] = []
-    for k, pose in _proposals(ground, session):
-        if any(stretch.passes(ground, k, pose) for stretch in tried):
-            continue
-        tried.append(session.follow(ground, odds, k, pose))
-        path = tried[-1].path
-        whole = len(path.poses) == len(session.motions)
-        if whole and not any(_is_same(ground, path, other) for other in found):
-            found.append(path)
-    return sorted(found, key=lambda path: -path.odds.sum())
-
-
-def _is_same(ground: Ground, path: Path, other: Path) -> bool:
-    """Whether two paths are the same placement: they are together at most keyframes."""
-    together = [same_pose(ground, path.poses[k : k + 1], pose)[0] for k, pose in enumerate(other.poses)]
-    return bool(np.mean(together) > 0.5)
-
-
-def _proposals(ground: Ground, session: Followed) -> Iterator[tuple[int, np.ndarray]]:
-    """Keyframes and their recalled poses [3] that agree with odometry for `CONFIRMING` of them."""
     views, newest = session.views, NOTHING_RECALLED
     for k, moved in enumerate(session.motions):
         claim = int(views.shift[k]), int(views.match[k])
         newest = newest.onwards(ground, moved, *claim, float(views.posterior[k]))
-        if newest.is_confirmed:
-            yield k, newest.pose
+        pose = newest.pose
+        if not newest.is_confirmed or any(stretch.passes(ground, k, pose) for stretch in tried):
+            continue
+        tried.append(session.follow(ground, odds, k, pose))
+        path = tried[-1].path
+        if len(path.poses) < len(session.motions):
+            continue
+        for other in found:
+            pairs = enumerate(other.poses)
+            if np.mean([same_pose(ground, path.poses[i : i + 1], there)[0] for i, there in pairs]) > 0.5:
+                break
+        else:
+            found.append(path)
+    return sorted(found, key=lambda path: -path.odds.sum())
 
 
 def closures_along(ground: Ground, views: Comparison, path: Path) -> list[tuple[int, Match]]:

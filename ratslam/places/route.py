@@ -8,7 +8,7 @@ forwards must not use these ways.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -82,9 +82,21 @@ def travel_graph(
     for number, piece in enumerate(sorted(networkx.connected_components(graph), key=min)):
         for place in piece:
             graph.nodes[place]["piece"] = number
-    _add_turns(graph, travel.turn_radius)
+    # Turns on the spot between experiences of one piece that stand together and have no link.
+    numbers = list(graph.nodes())
+    if len(numbers) > 1:
+        tree = cKDTree(np.array([position(graph, number) for number in numbers]))
+        for i, j in sorted(tree.query_pairs(travel.turn_radius)):
+            a, b = numbers[i], numbers[j]
+            if graph.nodes[a]["piece"] == graph.nodes[b]["piece"] and not graph.has_edge(a, b):
+                graph.add_edge(a, b, traversals=0)
     for a, b, data in graph.edges(data=True):
-        data |= _cost(graph.nodes[a], graph.nodes[b], data["traversals"], travel)
+        one, other, traversals = graph.nodes[a], graph.nodes[b], data["traversals"]
+        length = float(np.hypot(one["x"] - other["x"], one["y"] - other["y"]))
+        turn = abs(float(wrap(one["heading"] - other["heading"])))
+        seconds = max(length / travel.speed, turn / travel.turn_rate, LEAST_SECONDS)
+        expected = seconds * (traversals + 2) / (traversals + 1)
+        data |= {"length": length, "seconds": seconds, "expected": expected}
     if obstacles is not None and len(obstacles):
         graph.remove_edges_from(blocked_links(graph, obstacles, standoff))
     return graph
@@ -119,12 +131,17 @@ def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode
     left: dict[int, float]
     left, ways = networkx.multi_source_dijkstra(graph, set(goals), weight=weight)  # type: ignore[assignment]
     if start not in left:
-        raise NoWay(_reason(graph, start, goals[0]))
-    return describe_way(graph, ways[start][::-1] if mode == "time" else _descend(graph, start, left))
-
-
-def describe_way(graph: networkx.Graph, experiences: list[int]) -> Way:
-    """The way over these experiences, each joined to the next."""
+        goal, here = goals[0], graph.nodes[start]["piece"]
+        there = graph.nodes[goal]["piece"]
+        if here != there:
+            raise NoWay(f"experience {goal} is in piece {there} and experience {start} in piece {here}")
+        raise NoWay(f"every way from experience {start} to experience {goal} is blocked")
+    experiences = ways[start][::-1]
+    if mode == "temporal":  # from each to the neighbour with the least time to a goal
+        experiences = [start]
+        while left[experiences[-1]] > 0:
+            neighbours = graph[experiences[-1]]
+            experiences.append(min(neighbours, key=lambda place: (left[place], place)))
     links = [graph.edges[pair] for pair in pairwise(experiences)]
     nodes = [graph.nodes[place] for place in experiences]
     poses = np.array([[node["x"], node["y"], node["heading"]] for node in nodes])
@@ -172,37 +189,3 @@ def position(graph: networkx.Graph, place: int) -> tuple[float, float]:
     """x and y of an experience, m."""
     node = graph.nodes[place]
     return node["x"], node["y"]
-
-
-def _add_turns(graph: networkx.Graph, radius: float) -> None:
-    """Joins experiences of one piece within a distance (m) that have no link."""
-    numbers = list(graph.nodes())
-    if len(numbers) < 2:
-        return
-    tree = cKDTree(np.array([position(graph, number) for number in numbers]))
-    for i, j in sorted(tree.query_pairs(radius)):
-        a, b = numbers[i], numbers[j]
-        if graph.nodes[a]["piece"] == graph.nodes[b]["piece"] and not graph.has_edge(a, b):
-            graph.add_edge(a, b, traversals=0)
-
-
-def _cost(a: dict, b: dict, traversals: int, travel: Travel) -> dict[str, float]:
-    length = float(np.hypot(a["x"] - b["x"], a["y"] - b["y"]))
-    turn = abs(float(wrap(a["heading"] - b["heading"])))
-    seconds = max(length / travel.speed, turn / travel.turn_rate, LEAST_SECONDS)
-    return {"length": length, "seconds": seconds, "expected": seconds * (traversals + 2) / (traversals + 1)}
-
-
-def _descend(graph: networkx.Graph, start: int, left: Mapping[int, float]) -> list[int]:
-    """From each experience to the neighbour with the least time to a goal."""
-    way = [start]
-    while left[way[-1]] > 0:
-        way.append(min(graph[way[-1]], key=lambda place: (left[place], place)))
-    return way
-
-
-def _reason(graph: networkx.Graph, start: int, goal: int) -> str:
-    pieces = [graph.nodes[place]["piece"] for place in (start, goal)]
-    if pieces[0] != pieces[1]:
-        return f"experience {goal} is in piece {pieces[1]} and experience {start} in piece {pieces[0]}"
-    return f"every way from experience {start} to experience {goal} is blocked"

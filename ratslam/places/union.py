@@ -1,9 +1,8 @@
 """One map of two: their keyframes, closures and steps one after the other, in pieces apart.
 
 Nothing joins the second map to the first one here (`ratslam.places.joining`). The odometry of the second is
-bent so that the calibration of the first one corrects it as its own did: each session keeps its own.
-
-Sessions that two maps have in common: keyframes that are equal to the bit.
+bent so that the calibration of the first one corrects it as its own did: each session keeps its own. Sessions
+that both maps hold, keyframes that are equal to the bit, are found by `overlap`.
 """
 
 from __future__ import annotations
@@ -39,14 +38,6 @@ OF_NEWEST = ("live/", "since/", "turned/", "begins/", "doubt/")
 """Parts about the newest keyframe, which is that of the second map."""
 
 
-class Counts(NamedTuple):
-    """Of the first map: keyframes that are not merged, keyframes ever taken, closure sequences."""
-
-    kept: int
-    ever: int
-    sequences: int
-
-
 class Bend(NamedTuple):
     """The change of odometry after which the calibration `new` corrects it as `old` did before."""
 
@@ -74,12 +65,27 @@ def unite(first: KeyframeMap, second: KeyframeMap, blank: KeyframeMap) -> Keyfra
         blank: an empty map of the same settings, which becomes the result.
     """
     a, b = _finished(first), _finished(second)
-    counts = Counts(len(a["graph/taken"]), int(a["graph/taken"][-1]) + 1, len(a["log/verdict"]))
+    # Of the first map: keyframes that are not merged, keyframes ever taken, closure sequences.
+    size, taken, sequences = len(a["graph/taken"]), int(a["graph/taken"][-1]) + 1, len(a["log/verdict"])
     bend = Bend(_calibration(b), _calibration(a))
-    united = a | _graph("graph/", a, b, counts, bend) | _log("log/", a, b, counts.kept, counts.sequences)
+    united = a | _graph("graph/", a, b, (size, taken, sequences), bend)
+    united |= _log("log/", a, b, size, sequences)
     if first.archive.begun or second.archive.begun:
-        united |= _archive(_archived(first, a), _archived(second, b), counts, bend)
-    united |= _steps(a, b, counts.ever, bend) | _newest(b, bend)
+        one, other = _archived(first, a), _archived(second, b)
+        pairs = other["pairs"].copy()
+        pairs[:, :2] += taken
+        archive = one | _graph("graph/", one, other, (taken, taken, sequences), bend)
+        archive |= _log("log/", one, other, taken, sequences)
+        archive["row"] = np.concatenate([one["row"], other["row"] + size])
+        archive["offset"] = np.concatenate([one["offset"], other["offset"]])
+        archive["pairs"] = np.concatenate([one["pairs"], pairs])
+        united |= {f"archive/{name}": value for name, value in archive.items()}
+    united |= _steps(a, b, taken, bend)
+    # What concerns the newest keyframe, and the odometry since.
+    motion, length = b["travel/0"], b["travel/1"]
+    bent = bend.motions(motion[None], np.asarray(length)[None])[0]
+    united |= {name: value for name, value in b.items() if name.startswith(OF_NEWEST)}
+    united |= {"travel/0": bent, "travel/1": length, "travel/2": b["travel/2"]}
     kept = {name: value for name, value in united.items() if not name.startswith(AFRESH)}
     blank.restore(blank.arrays() | kept)
     blank.appearance.extend(second.appearance)
@@ -122,13 +128,14 @@ def _archived(map: KeyframeMap, own: Arrays) -> Arrays:
     return rows | {name: value for name, value in own.items() if name.startswith(("graph/", "log/"))}
 
 
-def _graph(prefix: str, a: Arrays, b: Arrays, counts: Counts, bend: Bend, size: int | None = None) -> Arrays:
-    """Keyframes; `size`: their number in the first map, that of the map's unless given."""
-    size = counts.kept if size is None else size
+def _graph(prefix: str, a: Arrays, b: Arrays, counts: tuple[int, int, int], bend: Bend) -> Arrays:
+    """Keyframes of both; counts: of the first map the keyframes in these arrays, those ever taken, and the
+    closure sequences."""
+    (size, taken, sequences), cut = counts, b[prefix + "cut"]
     moved = b | {
         prefix + "motion": bend.motions(b[prefix + "motion"], b[prefix + "length"]),
-        prefix + "cut": _shifted_cut(b[prefix + "cut"], counts.sequences),
-        prefix + "taken": b[prefix + "taken"] + counts.ever,
+        prefix + "cut": np.where((cut >= 0) & (cut < INTERRUPTED), cut + sequences, cut),
+        prefix + "taken": b[prefix + "taken"] + taken,
         prefix + "begins": b[prefix + "begins"].copy(),
     }
     moved[prefix + "begins"][0] = True
@@ -144,10 +151,6 @@ def _graph(prefix: str, a: Arrays, b: Arrays, counts: Counts, bend: Bend, size: 
     return graph
 
 
-def _shifted_cut(cut: np.ndarray, sequences: int) -> np.ndarray:
-    return np.where((cut >= 0) & (cut < INTERRUPTED), cut + sequences, cut)
-
-
 def _log(prefix: str, a: Arrays, b: Arrays, size: int, sequences: int) -> Arrays:
     """Candidates and sequences; the first map has `size` keyframes and so many sequences."""
     candidate = b[prefix + "candidate"].copy()
@@ -158,40 +161,20 @@ def _log(prefix: str, a: Arrays, b: Arrays, size: int, sequences: int) -> Arrays
     return {name: np.concatenate([a[name], moved[name]]) for name in names}
 
 
-def _archive(a: Arrays, b: Arrays, counts: Counts, bend: Bend) -> Arrays:
-    pairs = b["pairs"].copy()
-    pairs[:, :2] += counts.ever
-    archive = a | _graph("graph/", a, b, counts, bend, counts.ever)
-    archive |= _log("log/", a, b, counts.ever, counts.sequences)
-    archive |= {
-        "row": np.concatenate([a["row"], b["row"] + counts.kept]),
-        "offset": np.concatenate([a["offset"], b["offset"]]),
-        "pairs": np.concatenate([a["pairs"], pairs]),
-    }
-    return {f"archive/{name}": value for name, value in archive.items()}
-
-
-def _steps(a: Arrays, b: Arrays, ever: int, bend: Bend) -> Arrays:
-    """Steps; those of the second map before its first keyframe lead to that."""
+def _steps(a: Arrays, b: Arrays, taken: int, bend: Bend) -> Arrays:
+    """Steps, the first map having so many keyframes; those of the second map before its first keyframe lead
+    to that."""
     frame, motion = b["steps/frame"], b["steps/motion"].copy()
     early, led = frame == -1, frame < -1
     motion[early, :3] = between(b["graph/pose"][0], motion[early, :3])
     motion[:, :3] = np.where(early[:, None], motion[:, :3], bend.motions(motion[:, :3], motion[:, 3]))
     motion[early, 3] = 0.0
-    number = np.where(early, leading_to(ever), np.where(led, frame - ever, frame + ever))
+    number = np.where(early, leading_to(taken), np.where(led, frame - taken, frame + taken))
     return {
-        "steps/frame": np.concatenate([settled(a["steps/frame"], ever), number]),
+        "steps/frame": np.concatenate([settled(a["steps/frame"], taken), number]),
         "steps/motion": np.concatenate([a["steps/motion"], motion]),
         "steps/odometry": np.concatenate([a["steps/odometry"], b["steps/odometry"]]),
     }
-
-
-def _newest(b: Arrays, bend: Bend) -> Arrays:
-    """What concerns the newest keyframe and the odometry since."""
-    newest = {name: value for name, value in b.items() if name.startswith(OF_NEWEST)}
-    motion, length = b["travel/0"], b["travel/1"]
-    bent = bend.motions(motion[None], np.asarray(length)[None])[0]
-    return newest | {"travel/0": bent, "travel/1": length, "travel/2": b["travel/2"]}
 
 
 def renew_experiences(map: KeyframeMap) -> None:

@@ -30,7 +30,6 @@ from ratslam.mapping.closure_judge import (
     KINDS,
     WEIGHTS,
     SequenceEvidence,
-    log_odds,
     sequence_evidence,
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph
@@ -175,7 +174,7 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
     """A row of the table; each session with its own weights."""
     true, score, accepted = (np.concatenate([one[k] for one in sessions]) for k in range(3))
     odds, ended = (
-        np.concatenate([log_odds(one.known[k], own) for one, own in zip(sessions, fitted, strict=True)])
+        np.concatenate([one.known[k].log_odds(own) for one, own in zip(sessions, fitted, strict=True)])
         for k in (0, 2)
     )
     known = np.isfinite(odds)

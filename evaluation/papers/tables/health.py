@@ -83,7 +83,7 @@ class JudgedMaps(NamedTuple):
     """The maps of sessions, n in all.
 
     Attributes:
-        features: [n, 5] of `HealthFeatures`. ratio: [n] error over odometry's. bad: [n] bool. closures: [n].
+        features: [n, 5] of `health_features`. ratio: [n] error over odometry's. bad: [n] bool. closures: [n].
     """
 
     features: np.ndarray

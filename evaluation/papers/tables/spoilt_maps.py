@@ -169,4 +169,4 @@ def _unlikeness(graph: KeyframeGraph, frame: int, match: int, length: int) -> fl
     """Mean misfit of the candidates, about every sixth."""
     ahead = np.array([False])
     steps = range(0, length, max(1, length // 6))
-    return float(np.mean([graph.misfit(frame + k, np.array([match + k]), ahead) for k in steps]))
+    return float(np.mean([graph.least_misfit(frame + k, np.array([match + k]), ahead) for k in steps]))

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from hypothesis import strategies as st
 
-from ratslam.mapping.appearance import ConfirmedPairs, LabelAppearance, ViewAppearance, WhiskerAppearance
+from ratslam.mapping.appearance import LabelAppearance, ViewAppearance, WhiskerAppearance
 from ratslam.recall.whisker_likelihood import pixel_layout
 from tactile.base.types import Odometry, observation
 
@@ -20,8 +20,7 @@ seeds = st.integers(0, 10_000)
 
 
 def no_pairs():
-    none = np.zeros(0, int)
-    return ConfirmedPairs(none, none, none.astype(bool))
+    return np.zeros((0, 3), int)
 
 
 def seen(view=None, label=-1, dead=()):

@@ -10,7 +10,6 @@ from ratslam.mapping.acceptance import AcceptByOdds
 from ratslam.mapping.appearance import LabelAppearance
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.piece_ties import no_tie
 from tactile.base.types import Odometry, observation
 
 CELL = 0.5
@@ -41,7 +40,7 @@ class Pose(NamedTuple):
     action: int
 
 
-def new_map(acceptance=AcceptByOdds, find_tie=no_tie, **settings):
+def new_map(acceptance=AcceptByOdds, find_tie=None, **settings):
     config = KeyframeMapConfig.model_validate(settings)
     return KeyframeMap(config, CELL, LabelAppearance(), acceptance, find_tie=find_tie)
 

@@ -48,7 +48,7 @@ class LookAppearance(LabelAppearance):
         super().__init__()
         self._look = look
 
-    def unlikeness(self, frame, others, reversed):
+    def misfits(self, frame, others, reversed):
         return (self._look[others] != self._look[frame]).astype(float)
 
 

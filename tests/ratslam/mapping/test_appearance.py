@@ -11,7 +11,6 @@ from ratslam.mapping.appearance import (
     LOG_ODDS_INTERVAL,
     NEUTRAL_IMAGE_MISFIT,
     NEUTRAL_MISFIT,
-    ConfirmedPairs,
     LabelAppearance,
     ViewAppearance,
     WhiskerAppearance,
@@ -32,7 +31,7 @@ from tests.ratslam.mapping.appearance_cases import (
 
 @pytest.mark.parametrize("kind", ["touch", "views", "ids"])
 def test_equal_views_are_likelier_of_one_place(kind):
-    """The log-odds of one place fall with the unlikeness of the views, and are above 0 for equal ones."""
+    """The log-odds of one place fall with the misfits of the views, and are above 0 for equal ones."""
     stream, places = np.random.default_rng(0), np.arange(100) % 50
     views = images(stream, 50)[places]
     made = {
@@ -45,7 +44,7 @@ def test_equal_views_are_likelier_of_one_place(kind):
     same = places[:, None] == places
     assert odds[same].min() > 0
     assert odds[same].mean() > odds[~same].mean() + 0.5
-    order = [frames.unlikeness(7, np.arange(100), ahead), odds[7]]
+    order = [frames.misfits(7, np.arange(100), ahead), odds[7]]
     assert (np.diff(order[1][np.argsort(order[0], kind="stable")]) <= 0).all()
 
 
@@ -65,7 +64,7 @@ def test_without_neighbours_the_misfit_is_neutral(kind):
     views = images(np.random.default_rng(0), LOG_ODDS_INTERVAL)
     frames = {"touch": touched(views), "views": viewed(views), "labels": labelled([1] * 5)}[kind]
     none = np.zeros(0, int)
-    assert frames.misfit(3, none, none.astype(bool)) == (
+    assert frames.least_misfit(3, none, none.astype(bool)) == (
         NEUTRAL_IMAGE_MISFIT if isinstance(frames, WhiskerAppearance) else NEUTRAL_MISFIT
     )
 
@@ -87,7 +86,7 @@ def test_a_restored_appearance_continues_as_if_uninterrupted(kind, stop):
     errors = stream.uniform(0.1, 0.5, (120, 20))
     turn, pairs = (
         stream.normal(0, 0.2, 120),
-        ConfirmedPairs(np.arange(20, 30), np.arange(10), np.arange(10) % 2 == 0),
+        np.column_stack([np.arange(20, 30), np.arange(10), np.arange(10) % 2 == 0]),
     )
 
     def follow(frames, rows):
@@ -113,6 +112,6 @@ def test_a_restored_appearance_continues_as_if_uninterrupted(kind, stop):
     for one, two in zip(whole.metric(), second.metric(), strict=True):
         assert np.array_equal(one, two)
     near, about = np.arange(10), np.arange(10) % 2 == 0
-    assert whole.misfit(100, near, about) == second.misfit(100, near, about)
+    assert whole.least_misfit(100, near, about) == second.least_misfit(100, near, about)
     assert (whole.metric().likeness.size > 0) == (kind == "touch")
     assert (whole.metric().scale > 0) == (kind != "labels")

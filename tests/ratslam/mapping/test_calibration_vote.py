@@ -73,13 +73,13 @@ def test_means_and_odds_equal_the_sum_over_all_assignments(seed):
     share = total / total.sum()
     mean = share @ grid
     found = vote(*case, LEAST)
-    assert found.mean[::2] == pytest.approx(mean, abs=1e-9)
-    assert found.odds == pytest.approx(np.log(of_true) - np.log(of_false), rel=1e-6, abs=1e-6)
+    assert found[1][::2] == pytest.approx(mean, abs=1e-9)
+    assert found[2] == pytest.approx(np.log(of_true) - np.log(of_false), rel=1e-6, abs=1e-6)
     spread = np.sqrt(share @ (grid - mean) ** 2)
-    wide = np.hypot(spread, mean - found.belief[::2])
+    wide = np.hypot(spread, mean - found[0][::2])
     expected = np.maximum(wide, (LEAST, LEAST_TURN_ERROR)) * (1, prior.turn_error_sd > 0)
-    assert found.belief[1::2] == pytest.approx(expected, rel=1e-6)
-    off, kept = mean - prior[::2], found.belief[::2] - np.array(prior[::2])
+    assert found[0][1::2] == pytest.approx(expected, rel=1e-6)
+    off, kept = mean - prior[::2], found[0][::2] - np.array(prior[::2])
     shrunk = off * np.maximum(1 - (SHRINK * spread / np.where(off, off, np.inf)) ** 2, 0)
     assert kept == pytest.approx(shrunk, rel=1e-6, abs=1e-9)
 
@@ -90,8 +90,8 @@ def test_a_sequence_has_no_vote_on_its_own_odds(seed, change):
     grid, prior, ratios, odds = random_case(seed, 3)
     changed = odds + [change, 0, 0]
     before, after = (vote(grid, prior, ratios, each, LEAST) for each in (odds, changed))
-    assert after.odds[0] - before.odds[0] == pytest.approx(change, abs=1e-6)
-    alone = vote(grid, prior, ratios[:1], odds[:1], LEAST).odds[0]
+    assert after[2][0] - before[2][0] == pytest.approx(change, abs=1e-6)
+    alone = vote(grid, prior, ratios[:1], odds[:1], LEAST)[2][0]
     weight = prior_weight(grid, prior)
     expected = odds[0] + np.log(weight @ np.exp(ratios[0]) / weight.sum())
     assert alone == pytest.approx(expected, abs=1e-6)
@@ -104,8 +104,8 @@ def test_order_does_not_matter(seed):
     order, points = stream.permutation(4), stream.permutation(len(grid))
     first = vote(grid, prior, ratios, odds, LEAST)
     second = vote(grid[points], prior, ratios[order][:, points], odds[order], LEAST)
-    assert second.odds == pytest.approx(first.odds[order], abs=1e-9)
-    assert second.mean == pytest.approx(first.mean, abs=1e-12)
+    assert second[2] == pytest.approx(first[2][order], abs=1e-9)
+    assert second[1] == pytest.approx(first[1], abs=1e-12)
 
 
 @given(seeds)
@@ -114,9 +114,9 @@ def test_a_sequence_that_favours_no_calibration_leaves_the_others_as_they_are(se
     level = np.full((1, len(grid)), 1.5)
     found = vote(grid, prior, np.vstack([ratios, level]), np.append(odds, 2.0), LEAST)
     without = vote(grid, prior, ratios, odds, LEAST)
-    assert found.mean == pytest.approx(without.mean, abs=1e-12)
-    assert found.odds[:3] == pytest.approx(without.odds, abs=1e-9)
-    assert found.odds[3] == pytest.approx(3.5, abs=1e-9)
+    assert found[1] == pytest.approx(without[1], abs=1e-12)
+    assert found[2][:3] == pytest.approx(without[2], abs=1e-9)
+    assert found[2][3] == pytest.approx(3.5, abs=1e-9)
 
 
 @pytest.mark.parametrize("mean", [-0.03, 0.0, 0.01])
@@ -126,9 +126,9 @@ def test_without_sequences_the_belief_is_the_prior(mean):
         CalibrationPrior(mean, 0.05, -mean / 2, 0.03),
     )
     found = vote(grid, prior, np.zeros((0, len(grid))), np.zeros(0), LEAST)
-    assert found.odds.shape == (0,)
-    assert found.belief[::2] == pytest.approx(prior[::2], abs=1e-12)
-    assert found.belief[1::2] == pytest.approx(prior[1::2], rel=1e-3)
+    assert found[2].shape == (0,)
+    assert found[0][::2] == pytest.approx(prior[::2], abs=1e-12)
+    assert found[0][1::2] == pytest.approx(prior[1::2], rel=1e-3)
 
 
 @given(seeds)
@@ -137,12 +137,12 @@ def test_without_turn_errors_the_vote_on_the_bias_is_that_with_a_certain_turn_er
     grid, prior, ratios, odds = random_case(seed, 3)
     prior = prior._replace(turn_error=0.02, turn_error_sd=0.0)
     alone = vote(np.column_stack([grid[:, 0], np.full(5, 0.02)]), prior, ratios, odds, LEAST)
-    assert (*alone.belief[2:], *alone.mean[2:]) == pytest.approx((0.02, 0.0) * 2)
+    assert (*alone[0][2:], *alone[1][2:]) == pytest.approx((0.02, 0.0) * 2)
     # The other turn errors are 100 standard deviations of the prior away.
     both = mesh(grid[:, 0], [-0.08, 0.02, 0.12])
     sure = vote(both, prior._replace(turn_error_sd=1e-3), np.repeat(ratios, 3, axis=1), odds, LEAST)
-    assert sure.odds == pytest.approx(alone.odds, abs=1e-6)
-    assert sure.belief[:2] == pytest.approx(alone.belief[:2], abs=1e-9)
+    assert sure[2] == pytest.approx(alone[2], abs=1e-6)
+    assert sure[0][:2] == pytest.approx(alone[0][:2], abs=1e-9)
 
 
 def test_a_vote_on_one_of_them_leaves_the_other_as_the_prior():
@@ -152,10 +152,10 @@ def test_a_vote_on_one_of_them_leaves_the_other_as_the_prior():
     )
     on_bias = vote(grid, prior, of_bias(grid, 0.05, 0.003), np.array([30.0]), LEAST)
     on_turn = vote(grid, prior, of_turn(grid, -0.05, 0.003), np.array([30.0]), LEAST)
-    assert on_bias.mean.bias == pytest.approx(0.049, abs=0.002)
-    assert on_bias.belief[2:] == pytest.approx(prior[2:], rel=1e-3)
-    assert on_turn.mean.turn_error == pytest.approx(-0.049, abs=0.002)
-    assert on_turn.belief[:2] == pytest.approx(prior[:2], rel=1e-3)
+    assert on_bias[1].bias == pytest.approx(0.049, abs=0.002)
+    assert on_bias[0][2:] == pytest.approx(prior[2:], rel=1e-3)
+    assert on_turn[1].turn_error == pytest.approx(-0.049, abs=0.002)
+    assert on_turn[0][:2] == pytest.approx(prior[:2], rel=1e-3)
 
 
 @pytest.mark.parametrize("column", [0, 1])
@@ -164,12 +164,12 @@ def test_a_mean_within_two_deviations_is_shrunk_to_the_prior(column):
     grid = mesh(*((fine, coarse) if column == 0 else (coarse, fine)))
     prior, peaked = CalibrationPrior(0.0, 0.03, 0.0, 0.03), (of_bias, of_turn)[column]
     near = vote(grid, prior, peaked(grid, 0.01, 0.008), np.array([9.0]), LEAST)
-    mean, (kept, sd) = near.mean[2 * column], near.belief[2 * column :][:2]
+    mean, (kept, sd) = near[1][2 * column], near[0][2 * column :][:2]
     assert mean == pytest.approx(0.01, rel=0.2)
     assert kept == pytest.approx(0.0, abs=1e-15)
     assert sd >= mean  # what was shrunk is added to the spread
     far = vote(grid, prior, peaked(grid, 0.05, 0.002), np.array([30.0]), LEAST)
-    mean, (kept, sd) = far.mean[2 * column], far.belief[2 * column :][:2]
+    mean, (kept, sd) = far[1][2 * column], far[0][2 * column :][:2]
     spread = np.sqrt(sd**2 - (mean - kept) ** 2)
     assert mean == pytest.approx(0.05, rel=0.02)
     assert kept == pytest.approx(mean * (1 - (SHRINK * spread / mean) ** 2), rel=1e-6)
@@ -180,8 +180,8 @@ def test_the_belief_is_never_narrower_than_the_least_deviation():
     grid = mesh(np.linspace(-0.1, 0.1, 401), np.linspace(-0.1, 0.1, 41))
     ratios = np.vstack([of_bias(grid, 0.0, 1e-5), of_turn(grid, 0.0, 1e-5)])
     found = vote(grid, CalibrationPrior(0.0, 0.03, 0.0, 0.03), ratios, np.array([30.0, 30.0]), 0.02)
-    assert found.belief.bias_sd == 0.02
-    assert found.belief.turn_error_sd == LEAST_TURN_ERROR
+    assert found[0].bias_sd == 0.02
+    assert found[0].turn_error_sd == LEAST_TURN_ERROR
 
 
 def test_sequences_that_agree_outvote_stronger_ones_that_do_not():
@@ -196,5 +196,5 @@ def test_sequences_that_agree_outvote_stronger_ones_that_do_not():
     true = [along(angle, 0.04, -0.03) for angle in (0.2, 0.9, 1.7, 2.6)]
     false = [along(angle, *at) for angle, *at in [(0.5, -0.05, 0), (1.2, 0, 0.07), (2.9, 0.01, -0.08)]]
     found = vote(grid, prior, np.vstack(true + false), np.array([0.0] * 4 + [1.0] * 3), LEAST)
-    assert found.mean[::2] == pytest.approx([0.04, -0.03], abs=0.004)
-    assert found.odds[:4].min() > 2 > -1 > found.odds[4:].max()
+    assert found[1][::2] == pytest.approx([0.04, -0.03], abs=0.004)
+    assert found[2][:4].min() > 2 > -1 > found[2][4:].max()

@@ -15,7 +15,6 @@ from ratslam.mapping.closure_judge import (
     doubt_of_closures,
     judge_anew,
     judge_sequences,
-    log_odds,
     sequence_evidence,
     shipped_weights,
 )
@@ -62,16 +61,16 @@ def evidence(graph, log, sequences, cut=None, after=BEYOND):
 
 def test_a_true_sequence_has_higher_log_odds_than_a_false_one_of_the_same_map(graph):
     log = closed([*CLEAN, FALSE[1]])
-    odds = log_odds(evidence(graph, log, np.arange(log.sequences)), shipped_weights())
+    odds = evidence(graph, log, np.arange(log.sequences)).log_odds(shipped_weights())
     assert odds[:-1].min() > odds[-1]
 
 
 def test_nothing_is_said_of_a_sequence_across_a_break_of_the_odometry(graph):
     log, every = closed(CLEAN), np.arange(len(CLEAN))
-    odds = log_odds(evidence(graph, log, every, cuts(graph, 2 * LAP + 30)), shipped_weights())
+    odds = evidence(graph, log, every, cuts(graph, 2 * LAP + 30)).log_odds(shipped_weights())
     assert list(np.isnan(odds)) == [False, False, True, False]  # before the third and the fourth sequence
     apart = cuts(graph, *(LAP * np.arange(1, LAPS)))
-    assert np.isnan(log_odds(evidence(graph, log, every, apart), shipped_weights())).all()
+    assert np.isnan(evidence(graph, log, every, apart).log_odds(shipped_weights())).all()
 
 
 def test_views_count_up_to_a_break_and_no_further_than_the_keyframes_known(graph):
@@ -114,13 +113,13 @@ def test_a_map_of_false_closures_is_doubted_and_one_of_true_ones_is_not(judged):
 
 def test_an_unlikely_sequence_counts_less_as_its_odds_fall(judged):
     _, log = judged
-    log.rate_anew(np.arange(3), np.array([UNLIKELY + np.log(0.25), UNLIKELY / 2, np.nan]))
+    log.set_log_odds(np.arange(3), np.array([UNLIKELY + np.log(0.25), UNLIKELY / 2, np.nan]))
     assert log.credit() == pytest.approx([0.25, 1.0, 1.0, 1.0])
 
 
 def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
     graph, log = judged
-    log.rate_anew(np.arange(len(CLEAN)), np.full(len(CLEAN), -7.0))
+    log.set_log_odds(np.arange(len(CLEAN)), np.full(len(CLEAN), -7.0))
     gone = np.zeros(graph.count, bool)
     gone[log.members(1)[0, 0]] = True
     log.merge(gone, np.arange(graph.count), np.zeros(graph.count, bool))

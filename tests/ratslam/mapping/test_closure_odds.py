@@ -4,12 +4,11 @@ written by hand."""
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from ratslam.mapping.acceptance import MIN_LOG_ODDS, AcceptByEvidence, believe, is_round
+from ratslam.mapping.acceptance import MIN_LOG_ODDS, AcceptByEvidence
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.optimizer import CalibrationPrior
 from tactile.base.se2 import correct_heading, integrate
@@ -185,17 +184,10 @@ def test_poses_follow_the_believed_calibration_until_a_closure_fixes_them():
     graph, log = drive(new_map(), {}, last=50).keyframes(), ClosureLog()
     belief = CalibrationPrior(0.05, 0.01, -0.2, 0.02)
     moved = correct_heading(graph.motion.rows[1:], graph.length.rows[1:], belief.bias, belief.turn_error)
-    believe(graph, log, belief)
+    graph.adopt_prior(log, belief)
     assert graph.pose.rows[1:] == pytest.approx(integrate(moved, graph.pose.rows[0]), abs=1e-9)
     log.judge(log.add(Candidate(40, 3, 0, 1.0, 5.0), False), Verdict.ACCEPTED)
-    believe(graph, log, belief._replace(bias=0.0, turn_error=0.0))
+    graph.adopt_prior(log, belief._replace(bias=0.0, turn_error=0.0))
     assert (graph.bias, graph.turn_error) == (belief.bias, belief.turn_error)
     assert graph.pose.rows[1:] == pytest.approx(integrate(moved, graph.pose.rows[0]), abs=1e-9)
     assert graph.prior.turn_error == 0.0
-
-
-def test_a_growing_sequence_is_compared_at_lengths_that_grow_by_a_quarter_at_most():
-    rounds = [length for length in range(1, 1000) if is_round(length)]
-    assert rounds[:8] == list(range(1, 9))
-    assert all(after <= 1.25 * before for before, after in pairwise(rounds[7:]))
-    assert len(rounds) < 4 * np.log2(1000)

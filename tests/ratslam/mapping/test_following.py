@@ -1,4 +1,4 @@
-"""Supposed poses move as odometry says, and are corrected by the keyframes near by."""
+"""Pose hypotheses move as odometry says, and are corrected by the keyframes near by."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.mapping.ground import STILL, Motion, Supposed, advance, advance_all, move
+from ratslam.mapping.ground import NO_MOTION, Motion, PoseHypothesis, advance, advance_all
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (
     MOTIONS,
@@ -40,9 +40,9 @@ def test_without_views_a_pose_moves_as_odometry(pose: np.ndarray, path: list[Mot
 def test_going_back_undoes_going_forth(pose: np.ndarray, path: list[Motion]) -> None:
     at = supposed(pose)
     for moved in path:
-        at = move(at, moved)
+        at = at.moved(moved)
     for moved in reversed(path):
-        at = move(at, moved.reversed())
+        at = at.moved(moved.reversed())
     assert_same_pose(at.pose, pose)
 
 
@@ -64,8 +64,8 @@ def test_many_poses_advance_as_each_alone(poses: list[np.ndarray], path: list[Mo
     around = [compose(pose, stream.normal(0, 0.2, (10, 3))) for pose in poses]
     ground = ground_at(np.concatenate(around), (0.0, np.pi))
     alone = [supposed(pose, 0.0) for pose in poses]
-    together = Supposed(np.stack(poses), np.zeros((len(poses), 3, 3)))
-    for moved in [STILL, *path]:
+    together = PoseHypothesis(np.stack(poses), np.zeros((len(poses), 3, 3)))
+    for moved in [NO_MOTION, *path]:
         gain = stream.normal(0, 2, (2, 10 * len(poses)))
         together, gains = advance_all(ground, together, moved, gain)
         pairs = [advance(ground, at, moved, gain) for at in alone]
@@ -79,7 +79,7 @@ def test_many_poses_advance_as_each_alone(poses: list[np.ndarray], path: list[Mo
 @given(POSES, MOTIONS)
 def test_odometry_adds_uncertainty_and_views_remove_it(pose: np.ndarray, moved: Motion) -> None:
     before = supposed(pose)
-    driven = move(before, moved)
+    driven = before.moved(moved)
     assert np.trace(driven.covariance) >= np.trace(before.covariance) - 1e-15
     seen, gain = advance(ground_at(driven.pose), before, moved, np.full((1, 1), 2.0))
     assert gain == 2.0
@@ -90,7 +90,7 @@ def test_odometry_adds_uncertainty_and_views_remove_it(pose: np.ndarray, moved: 
 def test_a_rigid_motion_of_the_whole_map_moves_the_result(
     change: np.ndarray, pose: np.ndarray, path: list[Motion], seed: int
 ) -> None:
-    def follow(start: np.ndarray, frames: np.ndarray) -> tuple[Supposed, list[float]]:
+    def follow(start: np.ndarray, frames: np.ndarray) -> tuple[PoseHypothesis, list[float]]:
         stream, at, gains = np.random.default_rng(seed), supposed(start), []
         for moved in path:
             at, gain = advance(ground_at(frames), at, moved, stream.normal(1, 2, (1, 20)))
@@ -109,7 +109,7 @@ def test_a_rigid_motion_of_the_whole_map_moves_the_result(
 @given(POSES, st.floats(-0.04, 0.04), st.floats(-0.25, 0.25))
 def test_a_fitting_keyframe_draws_the_pose_to_it(pose: np.ndarray, beside: float, turned: float) -> None:
     frame = compose(pose, np.array([beside, -beside, turned]))
-    at, gain = advance(ground_at(frame), supposed(pose), STILL, np.full((1, 1), 1.5))
+    at, gain = advance(ground_at(frame), supposed(pose), NO_MOTION, np.full((1, 1), 1.5))
     assert gain == 1.5
     share = 0.02**2 / (0.02**2 + np.array([0.04, 0.04, 0.12]) ** 2)
     assert_same_pose(at.pose, pose + share * np.array([*(frame - pose)[:2], turned]))
@@ -118,7 +118,7 @@ def test_a_fitting_keyframe_draws_the_pose_to_it(pose: np.ndarray, beside: float
 @given(POSES, st.floats(-3, 0))
 def test_keyframes_that_do_not_fit_correct_nothing(pose: np.ndarray, fit: float) -> None:
     frame = compose(pose, np.array([0.03, 0.0, 0.1]))
-    at, gain = advance(ground_at(frame), supposed(pose), STILL, np.full((1, 1), fit))
+    at, gain = advance(ground_at(frame), supposed(pose), NO_MOTION, np.full((1, 1), fit))
     assert gain == pytest.approx(fit)
     np.testing.assert_array_equal(at.pose, pose)
 
@@ -137,7 +137,9 @@ def test_keyframes_that_do_not_fit_correct_nothing(pose: np.ndarray, fit: float)
 def test_an_uncertain_pose_is_compared_with_more(
     beside: tuple[float, ...], deviation: float, near: bool
 ) -> None:
-    _, gain = advance(ground_at(np.array(beside)), supposed(np.zeros(3), deviation), STILL, np.ones((1, 1)))
+    _, gain = advance(
+        ground_at(np.array(beside)), supposed(np.zeros(3), deviation), NO_MOTION, np.ones((1, 1))
+    )
     assert np.isfinite(gain) == near
 
 
@@ -150,7 +152,7 @@ def test_a_turn_measured_badly_is_made_good() -> None:
 
     def error(deviation: float) -> float:
         wrong = Motion(np.array([0.0, 0.0, 0.5]), np.array([1e-6, 1e-6, deviation**2]))
-        at = move(supposed(truth[0]), wrong)
+        at = supposed(truth[0]).moved(wrong)
         for k in range(1, 25):
             step = Motion(np.array([0.05, 0.0, 0.0 if k != 15 else np.pi / 2]), np.full(3, 1e-4))
             at, _ = advance(loop.ground, at, step, gains[k])
@@ -179,7 +181,7 @@ def test_a_supposed_pose_is_comparable_while_its_ground_is_within_reach() -> Non
     ground = ground_at(np.zeros((1, 3)))
     narrow, wide = ((REACH * factor) ** 2 for factor in (1.4, 1.6))
     for variance, expected in ((narrow, True), (wide, False)):
-        at = Supposed(np.zeros(3), np.diag([variance, 1e-6, 1e-6]))
+        at = PoseHypothesis(np.zeros(3), np.diag([variance, 1e-6, 1e-6]))
         assert at.is_comparable(ground) is expected
-    turned = Supposed(np.zeros(3), np.diag([1e-6, 1e-6, (1.1 * REACH_HEADING) ** 2]))
+    turned = PoseHypothesis(np.zeros(3), np.diag([1e-6, 1e-6, (1.1 * REACH_HEADING) ** 2]))
     assert not turned.is_comparable(ground)

@@ -93,7 +93,7 @@ def test_queries_speak_of_all_keyframes(tmp_path):
     assert np.array_equal(candidates[:, 0], whole.candidates()[:, 0])
     assert np.allclose(candidates[:, 4], 4.0)
     assert map.keyframes().count == steps
-    assert map.keyframes().misfit(steps - 1, np.array([steps - 1 - LAP]), np.array([False])) == 0.0
+    assert map.keyframes().least_misfit(steps - 1, np.array([steps - 1 - LAP]), np.array([False])) == 0.0
     later, earlier = map.closures().T
     accepted = candidates[:, 7] == Verdict.ACCEPTED
     assert later.tolist() == candidates[accepted, 0].astype(int).tolist()

@@ -47,10 +47,10 @@ def test_the_log_is_a_list_of_candidates(steps):
             log.judge(a % len(verdicts), b)
         elif kind == "rate" and verdicts:
             odds[a % len(verdicts)] = b
-            log.rate(np.array([a % len(verdicts)]), np.array([b]))
+            log.raise_log_odds(np.array([a % len(verdicts)]), np.array([b]))
         elif kind == "strike" and verdicts:
             frame, spare = 50 + a, b % len(verdicts)
-            log.strike(frame, spare)
+            log.reject(frame, spare)
             for row in rows:
                 accepted = row[1] >= 0 and verdicts[row[1]] == Verdict.ACCEPTED
                 if row[0].keyframe >= frame and accepted and row[1] != spare:
@@ -122,11 +122,11 @@ def test_a_sequence_counts_while_it_is_accepted():
 
 def test_the_odds_of_an_accepted_sequence_do_not_fall():
     log = filled()
-    log.rate(np.array([0, 1]), np.array([3.0, 3.0]))
+    log.raise_log_odds(np.array([0, 1]), np.array([3.0, 3.0]))
     log.judge(0, Verdict.ACCEPTED)
     log.judge(2, Verdict.ACCEPTED)
     for odds in (1.0, 4.0, 2.0):
-        log.rate(np.arange(3), np.full(3, odds))
+        log.raise_log_odds(np.arange(3), np.full(3, odds))
     assert log.table()[[0, 2, 5], 9].tolist() == [4.0, 2.0, 4.0]
 
 
@@ -134,14 +134,14 @@ def test_a_break_strikes_out_later_candidates():
     log = filled()
     for sequence in (0, 1):
         log.judge(sequence, Verdict.ACCEPTED)
-    log.strike(56, 2)
+    log.reject(56, 2)
     assert log.accepted_rows().tolist() == [0, 1, 2]  # sequence 1 keeps its candidates before the break
     assert log.score(1) == 2.0
     assert log.table()[:, 5].tolist() == [0, 0, 1, -1, -1, 2]  # an open sequence is spared, accepted or not
     assert log.table()[3, 6:9].tolist() == [np.inf, Verdict.UNDONE, 0.0]
     assert np.isnan(log.table()[3, 9])
     log.judge(2, Verdict.ACCEPTED)
-    log.strike(0, 2)
+    log.reject(0, 2)
     assert log.accepted_rows().tolist() == [5]
 
 
@@ -152,7 +152,7 @@ def test_no_sequence_lies_across_a_cut(steps, cuts):
         if kind == "add":
             log.add(Candidate(50 + k, k, 0, 0.9, b), a and log.sequences > 0)
     before = [log.members(sequence)[:, 0] for sequence in range(log.sequences)]
-    log.strike_across(cuts)
+    log.reject_across(cuts)
     for sequence, frames in enumerate(before):
         parts = np.searchsorted(cuts, frames, side="right")
         largest = np.bincount(parts).max()
@@ -171,7 +171,7 @@ def test_summaries_of_sequences_follow_from_their_members(steps):
         elif kind == "judge" and log.sequences:
             log.judge(a % log.sequences, b)
         elif kind == "strike" and log.sequences:
-            log.strike(50 + a, b % log.sequences)
+            log.reject(50 + a, b % log.sequences)
     members = [log.members(sequence) for sequence in range(log.sequences)]
     assert log.sizes().tolist() == [len(rows) for rows in members]
     assert log.scores() == pytest.approx(
@@ -222,7 +222,7 @@ def test_the_table_has_all_evidence():
     log.judge(0, Verdict.ACCEPTED, 2.25)
     log.judge(0, Verdict.ACCEPTED)  # without a distance, the one known stays
     log.weigh(np.array([0.5]))
-    log.rate(np.array([1]), np.array([-0.75]))
+    log.raise_log_odds(np.array([1]), np.array([-0.75]))
     expected = [
         [30, 4, -2, 0.75, 6.5, 0, 2.25, Verdict.ACCEPTED, 0.5, np.nan],
         [40, 5, 1, 0.5, -1.5, 1, np.inf, Verdict.OPEN, 0.0, -0.75],
@@ -235,7 +235,7 @@ def test_saved_arrays_are_copies():
     saved = log.arrays()
     before = log.table()
     log.judge(0, Verdict.ACCEPTED, 1.0)
-    log.strike(50, 2)
+    log.reject(50, 2)
     log.restore(saved)
     assert np.array_equal(log.table(), before, equal_nan=True)
     assert len(log.accepted_rows()) == 0

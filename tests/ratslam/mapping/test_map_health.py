@@ -43,8 +43,8 @@ def test_a_map_of_true_closures_is_not_doubted(graph):
 def test_a_map_with_false_loops_is_doubted(graph):
     assert worse_than_odometry(graph, solution(graph, closed(FALSE))) > DOUBTED
     clean, false = (health_features(graph, solution(graph, closed(rows))) for rows in (CLEAN, FALSE))
-    assert clean.gain > false.gain
-    assert clean.strain < false.strain
+    assert clean[0] > false[0]
+    assert clean[2] < false[2]
 
 
 def test_a_map_without_closures_is_odometry_and_not_doubted(graph):
@@ -60,11 +60,11 @@ def test_closures_of_little_weight_are_closures(graph):
     assert np.isfinite(worse_than_odometry(graph, found))
 
 
-def test_true_poses_claim_revisits_that_the_views_bear_out(graph):
+def test_true_poses_claim_revisits_that_the_views_confirm(graph):
     claims = claimed_revisits(graph, TRUTH, 300)
     assert claims.examined == len(TRUTH) - GUARD - 1
     assert len(claims.frame) > 2 * LAP
-    assert claims.likeness.mean() > 0.8
+    assert claims.rank.mean() > 0.8
     assert np.all(claims.frame - claims.match > GUARD)
 
 
@@ -76,7 +76,7 @@ def test_each_pass_is_a_claim_of_its_own(graph):
 def test_poses_alike_by_chance_are_not_borne_out():
     """Views without information are as like here as elsewhere."""
     graph = drive(LabelAppearance(), places=1)
-    assert np.all(claimed_revisits(graph, TRUTH, 300).likeness == 0.5)
+    assert np.all(claimed_revisits(graph, TRUTH, 300).rank == 0.5)
 
 
 TURNED_LAPS = np.stack([TRUTH[(k + 7 * (k // LAP)) % LAP] for k in range(len(TRUTH))])

@@ -11,7 +11,6 @@ from ratslam.mapping.closure_selection import (
     KEPT,
     MapHypotheses,
     SelectionProblem,
-    choose_sequences,
     optimise_with_cuts,
     select_closures,
 )
@@ -34,7 +33,7 @@ def part(case: SelectionProblem, sequences: np.ndarray, count: int | None = None
     """The problem with only the sequences marked in [R] bool, and the first keyframes up to `count`."""
     problem = case.measurements
     chain = OdometryChain(*(rows[: None if count is None else count - 1] for rows in problem.chain))
-    fewer = problem._replace(chain=chain, closures=choose_sequences(problem.closures, sequences))
+    fewer = problem._replace(chain=chain, closures=problem.closures.of_sequences(sequences))
     return case._replace(
         measurements=fewer,
         evidence=case.evidence[sequences],

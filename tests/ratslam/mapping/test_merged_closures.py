@@ -14,7 +14,7 @@ KEYFRAMES = 60
 
 
 def random_log(stream, sequences=5):
-    """Sequences of keyframes 30.. matched to 0..29, some accepted, the last candidates struck out."""
+    """Sequences of keyframes 30.. matched to 0..29, some accepted, the last candidates rejected."""
     log, frame = ClosureLog(), 30
     for _ in range(sequences):
         for k in range(int(stream.integers(1, 7))):
@@ -25,7 +25,7 @@ def random_log(stream, sequences=5):
             )
             frame += 1
         log.judge(log.sequences - 1, stream.choice([Verdict.OPEN, Verdict.ACCEPTED]), 1.5)
-    log.strike(frame - 3, 0)
+    log.reject(frame - 3, 0)
     accepted = int((np.bincount(log.table()[log.accepted_rows(), 5].astype(int)) > 0).sum())
     log.weigh(stream.uniform(0, 1, accepted))
     return log
@@ -112,15 +112,15 @@ def test_a_sequence_stands_selections_in_a_row():
     counts = []
     for _ in range(3):
         log.count_selection()
-        counts.append(log.stood().tolist())
+        counts.append(log.confirmations().tolist())
     assert counts == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
     log.judge(2, Verdict.ACCEPTED)
     log.weigh(np.array([0.4, 0.6, 1.0]))
     log.count_selection()
-    assert log.stood().tolist() == [0, 1, 1]
+    assert log.confirmations().tolist() == [0, 1, 1]
     log.judge(1, Verdict.OPEN)
     log.count_selection()
-    assert log.stood().tolist() == [0, 0, 2]
+    assert log.confirmations().tolist() == [0, 0, 2]
 
 
 def test_sequences_are_confirmed_by_their_weight():
@@ -129,9 +129,14 @@ def test_sequences_are_confirmed_by_their_weight():
         log.count_selection()
     log.weigh(np.array([0.9, 0.9, 0.4]))
     log.confirm(2)
-    assert log.stood().tolist() == [3, 2, 0, 3]  # the second has begun to count, the last no longer does
+    assert log.confirmations().tolist() == [
+        3,
+        2,
+        0,
+        3,
+    ]  # the second has begun to count, the last no longer does
     log.confirm(5)
-    assert log.stood().tolist() == [5, 5, 0, 3]
+    assert log.confirmations().tolist() == [5, 5, 0, 3]
 
 
 def test_verdicts_are_taken_over_whatever_was_merged():
@@ -139,7 +144,7 @@ def test_verdicts_are_taken_over_whatever_was_merged():
     log = whole.copy()
     log.merge(np.isin(np.arange(33), [30, 32]), np.arange(33), np.zeros(33, bool))
     log.judge(1, Verdict.ACCEPTED, 2.5)
-    log.rate(np.array([1]), np.array([4.0]))
+    log.raise_log_odds(np.array([1]), np.array([4.0]))
     log.judge(2, Verdict.UNDONE)
     log.count_selection()
     whole.accepted_rows()
@@ -148,7 +153,7 @@ def test_verdicts_are_taken_over_whatever_was_merged():
     assert table[:, 7].tolist() == [Verdict.ACCEPTED, Verdict.ACCEPTED, Verdict.UNDONE]
     assert table[:, 8].tolist() == [0.9, 1.0, 0.0]
     assert table[1, [6, 9]].tolist() == [2.5, 4.0]
-    assert whole.stood().tolist() == [1, 1, 0]
+    assert whole.confirmations().tolist() == [1, 1, 0]
     assert whole.accepted_rows().tolist() == [0, 1]
     assert whole.left().tolist() == [1, 1, 1]
     log.judge(0, Verdict.OPEN)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from ratslam.core.backend import NO_CLOSURE
-from ratslam.mapping.acceptance import AcceptByEvidence, AcceptByOdds, believe
+from ratslam.mapping.acceptance import AcceptByEvidence, AcceptByOdds
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import APART
 from ratslam.mapping.loop_closures import Candidate
 from ratslam.mapping.map_solution import DOUBTED
 from ratslam.mapping.optimizer import CalibrationPrior
-from ratslam.mapping.piece_ties import Tie, no_tie
+from ratslam.mapping.piece_ties import Tie
 from tactile.base.se2 import between, compose
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, STEP, drive, new_map, sequence
 
@@ -27,10 +27,10 @@ TIE = [Candidate(LAP + k, k, 0, 1.0, 4.0) for k in range(2, 14)]
 
 def tie_late(graph, log, archive, odds):
     """The tie of the second lap to the first, once the views that show it are there."""
-    return Tie(20.0, TIE) if graph.ever > LAP + 14 else None
+    return Tie(20.0, TIE) if graph.total > LAP + 14 else None
 
 
-def driven(rule, *sequences, find_tie=no_tie, last=LAP + 60):
+def driven(rule, *sequences, find_tie=None, last=LAP + 60):
     """A lap and a part of the next one, which begins a piece."""
     map = drive(new_map(rule, find_tie=find_tie), {}, last=BEGIN)
     map.begin_piece()
@@ -54,7 +54,7 @@ def test_a_tie_is_undone_below_half_the_log_odds_that_it_needs(rule, stands):
     later = 0.5 * KeyframeMapConfig().tie_log_odds + (0.1 if stands else -0.1)
 
     def tie_once(graph, log, archive, odds):
-        return Tie(20.0 if graph.ever < LAP + 40 else later, TIE) if graph.ever > LAP + 14 else None
+        return Tie(20.0 if graph.total < LAP + 40 else later, TIE) if graph.total > LAP + 14 else None
 
     assert not driven(rule, find_tie=tie_once, last=LAP + 38).pieces().any()
     map = driven(rule, find_tie=tie_once)
@@ -98,7 +98,7 @@ def test_a_piece_without_an_accepted_closure_is_its_odometry(rule, begin):
     map = drive(new_map(rule), {}, last=40)
     if begin:
         map.begin_piece()
-    believe(map.kept_keyframes(), map.log, CalibrationPrior(0.3, 0.01))
+    map.kept_keyframes().adopt_prior(map.log, CalibrationPrior(0.3, 0.01))
     drive(map, {}, first=40, last=80)
     motion, path = np.array([STEP, 0.0, 2 * np.pi / LAP - BIAS * STEP]), [np.zeros(3)]
     for _ in range(79):

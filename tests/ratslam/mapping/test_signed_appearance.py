@@ -11,7 +11,6 @@ from ratslam.mapping.appearance import (
     LOG_ODDS_INTERVAL,
     NEUTRAL_IMAGE_MISFIT,
     NEW_IMAGE_LOG_ODDS,
-    ConfirmedPairs,
     SignedAppearance,
 )
 from tactile.base.types import Odometry, observation
@@ -21,8 +20,7 @@ SILENT = SimpleNamespace()
 
 
 def no_pairs():
-    none = np.zeros(0, int)
-    return ConfirmedPairs(none, none, none.astype(bool))
+    return np.zeros((0, 3), int)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +40,7 @@ def test_the_metric_is_learned_at_intervals(filled):
     fresh = SignedAppearance(12)
     assert fresh.metric().scale == 0.0
     assert not fresh.metric().likeness.size
-    assert fresh.misfit(0, np.array([0]), np.zeros(1, bool)) == NEUTRAL_IMAGE_MISFIT
+    assert fresh.least_misfit(0, np.array([0]), np.zeros(1, bool)) == NEUTRAL_IMAGE_MISFIT
     assert filled.metric().scale == NEW_IMAGE_LOG_ODDS
     assert filled.metric().likeness.size
     assert 2 * LOG_ODDS_INTERVAL == 8 * PLACES
@@ -51,18 +49,18 @@ def test_the_metric_is_learned_at_intervals(filled):
 def test_images_of_one_place_are_more_alike(filled):
     frames = np.arange(40, 80)
     ahead = np.zeros(40, bool)
-    here = filled.unlikeness(frames, frames - 40, ahead)
-    elsewhere = filled.unlikeness(frames, (frames - 20) % 40, ahead)
+    here = filled.misfits(frames, frames - 40, ahead)
+    elsewhere = filled.misfits(frames, (frames - 20) % 40, ahead)
     assert (here < elsewhere).mean() > 0.9
     others = np.arange(40)
     odds = filled.log_odds(50, others, ahead)
-    assert np.array_equal(odds, -filled.unlikeness(50, others, ahead))
+    assert np.array_equal(odds, -filled.misfits(50, others, ahead))
     assert odds[8:12].min() > 0 > np.median(odds)
-    one = filled.unlikeness(50, np.array([10, 30]), np.zeros(2, bool))
-    np.testing.assert_allclose(
-        one, [here[10], filled.unlikeness(np.array([50]), np.array([30]), ahead[:1])[0]]
+    one = filled.misfits(50, np.array([10, 30]), np.zeros(2, bool))
+    np.testing.assert_allclose(one, [here[10], filled.misfits(np.array([50]), np.array([30]), ahead[:1])[0]])
+    assert filled.least_misfit(50, np.array([10]), ahead[:1]) < filled.least_misfit(
+        50, np.array([30]), ahead[:1]
     )
-    assert filled.misfit(50, np.array([10]), ahead[:1]) < filled.misfit(50, np.array([30]), ahead[:1])
 
 
 def test_restored_state_is_the_same(filled):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.optimizer import MapFit
-from ratslam.mapping.step_record import HALT, StepRecord, Travel, leading_to
+from ratslam.mapping.step_record import NO_TRAVEL, StepRecord, Travel, leading_to
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry
 
@@ -19,7 +19,7 @@ def fit(poses: np.ndarray) -> MapFit:
 
 
 def travelled(steps: int) -> Travel:
-    travel = HALT
+    travel = NO_TRAVEL
     for _ in range(steps):
         travel = travel.onwards(Odometry(*MOTION, 0.1))
     return travel
@@ -29,13 +29,13 @@ def record(taken: bool = True) -> StepRecord:
     """Two keyframes, each followed by a step; three steps of a new piece, the third being its keyframe."""
     steps = StepRecord()
     for frame in (0, 1):
-        steps.append(frame, HALT, MOTION)
+        steps.append(frame, NO_TRAVEL, MOTION)
         steps.append(frame, travelled(1), MOTION)
     for k in (1, 2):
         steps.append(leading_to(2), travelled(k), MOTION)
     if taken:
         steps.arrive(2, travelled(3))
-        steps.append(2, HALT, MOTION)
+        steps.append(2, NO_TRAVEL, MOTION)
     return steps
 
 

@@ -22,8 +22,8 @@ def test_views_misfit_by_their_error_in_scales(seed):
         near = stream.integers(0, 30, 4)
         errors = [np.abs(views[k] - views[frame]).mean() for k in near]
         expected = min(min(errors) / (2 * scale), 1.0)
-        assert frames.misfit(frame, near, stream.random(4) < 0.5) == pytest.approx(expected, rel=1e-12)
-    assert frames.misfit(11, *alone(11)) == 0
+        assert frames.least_misfit(frame, near, stream.random(4) < 0.5) == pytest.approx(expected, rel=1e-12)
+    assert frames.least_misfit(11, *alone(11)) == 0
 
 
 def test_a_scale_needs_enough_errors_and_grows_with_the_sensors_unit():

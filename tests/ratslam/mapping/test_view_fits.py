@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.appearance import SAME_ID_LOG_ODDS
-from ratslam.mapping.carried_solution import earlier_fits, learn_odds, view_fits
+from ratslam.mapping.carried_solution import learn_odds, view_fits
 from tests.ratslam.mapping.map_cases import LAP, drive, new_map
 from tests.ratslam.mapping.track_cases import FIT, laps, places
 
@@ -18,15 +18,6 @@ def test_every_view_is_compared_with_all_but_those_of_nearly_the_same_time():
     near = np.abs(time[:, None] - time) <= graph.guard
     assert np.array_equal(np.isneginf(fits[:, 0]), near)
     assert (fits[:, 0][~near] == -SAME_ID_LOG_ODDS).all()  # every id is seen once
-
-
-def test_earlier_fits_are_those_of_earlier_keyframes():
-    fits = np.random.default_rng(0).normal(size=(7, 2, 7)).astype(np.float32)
-    earlier = earlier_fits(fits)
-    for frame in range(7):
-        assert np.array_equal(earlier[frame, :, :frame], fits[frame, :, :frame])
-        assert np.isneginf(earlier[frame, :, frame:]).all()
-    assert earlier.dtype == fits.dtype
 
 
 @pytest.mark.parametrize("told", [FIT, 0.0])

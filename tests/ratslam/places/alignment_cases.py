@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ratslam.mapping.ground import GainOdds, Ground, Motion, Supposed, learn_gain_odds
+from ratslam.mapping.ground import GainOdds, Ground, Motion, PoseHypothesis, learn_gain_odds
 from tactile.base.se2 import between, compose, wrap
 
 REACH, REACH_HEADING = 0.06, 0.3
@@ -29,8 +29,8 @@ def ground_at(poses: np.ndarray, turns: tuple[float, ...] = (0.0,)) -> Ground:
     return Ground(np.atleast_2d(poses), np.array(turns), REACH, REACH_HEADING, VARIANCE)
 
 
-def supposed(pose: np.ndarray, deviation: float = 0.02) -> Supposed:
-    return Supposed(pose, np.diag(np.full(3, deviation**2)))
+def supposed(pose: np.ndarray, deviation: float = 0.02) -> PoseHypothesis:
+    return PoseHypothesis(pose, np.diag(np.full(3, deviation**2)))
 
 
 def moved_by(change: np.ndarray, ground: Ground) -> Ground:

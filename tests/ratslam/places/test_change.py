@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.places.change import ALARMS, PASS, Chance, Signs, find_changes, learn_chance
+from ratslam.places.change import ALARMS, PASS, Signs, find_changes, learn_chance
 
 RADIUS = 0.09
-CHANCE = Chance(rate=0.01, height=8.0)
+CHANCE = (0.01, 8.0)
 
 
 def walls(random: np.random.Generator, count: int = 2000) -> Signs:
@@ -57,8 +57,9 @@ def test_a_map_whose_revisits_disagree_needs_more_evidence() -> None:
     noisy = walls(random)
     noisy = noisy._replace(evidence=random.normal(0.0, 3.0, len(noisy.evidence)))
     calm, restless = learn_chance(walls(random), RADIUS), learn_chance(noisy, RADIUS)
-    assert restless.height > 2 * calm.height
-    assert restless.expected(60.0, 400) > calm.expected(60.0, 400)
+    assert restless[1] > 2 * calm[1]
+    by_chance = [rate * np.exp(-60.0 / height) for rate, height in (calm, restless)]
+    assert by_chance[1] > by_chance[0]
 
 
 def test_passes_are_told_apart() -> None:

@@ -1,4 +1,4 @@
-"""Supposed poses have to explain a session from its start."""
+"""Pose hypotheses have to explain a session from its start."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.mapping.ground import Ground, Motion, Supposed
+from ratslam.mapping.ground import Ground, Motion, PoseHypothesis
 from ratslam.places.hypotheses import SPAN, Hypotheses, Recalled, SessionViews
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (
@@ -42,7 +42,7 @@ def recorded(motions: Sequence[Motion], gains: Sequence[np.ndarray | None]) -> S
 
 
 def total(views: SessionViews, pose: np.ndarray, ground: Ground = LOOP.ground) -> float:
-    path = views.follow_back(ground, ODDS, Supposed(pose, np.diag(VARIANCE)))
+    path = views.follow_back(ground, ODDS, PoseHypothesis(pose, np.diag(VARIANCE)))
     return float(path.odds.sum())
 
 
@@ -68,7 +68,9 @@ def test_the_true_pose_explains_the_session_and_others_do_not(seed: int) -> None
 @given(SEEDS)
 def test_following_back_ends_where_the_session_began(seed: int) -> None:
     truth, motions, gains = session(seed)
-    path = recorded(motions, gains).follow_back(LOOP.ground, ODDS, Supposed(truth[-1], np.diag(VARIANCE)))
+    path = recorded(motions, gains).follow_back(
+        LOOP.ground, ODDS, PoseHypothesis(truth[-1], np.diag(VARIANCE))
+    )
     assert len(path.poses) == len(path.covariances) == len(path.odds) == COUNT
     assert np.hypot(*(path.poses[-1] - truth[0])[:2]) < REACH
     assert path.odds[0] == 0  # the view of the newest keyframe proposed the pose
@@ -78,7 +80,7 @@ def test_a_hopeless_path_is_not_followed_to_its_end() -> None:
     _, motions, gains = session()
     views = recorded(motions, [np.full_like(gain, -5.0) for gain in gains])
     path = views.follow_back(
-        LOOP.ground, ODDS, Supposed(LOOP.poses[BEGIN + COUNT - 1], np.diag(VARIANCE)), -6.0
+        LOOP.ground, ODDS, PoseHypothesis(LOOP.poses[BEGIN + COUNT - 1], np.diag(VARIANCE)), -6.0
     )
     assert path.odds.sum() < -6
     assert len(path.poses) < 8
@@ -190,8 +192,8 @@ def test_restored_hypotheses_and_views_go_on_to_the_same_bits() -> None:
             np.testing.assert_array_equal(found[name], expected[name])
 
 
-def uncertain(pose: np.ndarray, deviation: float) -> Supposed:
-    return Supposed(pose, np.diag([deviation**2, deviation**2, 0.01]))
+def uncertain(pose: np.ndarray, deviation: float) -> PoseHypothesis:
+    return PoseHypothesis(pose, np.diag([deviation**2, deviation**2, 0.01]))
 
 
 def test_a_recalled_pose_continues_one_that_odometry_has_made_uncertain() -> None:

@@ -14,7 +14,7 @@ from tests.ratslam.places.test_placement import COUNT, MOVED, ODDS, compared, gr
 GAP = range(70, 130)
 """Keyframes of the ring that the ground does not have."""
 HELD = np.setdiff1d(np.arange(COUNT), GAP)
-HOPELESS = -60.0
+MIN_LOG_ODDS = -60.0
 
 
 def half_known(recalled: np.ndarray, turn: float) -> MapTraverse:
@@ -29,7 +29,7 @@ def half_known(recalled: np.ndarray, turn: float) -> MapTraverse:
     for k in GAP:
         astray = session.motions[k].motion + np.array([0.0, 0.0, turn])
         session.motions[k] = Motion(astray, session.motions[k].variance)
-    return MapTraverse(session.views, ring(), session.motions, HOPELESS)
+    return MapTraverse(session.views, ring(), session.motions, MIN_LOG_ODDS)
 
 
 def error(poses: np.ndarray, rows: slice) -> float:
@@ -60,9 +60,9 @@ def test_a_few_confirmed_places_do_not_make_a_rigid_body() -> None:
     place = np.where(np.arange(COUNT) < TOGETHER - 1, np.arange(COUNT), -1)
     session = compared(place, place, COUNT)
     ground = ground_of(compose(MOVED, ring()))
-    piece = MapTraverse(session.views, ring(), session.motions, HOPELESS)
+    piece = MapTraverse(session.views, ring(), session.motions, MIN_LOG_ODDS)
     pose = compose(MOVED, ring()[0])
-    way = Traverse(session.views, session.motions, HOPELESS).follow(ground, ODDS, 0, pose)
+    way = Traverse(session.views, session.motions, MIN_LOG_ODDS).follow(ground, ODDS, 0, pose)
     found = piece.follow(ground, ODDS, 0, pose)
     assert found.first == way.first
     np.testing.assert_array_equal(found.path.odds, way.path.odds)

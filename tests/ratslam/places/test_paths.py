@@ -14,10 +14,7 @@ from ratslam.places.hypotheses import (
     BESIDE,
     BESIDE_SHARE,
     Path,
-    at_undriven_headings,
-    counted_beside,
     keyframe_odds,
-    less_where_dependent,
 )
 from tactile.base.se2 import compose, wrap
 from tests.ratslam.places.alignment_cases import SEEDS, odds_of, square_loop
@@ -71,7 +68,7 @@ def test_evidence_for_a_path_counts_half_where_it_comes_again(seed: int, laps: i
     lap = LOOP.ground.poses
     odds = random.normal(0.5, 1.0, laps * len(lap))
     path = Path(np.tile(lap, (laps, 1)), np.zeros((len(odds), 3, 3)), odds)
-    counted = less_where_dependent(LOOP.ground, path)
+    counted = path.independent_odds(LOOP.ground)
     first = len(lap) - AGAIN
     np.testing.assert_array_equal(counted[:first], odds[:first])
     later = odds[len(lap) + AGAIN :]
@@ -84,15 +81,15 @@ def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() 
     poses = np.tile(LOOP.ground.poses[3], (AGAIN, 1))
     poses[:, 2] += np.arange(AGAIN)
     path = Path(poses, np.zeros((AGAIN, 3, 3)), odds)
-    np.testing.assert_array_equal(less_where_dependent(LOOP.ground, path), odds)
+    np.testing.assert_array_equal(path.independent_odds(LOOP.ground), odds)
 
 
-@pytest.mark.parametrize("count", [counted_beside, less_where_dependent])
+@pytest.mark.parametrize("count", [Path.odds_beside, Path.independent_odds])
 def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyframe(count) -> None:
     lap = LOOP.ground.poses
     across = compose(lap[3:8], np.array([0.0, 0.0, np.pi / 2]))
     poses = np.concatenate([lap[:3], across, lap[8:11]])
-    counted = count(LOOP.ground, Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)))
+    counted = count(Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)), LOOP.ground)
     np.testing.assert_array_equal(counted, [-1.0] * 4 + [-BESIDE_SHARE] * 4 + [-1.0] * 3)
 
 
@@ -101,11 +98,11 @@ def test_headings_are_undriven_on_the_way_where_nobody_drove_there_and_faced_so(
     across = compose(driven, np.array([0.0, 0.0, np.pi / 2]))
     poses = np.stack([driven, across, driven + away, across + away])
     path = Path(poses, np.zeros((4, 3, 3)), np.full(4, -1.0))
-    assert at_undriven_headings(LOOP.ground, path).tolist() == [False, True, False, False]
+    assert path.at_undriven_headings(LOOP.ground).tolist() == [False, True, False, False]
 
 
 def test_evidence_for_a_path_counts_beside_the_way_and_where_it_comes_again() -> None:
     poses = np.tile(compose(LOOP.ground.poses[3], np.array([0.0, 0.0, np.pi / 2])), (2 * AGAIN, 1))
     odds = np.full(len(poses), 0.5)
-    counted = counted_beside(LOOP.ground, Path(poses, np.zeros((len(poses), 3, 3)), odds))
+    counted = Path(poses, np.zeros((len(poses), 3, 3)), odds).odds_beside(LOOP.ground)
     np.testing.assert_array_equal(counted, odds)

@@ -33,7 +33,7 @@ def compared(place: np.ndarray, recalled: np.ndarray, count: int) -> Traverse:
     shows, shift = np.ones(len(place), bool), np.zeros(len(place), int)
     views = Comparison(gain, shows, recalled, shift, (recalled >= 0).astype(float))
     steps = between(np.roll(ring(), 1, axis=0), ring())[: len(place)]
-    return Traverse(views, [Motion(step, np.full(3, 1e-6)) for step in steps], hopeless=-60.0)
+    return Traverse(views, [Motion(step, np.full(3, 1e-6)) for step in steps], least=-60.0)
 
 
 def test_a_session_on_known_ground_is_placed_where_it_was():

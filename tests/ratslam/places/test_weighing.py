@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ratslam.mapping.ground import COMMON, COMMON_OF_PIECE, DISTINCT, PIECE, less_where_common
+from ratslam.mapping.ground import (
+    COMMON,
+    COMMON_OF_PIECE,
+    PIECE_WEIGHTING,
+    SESSION_WEIGHTING,
+    less_where_common,
+)
 from ratslam.places.localiser import compare_with_itself
 from tests.ratslam.places.test_self_comparison import GUARD, gains_on, laps
 
@@ -36,8 +42,8 @@ def test_a_better_fit_everywhere_counts_in_part(gain: np.ndarray, more: float) -
 
 @given(GAINS)
 def test_a_view_on_a_growing_map_loses_less_than_one_on_a_finished_map(gain: np.ndarray) -> None:
-    lost = COMMON_OF_PIECE / COMMON * (gain - DISTINCT.weigh(gain))
-    np.testing.assert_allclose(gain - PIECE.weigh(gain), lost, atol=1e-9)
+    lost = COMMON_OF_PIECE / COMMON * (gain - SESSION_WEIGHTING.weigh(gain))
+    np.testing.assert_allclose(gain - PIECE_WEIGHTING.weigh(gain), lost, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -52,6 +58,6 @@ def test_a_view_of_one_place_counts_more_than_one_of_many(dtype: type) -> None:
 def test_views_alike_everywhere_have_no_odds_and_others_do() -> None:
     """The map's own odds are those of the weighed gains."""
     ground = laps(4)
-    alike = compare_with_itself(ground, GUARD, gains_on(ground, 0.0), weighing=DISTINCT)
-    told = compare_with_itself(ground, GUARD, gains_on(ground, 6.0, reaches=1.0), weighing=DISTINCT)
+    alike = compare_with_itself(ground, GUARD, gains_on(ground, 0.0), weighing=SESSION_WEIGHTING)
+    told = compare_with_itself(ground, GUARD, gains_on(ground, 6.0, reaches=1.0), weighing=SESSION_WEIGHTING)
     assert alike.expected < 0.5 * told.expected

@@ -9,7 +9,7 @@ import numpy as np
 from evaluation.papers.tables import closures
 from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.closures import JudgedSession, closures_table, fit_weights
-from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, log_odds, shipped_weights
+from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, shipped_weights
 
 FIT, CONTRADICT = 3, 0
 
@@ -51,8 +51,8 @@ def test_every_session_is_tested_by_the_weights_of_the_others(monkeypatch, tmp_p
 
 def test_nothing_said_is_not_counted():
     one = session(0)
-    one.known[0].foretold[:10] = np.nan
-    odds = log_odds(one.known[0], fit_weights([one, session(1)]))
+    one.known[0].odometry_ratio[:10] = np.nan
+    odds = one.known[0].log_odds(fit_weights([one, session(1)]))
     assert np.isnan(odds[:10]).all()
     assert np.isfinite(odds[10:]).all()
 
