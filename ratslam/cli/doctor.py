@@ -1,7 +1,4 @@
-"""The command doctor.
-
-The command fit.
-"""
+"""The commands doctor, which says what a recording, run or robot is, and fit, which measures a rig."""
 
 from __future__ import annotations
 

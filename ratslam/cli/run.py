@@ -1,7 +1,4 @@
-"""The commands run and simulate.
-
-The commands that look at a run: watch, score, report.
-"""
+"""The commands that make a run, run and simulate, and those that look at one: watch, score, report."""
 
 from __future__ import annotations
 

@@ -1,17 +1,9 @@
-"""Loops compiled by Numba.
+"""How JAX and Numba compile: precision, flags of the compiler, kernels kept on disk, compiled loops.
 
-The cache of compiled kernels on disk: a later process loads what it would compile again.
-
-JAX's global float64 switch.
-
-Importing ratslam changes no JAX setting. A program calls `prepare_precision` before it makes a `Session`;
-`ratslam.runs` does so for every run.
-
-The flags of JAX's compiler that make steps fast on a CPU.
-
-JAX reads XLA_FLAGS of the environment when it first computes, for the whole process. The commands set it;
-importing ratslam does not, so that a program sets it before its first session:
-`os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))`.
+Importing ratslam changes no setting of JAX. A program calls `prepare_precision` before it makes a `Session`;
+`ratslam.runs` does so for every run. JAX reads XLA_FLAGS of the environment when it first computes, for the
+whole process; the commands set it, and a program does before its first session, because steps are faster
+then: `os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ one observation, replay up to `CHUNK`, and both give the same bits. At the start
 to a power of two that depends only on the rows in use, the kernel follows the map where rows of its memory
 are merged or restored, and it takes over the map's feedback.
 
-Observations without values that are NaN or infinite.
+`finite_values` masks what is NaN or infinite, for every kernel.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CHUNK = 16
 MOST_STATE = 1 << 30
 """Largest state of a new session, bytes."""
 UNKNOWN = -1
-"""`Session.earlier` of a checkpoint that does not tell it."""
+"""`Session.earlier` after a checkpoint of an early version, which does not hold it."""
 
 
 class Probe(NamedTuple):
@@ -110,9 +110,15 @@ class Session:
         self._layout: Layout | None = None
         # Compiled as one: each operation by itself would be compiled too.
         self._init = jax.jit(backend.init, static_argnums=1)
-        run = run_chunk if probe is None else partial(run_probed_chunk, probe)
+        run = run_chunk if probe is None else partial(_run_probed_chunk, probe)
         self._run_chunk = jax.jit(partial(run, backend.kernel), donate_argnums=0)
-        self._check_memory()
+        capacity = capacity_at(0, reserve)
+        state = jax.eval_shape(lambda key: backend.init(key, capacity), jax.random.key(0))
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+        if size > MOST_STATE:
+            found = f"a state of {size >> 20} MiB, with rows for {capacity} steps"
+            cure = "fewer cells or particles, smaller views, or a smaller session.reserve"
+            raise InputError("session", found, f"at most {MOST_STATE >> 20} MiB at the start", cure)
         self.restart(seed)
 
     def restart(self, seed: int = 0) -> None:
@@ -122,15 +128,6 @@ class Session:
         self._sides: tuple[int, ...] = ()
         self.map: Map = self.backend.new_map()
         self.state = self._init(jax.random.key(seed), self._capacity)
-
-    def _check_memory(self) -> None:
-        capacity = capacity_at(0, self.reserve)
-        state = jax.eval_shape(lambda key: self.backend.init(key, capacity), jax.random.key(0))
-        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-        if size > MOST_STATE:
-            found = f"a state of {size >> 20} MiB, with rows for {capacity} steps"
-            cure = "fewer cells or particles, smaller views, or a smaller session.reserve"
-            raise InputError("session", found, f"at most {MOST_STATE >> 20} MiB at the start", cure)
 
     def step(self, observation: Observation) -> Step:
         """Folds one observation, live."""
@@ -228,17 +225,13 @@ class Session:
         if capacity > self._capacity:
             self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
 
-    def _cover(self, feedback: Any) -> None:
-        """Grows what covers the ground to that of the map."""
-        sides = self.backend.sides(feedback)
-        sides = tuple(map(max, sides, self._sides)) if self._sides else sides
-        if sides != self._sides:
-            self.state, self._sides = self.backend.cover(self.state, sides), sides
-
     def follow_map(self, merged: Any, feedback: Any) -> None:
         """Lets the state follow the map, at the start of each chunk: `Map.merge` and `Map.feedback`."""
         self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
-        self._cover(feedback)
+        sides = self.backend.sides(feedback)  # of what covers the ground: it grows with the map
+        sides = tuple(map(max, sides, self._sides)) if self._sides else sides
+        if sides != self._sides:
+            self.state, self._sides = self.backend.cover(self.state, sides), sides
         if merged is not None:
             self.state = self.backend.merge_rows(self.state, merged)
         self.state = self.backend.apply_map_feedback(self.state, feedback)
@@ -289,7 +282,7 @@ def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tupl
     return lax.fori_loop(0, count, body, (state, results))
 
 
-def run_probed_chunk(
+def _run_probed_chunk(
     probe: Probe, kernel: Any, state: Any, chunk: PackedRecords, count: Any, begun: Any
 ) -> tuple[Any, PackedRecords, PackedRecords | None]:
     """`run_chunk` with the record of `probe.each` after the kernel's results, and the records of

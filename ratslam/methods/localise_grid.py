@@ -13,8 +13,8 @@ from jax import lax
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
-from ratslam.grid.expectation import draw_surfaces, expect
-from ratslam.grid.localiser import GridLocaliser, SavedGrid, Search, Supposed, counted_agreement
+from ratslam.grid.expectation import Expectation, draw_surfaces
+from ratslam.grid.localiser import GridLocaliser, Search, Supposed
 from ratslam.grid.map import GridMap
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
@@ -70,9 +70,11 @@ class GridLocaliseEvidence(NamedTuple):
 
 
 class GridLocaliseState(NamedTuple):
-    """Attributes:
-    known: the supposed poses. motion: the last report's `Motion`. touched: [W] its contacts. key: data of the
-        random stream's key.
+    """State of the search.
+
+    Attributes:
+        known: the pose hypotheses. motion: the last report's `Motion`. touched: [W] its contacts. key: data
+            of the random stream's key.
     """
 
     known: Supposed
@@ -100,10 +102,10 @@ class GridLocaliseBackend(Backend):
             raise InputError(
                 "localise.map", "a map without driven ground", "one in which a session can be found"
             )
-        expected = expect(surfaces, made.feelers, config.body)
-        self._search = Search(config, expected, counted_agreement(), free, count, self.dtype)
+        expected = Expectation(surfaces, made.feelers, config.body)
+        self._search = Search(config, expected, free, count, self.dtype)
         self._needed = log_odds + float(np.log(self._search.places())) + ALIKE
-        self._saved = SavedGrid(made.grid(), path.copy())
+        self._drawn, self._path = made.grid(), path.copy()
         self._start = path[-1] if here else None
         self._whiskers = len(made.feelers.length)
 
@@ -128,9 +130,9 @@ class GridLocaliseBackend(Backend):
         pressed = jnp.any(state.touched)
         known = self._search.move(state.known, odometry, motion != state.motion, draw, pressed)
         known, vanished = self._search.weigh(known, features, state.touched)
-        found = self._search.best_cluster(known)
+        pose, covariance, share, odds, fall = self._search.best_cluster(known)
         known, worth, drawn = self._search.resample(known, again)
-        failed = (found.log_odds < -self._hopeless / 2) | (found.fall > self._hopeless)
+        failed = (odds < -self._hopeless / 2) | (fall > self._hopeless)
         known = lax.cond(failed, lambda: self._search.begin(anew), lambda: known)
 
         outcome = jnp.where(drawn, GridLocaliseOutcome.RESAMPLED, GridLocaliseOutcome.OK)
@@ -138,16 +140,16 @@ class GridLocaliseBackend(Backend):
         outcome = jnp.where(failed, GridLocaliseOutcome.BEGUN_ANEW, outcome)
         outcome = jnp.where(clean, outcome, GridLocaliseOutcome.NOT_FINITE).astype(jnp.int32)
         place = jnp.int32(-1)  # a grid has no places
-        spread = jnp.sqrt(jnp.diag(found.covariance))
-        estimate = Estimate(found.pose, spread, place, place, jnp.int32(Action.NONE), jnp.bool_(True))
-        evidence = GridLocaliseEvidence(*found, worth, failed, outcome)
+        spread = jnp.sqrt(jnp.diag(covariance))
+        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), jnp.bool_(True))
+        evidence = GridLocaliseEvidence(pose, covariance, share, odds, fall, worth, failed, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridLocaliseState(known, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
     def new_map(self) -> GridLocaliser:
         """A session of which nothing is known but perhaps its start."""
-        return GridLocaliser(self._saved, self._needed, self._start is not None)
+        return GridLocaliser(self._drawn, self._path, self._needed, self._start is not None)
 
 
 def build(

@@ -117,17 +117,13 @@ class SessionBatch:
         if all(each is None for each in merged):
             return states
         held = jax.tree.map(np.asarray, states)
-        each_state = [jax.tree.map(partial(_row, k), held) for k in range(len(merged))]
+        each_state = [jax.tree.map(lambda rows, k=k: rows[k], held) for k in range(len(merged))]
         with jax.default_device(jax.devices("cpu")[0]):
             after = [
                 state if each is None else self._backend.merge_rows(state, each)
                 for state, each in zip(each_state, merged, strict=True)
             ]
         return cast(RecallState, jax.tree.map(jnp.asarray, _stack(after)))
-
-
-def _row(k: int, rows: np.ndarray) -> np.ndarray:
-    return rows[k]
 
 
 def _stack(trees: Sequence[Any]) -> Any:

@@ -67,24 +67,38 @@ def recognise(
 ) -> tuple[Belief, RecallResult]:
     """Updates the belief for a new keyframe, and finds the best candidate.
 
+    One update of a hidden Markov model whose states are the view cells (k, s) and novelty, as the equations
+    of `ratslam.network.pose_cells` have it: the prior moves with the odometry, each view cell is weighed by
+    the likelihood of the view there, and the sum is normalised (Bayesian localisation, Fox et al. 1999).
+
     Args:
-        network: the size of its cells is the unit of all lengths in `config`. motion: [3] odometry since the
-            last update, m, m, rad. local: share of what enters anew that is put around the map's pose.
+        network: the size of its cells is the unit of all lengths in `config`. memory: C keyframes with their
+            poses in the map, m, m, rad.
+        belief: after the last update. motion: [3] odometry since then, m, m, rad.
+        observation: likelihood l_ks [S or 1, C] of the view at each shift and keyframe, and l_new.
+        local: share of what enters anew that is put around the map's pose.
+
+    Returns:
+        the belief after the view, with mass [S, C] of the view cells; the candidate for a loop closure.
     """
     cell, shifts = network.cells.cell_size, sector_shifts(config)
     cells = view_cells(config, memory)
     known, certain, novelty = recallable(config, memory), observation.certain, observation.novelty
     likelihood = jnp.where(known[None], observation.likelihood, 0.0)
 
+    # Prior: mass that odometry leads to each view cell, and mass e that enters anew from novelty.
     moved, lost = pose_cells.predict(network, belief, cells, motion)
     fresh = jnp.maximum(1 - jnp.sum(belief.activity), 0.0)
     entered = fresh * config.enter * _entry(config, cell, memory, cells, local)
     arrived, dtype = fresh + lost - jnp.sum(entered), memory.x.dtype
+    # v_ks = l_ks [(1 - leak) (K'Y)_ks + e_ks] and n = l_new (novelty that stays + mass that found no view
+    # cell), both divided by their sum; then A = K v.
     mass, novel = pose_cells.inhibit(
         likelihood * (moved + entered).astype(dtype), novelty * arrived.astype(dtype)
     )
     belief = pose_cells.anchor(network, belief, cells, mass)
 
+    # The heaviest packet, and the heaviest apart from it.
     match = _peak(jnp.max(mass, axis=0))
     shift = _peak(mass[:, match])
     basin = _basin(cell, memory, match)
@@ -92,9 +106,13 @@ def recognise(
     others = jnp.where(basin, 0.0, jnp.sum(mass, axis=0))
     second = jnp.sum(jnp.where(_basin(cell, memory, _peak(others)), others, 0.0))
     gain = jnp.log(jnp.where(certain, jnp.broadcast_to(likelihood, mass.shape)[shift, match], 1.0) / novelty)
-    near = known & _is_here(cell, memory, current_pose(memory))
+    # Does the view fit where the map says that the robot is: within a cell, facing alike?
+    here = current_pose(memory)
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
+    near = known & ((apart < cell**2) & facing)
     best = jnp.max(jnp.where(near, jnp.max(likelihood, axis=0), 0.0))
-    told = certain & observation.informative & jnp.any(near)
+    is_informative = certain & observation.informative & jnp.any(near)
     found = certain & (packet > 0)
     return belief, RecallResult(
         keyframe=memory.count,
@@ -104,7 +122,7 @@ def recognise(
         second=jnp.where(certain, second, 0.0),
         log_ratio=jnp.where(found, gain, 0.0),
         novelty=jnp.where(certain, novel, 1.0),
-        view_fits=jnp.where(told, (best >= novelty).astype(jnp.int32), -1),
+        view_fits=jnp.where(is_informative, (best >= novelty).astype(jnp.int32), -1),
         background=observation.background,
     )
 
@@ -154,13 +172,6 @@ def _entry(
 def _basin(cell: float, memory: Memory, row: Array) -> Array:
     """[C] whether each keyframe is in the packet of one."""
     return (memory.x - memory.x[row]) ** 2 + (memory.y - memory.y[row]) ** 2 < (BASIN * cell) ** 2
-
-
-def _is_here(cell: float, memory: Memory, here: Array) -> Array:
-    """[C] whether each keyframe is within a cell of the pose `here` [3] and faces alike."""
-    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
-    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
-    return (apart < cell**2) & facing
 
 
 def empty_result(memory: Memory) -> RecallResult:

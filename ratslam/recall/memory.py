@@ -1,4 +1,11 @@
-"""The memory of recall: all keyframes, and the map's feedback."""
+"""The memory of recall: a view cell for every keyframe, and what it takes over from the map.
+
+Each keyframe keeps the view and the pose in the map at which it was stored, as the view templates of RatSLAM
+keep a view and the packet's pose (Milford & Wyeth 2004; Ball et al. 2013, section 3). Between keyframes the
+odometry adds up; when it is long enough, the next view becomes a keyframe (`is_keyframe_due`). Where
+keyframes are is decided by the map: its poses and what it has learned of the sensors come back as
+`MapFeedback`.
+"""
 
 from __future__ import annotations
 
@@ -142,22 +149,14 @@ def begin_piece(memory: Memory) -> Memory:
     )
 
 
-class PackedFeedback(NamedTuple):
-    """`MapFeedback` in arrays of fixed shapes.
+def pack_feedback(memory: Memory, feedback: MapFeedback) -> tuple[np.ndarray, np.ndarray, Array]:
+    """The feedback of a map of a keyframe or more, in arrays of fixed shapes; copied, because the map changes
+    its arrays in place.
 
-    Attributes:
-        rows: [5, C] x, y, heading, its cosine and sine of all keyframes, 0 after the last. values: [8] pose
-            of the newest keyframe, bias, turn error, distance, angle, scale. likeness: see `MapFeedback`.
+    Returns:
+        rows [5, C]: x, y, heading, its cosine and sine of all keyframes, 0 after the last; values [8]: pose
+        of the newest keyframe, bias, turn error, distance, angle, scale; likeness: see `MapFeedback`.
     """
-
-    rows: Array
-    values: Array
-    likeness: Array
-
-
-def pack_feedback(memory: Memory, feedback: MapFeedback) -> PackedFeedback:
-    """The feedback of a map of a keyframe or more, for a memory; copied, because the map changes its arrays
-    in place."""
     dtype, count = memory.x.dtype, len(feedback.poses)
     newest = feedback.poses[-1] if feedback.start is None else feedback.start
     rows = np.zeros((5, memory.x.shape[0]), dtype)
@@ -165,16 +164,16 @@ def pack_feedback(memory: Memory, feedback: MapFeedback) -> PackedFeedback:
     rows[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
     rest = feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale
     likeness = np.array(feedback.likeness, dtype) if feedback.likeness.size else memory.likeness
-    return PackedFeedback(rows, np.array([*newest, *rest], dtype), likeness)
+    return rows, np.array([*newest, *rest], dtype), likeness
 
 
-def take_feedback(memory: Memory, feedback: PackedFeedback) -> Memory:
-    """The memory with the map's current poses and view metric."""
-    x, y, heading, cosine, sine = feedback.rows
-    bias, turn_error, since, angle, scale = feedback.values[3:]
+def take_feedback(memory: Memory, feedback: tuple[Array, Array, Array]) -> Memory:
+    """The memory with the map's current poses and view metric, packed by `pack_feedback`."""
+    (x, y, heading, cosine, sine), values, likeness = feedback
+    bias, turn_error, since, angle, scale = values[3:]
     return memory._replace(
-        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=feedback.values[:3],
-        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=feedback.likeness,
+        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=values[:3],
+        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=likeness,
     )  # fmt: skip
 
 
@@ -182,7 +181,8 @@ def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     """The memory with the feedback of a map, of an empty one as it is."""
     if not len(feedback.poses):
         return memory
-    return take_feedback(memory, PackedFeedback(*map(jnp.asarray, pack_feedback(memory, feedback))))
+    rows, values, likeness = pack_feedback(memory, feedback)
+    return take_feedback(memory, (jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
 
 
 def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
@@ -225,7 +225,11 @@ def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
 
 
 def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
-    """bool: the present view becomes a keyframe, because the robot has moved far enough."""
+    """bool: the present view becomes a keyframe, because the robot has moved far enough.
+
+    Args:
+        cell: side of a pose cell, m: the unit of the lengths in `config`.
+    """
     moved = is_motion_due(config, cell, memory)
     return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
 
@@ -255,7 +259,12 @@ def pose_spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Arra
 
 
 def store_keyframe(memory: Memory, view: Array, label: Array) -> Memory:
-    """Stores the newest view as a keyframe at the robot's current pose."""
+    """Stores the newest view as a keyframe at the robot's current pose.
+
+    Args:
+        view: [D] or more values as they are compared, those beyond D are not stored. label: int32 place id,
+            -1 for none.
+    """
     row, pose = memory.count, current_pose(memory)
     zero = jnp.zeros_like(memory.length)
     known = jnp.any(memory.label == label) | (label < 0)
