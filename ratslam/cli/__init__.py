@@ -21,7 +21,7 @@ from tactile.base.files import FULL
 
 COMMANDS = (
     run.add_run, live.add_commands, maps.add_localise, maps.add_merge, maps.add_map, maps.add_path,
-    run.add_look, doctor.add_doctor, doctor.add_fit, tools.add_export, tools.add_check, tools.add_tools,
+    run.add_look, doctor.add_commands, tools.add_export, tools.add_check, tools.add_tools,
 )  # fmt: skip
 """The commands that are always there, in the order of the help."""
 INSTALLED = "ratslam.commands"

@@ -40,9 +40,13 @@ FOLDER = "jax_compilation_cache_dir"
 def cache_settings() -> dict[str, str | int]:
     """JAX's settings of the cache, by name. Each kind of processor has its own folder, because a kernel may
     use what another processor lacks; of other versions JAX finds nothing there."""
+    lines = CPUINFO.read_text(errors="replace").splitlines() if CPUINFO.exists() else []
+    skills = [line for line in lines if line.startswith(("flags", "Features"))][:1]
+    digest = hashlib.sha256((platform.processor() + "".join(skills)).encode()).hexdigest()
+    processor = f"{platform.machine()}-{digest[:12]}"
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return {
-        FOLDER: str(Path(home) / "ratslam" / "jax" / processor_name()),
+        FOLDER: str(Path(home) / "ratslam" / "jax" / processor),
         # The defaults do not cache kernels that compile as fast as ours do on a CPU.
         "jax_persistent_cache_min_compile_time_secs": 0,
         "jax_persistent_cache_min_entry_size_bytes": -1,
@@ -56,14 +60,6 @@ def keep_kernels() -> None:
             jax.config.update(name, value)
 
 
-def processor_name() -> str:
-    """A name of the kind of processor: its architecture, and a digest of what it can do."""
-    lines = CPUINFO.read_text(errors="replace").splitlines() if CPUINFO.exists() else []
-    skills = [line for line in lines if line.startswith(("flags", "Features"))][:1]
-    digest = hashlib.sha256((platform.processor() + "".join(skills)).encode()).hexdigest()
-    return f"{platform.machine()}-{digest[:12]}"
-
-
 Precision = Literal["float64", "float32"]
 
 
@@ -71,19 +67,6 @@ def prepare_precision(precision: Precision) -> None:
     """Enables JAX's 64-bit types for `float64`; `float32` works with them enabled or not."""
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
-
-
-def check_precision(precision: Precision) -> None:
-    """Checks that JAX can compute in this precision.
-
-    Raises:
-        ValueError: float64 while JAX's 64-bit types are disabled.
-    """
-    if precision == "float64" and not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "precision float64, but JAX's 64-bit types are disabled; call"
-            " ratslam.core.compilation.prepare_precision('float64') before JAX is used"
-        )
 
 
 FLAGS = (

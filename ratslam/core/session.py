@@ -23,7 +23,7 @@ from jax import lax
 from ratslam.core.arrays import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.backend import Backend, Evidence, Map, State
 from ratslam.core.checkpoint import with_prefix
-from ratslam.core.compilation import Precision, check_precision
+from ratslam.core.compilation import Precision
 from ratslam.core.estimates import Estimate
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation, Odometry
@@ -104,7 +104,11 @@ class Session:
         precision: Precision = "float64",
         probe: Probe | None = None,
     ) -> None:
-        check_precision(precision)
+        if precision == "float64" and not jax.config.read("jax_enable_x64"):
+            raise ValueError(
+                "precision float64, but JAX's 64-bit types are disabled; call"
+                " ratslam.core.compilation.prepare_precision('float64') before JAX is used"
+            )
         self.backend, self._probe = backend, probe
         self.reserve = reserve
         self._layout: Layout | None = None

@@ -27,7 +27,7 @@ from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from ratslam.recall import filter
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import MapFeedback, Memory, corrected_motion, first_keyframes, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory, frozen_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
 
@@ -115,7 +115,7 @@ class MapViews:
         views, labels = self.graph.appearance.stored(frames)
 
         def gains(begin: int, count: int) -> np.ndarray:
-            earlier = first_keyframes(whole, int(held[: begin - guard].sum()))
+            earlier = whole.first_keyframes(int(held[: begin - guard].sum()))
             view = jnp.asarray(views[begin : begin + count].T.astype(whole.view.dtype))
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
@@ -163,7 +163,7 @@ class MapViews:
     def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
         """Recalls one view in its stored form, and compares it with all keyframes."""
         memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
-        motion = corrected_motion(memory)
+        motion = memory.corrected_motion()
         belief, result = filter.recognise(
             self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
         )

@@ -178,7 +178,7 @@ class RecallBackend(Backend):
         if not len(feedback.poses):
             return state
         memory = state.memory
-        memory, belief = self._follow(memory, state.belief, recall_memory.pack_feedback(memory, feedback))
+        memory, belief = self._follow(memory, state.belief, memory.pack_feedback(feedback))
         return state._replace(memory=memory, belief=belief)
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
@@ -226,7 +226,7 @@ class RecallBackend(Backend):
         self, memory: Memory, belief: Belief, feedback: tuple[Array, Array, Array]
     ) -> tuple[Memory, Belief]:
         """Memory and belief of a map that has moved; pure."""
-        memory = recall_memory.take_feedback(memory, feedback)
+        memory = memory.take_feedback(feedback)
         return memory, self._anchored(memory, belief)
 
     def _anchored(self, memory: Memory, belief: Belief) -> Belief:
@@ -267,10 +267,10 @@ class RecallBackend(Backend):
         has_room = memory.count < memory.label.shape[0]
         outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
         outcome = jnp.where(clean, outcome, RecallOutcome.NOT_FINITE).astype(jnp.int32)
-        sd, sd_heading = recall_memory.pose_spread(self.recall, self.cell, memory)
+        sd, sd_heading = memory.pose_spread(self.recall, self.cell)
         place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
         estimate = Estimate(
-            pose=recall_memory.current_pose(memory),
+            pose=memory.current_pose(),
             spread=jnp.stack([sd, sd, sd_heading]),
             place=place,
             previous=place,
@@ -290,7 +290,7 @@ class RecallBackend(Backend):
         units = 2 * np.pi / shape[0], cells.cell_size, cells.cell_size
 
         def each(state: RecallState, chosen: Array) -> Array:
-            motion = recall_memory.corrected_motion(state.memory)
+            motion = state.memory.corrected_motion()
             return pose_cells.activity_at(self.network, state.belief, motion, chosen)
 
         def active(held: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -395,12 +395,12 @@ class RecallBackend(Backend):
     def _recognise(
         self, config: RecallConfig, state: RecallState, view: Array, label: Array
     ) -> tuple[RecallState, RecallResult]:
-        motion = recall_memory.corrected_motion(state.memory)
+        motion = state.memory.corrected_motion()
         memory, likelihood = self.likelihood(config, state.memory, view, label)
         belief, result = filter.recognise(
             config, self.network, memory, state.belief, motion, likelihood, self.recall.local
         )
-        memory = recall_memory.store_keyframe(memory, view, label)
+        memory = memory.store_keyframe(view, label)
         return state._replace(belief=belief, memory=memory), result
 
     def likelihood(

@@ -18,7 +18,7 @@ from jax import lax
 from ratslam.core.arrays import PackedRecords, allocate, layout_of
 from ratslam.core.session import CHUNK, Session, run_chunk
 from ratslam.methods.recall import RecallBackend, RecallState
-from ratslam.recall.memory import MapFeedback, MergedRows, pack_feedback
+from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
 
@@ -105,7 +105,7 @@ class SessionBatch:
                 states = jax.vmap(partial(backend.cover, sides=sides))(states)
             states = self._merge(states, [each.merged for each in chunks])
             if len(chunks[0].feedback.poses):
-                packed = _stack([pack_feedback(empty.memory, each.feedback) for each in chunks])
+                packed = _stack([empty.memory.pack_feedback(each.feedback) for each in chunks])
                 memory, belief = self._follow(states.memory, states.belief, packed)
                 states = states._replace(memory=memory, belief=belief)
             records = _stack([each.records for each in chunks])

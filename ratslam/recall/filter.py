@@ -23,7 +23,7 @@ from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import BASIN, SUPPORT, Belief, ViewCells
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import Memory, allowed_shifts, current_pose, pose_spread, recallable
+from ratslam.recall.memory import Memory
 from ratslam.recall.observation_model import SAMPLES, ObservationLikelihood
 from tactile.base.se2 import wrap
 from tactile.base.types import Array
@@ -83,7 +83,7 @@ def recognise(
     """
     cell, shifts = network.cells.cell_size, sector_shifts(config)
     cells = view_cells(config, memory)
-    known, certain, novelty = recallable(config, memory), observation.certain, observation.novelty
+    known, certain, novelty = memory.recallable(config), observation.certain, observation.novelty
     likelihood = jnp.where(known[None], observation.likelihood, 0.0)
 
     # Prior: mass that odometry leads to each view cell, and mass e that enters anew from novelty.
@@ -107,7 +107,7 @@ def recognise(
     second = jnp.sum(jnp.where(_basin(cell, memory, _peak(others)), others, 0.0))
     gain = jnp.log(jnp.where(certain, jnp.broadcast_to(likelihood, mass.shape)[shift, match], 1.0) / novelty)
     # Does the view fit where the map says that the robot is: within a cell, facing alike?
-    here = current_pose(memory)
+    here = memory.current_pose()
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
     facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
     near = known & ((apart < cell**2) & facing)
@@ -135,7 +135,7 @@ def view_cells(config: RecallConfig, memory: Memory) -> ViewCells:
     rows = memory.x, memory.y, memory.heading, memory.cosine, memory.sine
     x, y, heading, own_cosine, own_sine = (values.astype(single)[None] for values in rows)
     cosine, sine = jnp.cos(angles)[:, None], jnp.sin(angles)[:, None]
-    used = allowed_shifts(shifts, memory)[:, None] & recallable(config, memory)[None]
+    used = memory.allowed_shifts(shifts)[:, None] & memory.recallable(config)[None]
     return ViewCells(
         x=jnp.broadcast_to(x, used.shape),
         y=jnp.broadcast_to(y, used.shape),
@@ -157,8 +157,8 @@ def _entry(
     config: RecallConfig, cell: float, memory: Memory, cells: ViewCells, local: Array | float
 ) -> Array:
     """[S, C] shares of what enters anew: spread over all view cells, and around the map's pose."""
-    here = current_pose(memory).astype(cells.x.dtype)
-    sd, sd_heading = (spread.astype(cells.x.dtype) for spread in pose_spread(config, cell, memory))
+    here = memory.current_pose().astype(cells.x.dtype)
+    sd, sd_heading = (spread.astype(cells.x.dtype) for spread in memory.pose_spread(config, cell))
     apart = ((cells.x - here[0]) ** 2 + (cells.y - here[1]) ** 2) / sd**2
     facing = cells.cosine * jnp.cos(here[2]) + cells.sine * jnp.sin(here[2])
     inside = jnp.maximum(1 - (apart + (2 / sd_heading**2) * (1 - facing)) / SUPPORT, 0.0)
