@@ -57,12 +57,8 @@ class Course(NamedTuple):
     energy: Array
 
 
-class Track(NamedTuple):
-    """Result: pose [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
-
-    pose: Array
-    outcome: Array
-    level: Array
+Track = tuple[Array, Array, Array]
+"""Decoded packets [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
 
 
 def networks(config: NetworkConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
@@ -72,7 +68,7 @@ def networks(config: NetworkConfig, sets: Network, course: Course, block: int = 
     again with all levels, which in a batch cost time even where they are not used.
     """
     track = jax.tree.map(np.array, _networks(config, 1, sets, course, block))
-    again = np.flatnonzero(np.any(track.level > 0, axis=1))
+    again = np.flatnonzero(np.any(track[2] > 0, axis=1))
     if len(again):
         room = np.resize(again, 1 << (len(again) - 1).bit_length())  # few shapes to compile
         chosen = jax.tree.map(lambda column: jnp.asarray(column)[room], sets)
@@ -96,7 +92,7 @@ def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: 
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
             cells, info = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
-            return cells, Track(cells.pose, info.outcome, info.level)
+            return cells, (cells.pose, info.outcome, info.level)
 
         return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
 

@@ -134,11 +134,19 @@ class Session:
         self.state = self._init(jax.random.key(seed), self._capacity)
 
     def step(self, observation: Observation) -> Step:
-        """Folds one observation, live."""
+        """Folds one observation, live.
+
+        Args:
+            observation: body-frame odometry since the one before, m, m, rad, with a view [R, C, K], a place
+                id or whiskers; of the same shapes in every step.
+
+        Returns:
+            the estimate and evidence of the kernel, and the pose [3] in the map frame, m, m, rad.
+        """
         return self._advance([observation])[0]
 
     def replay(self, observations: Iterable[Observation]) -> Iterator[Step]:
-        """Folds many observations, a chunk at a time; bit-identical to `step` for each."""
+        """Folds many observations, a chunk of up to `CHUNK` at a time; bit-identical to `step` for each."""
         remaining = iter(observations)
         # Chunks end at multiples of CHUNK, wherever the session stands when the replay begins.
         while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):

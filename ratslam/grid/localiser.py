@@ -41,7 +41,7 @@ from tactile.base.types import Array, Observation, Odometry
 UNEXPLAINED = 4
 """The session is not in the map if this many searches in a row have failed."""
 LEAST_SHARE = 0.5
-"""Share of the supposed poses that are the best one below which a found pose is lost."""
+"""Share of the pose hypotheses that are the best one below which a found pose is lost."""
 
 
 class GridLocaliser(Checkpointed, Map):
@@ -160,7 +160,7 @@ def _chance(log_odds: float) -> float:
 REPEATED = 0.5
 """Weight of what reports repeat, free whiskers and the robot's body, against new contacts and walls."""
 TEMPER = 0.6
-"""Weight of all of it where supposed poses compete: the map is wrong alike for many reports."""
+"""Weight of all of it where pose hypotheses compete: the map is wrong alike for many reports."""
 SPREAD, TURN = 0.12, 0.01
 """Displacement of a copy: standard deviation in cells of the map, and rad."""
 MIN_EFFECTIVE = 0.5
@@ -171,8 +171,8 @@ NEAR, NEAR_HEADING = 3.0, 0.5
 """Poses that are the same: within this distance, cells of the map, and this difference in heading, rad."""
 
 
-class Supposed(NamedTuple):
-    """N supposed poses.
+class Hypotheses(NamedTuple):
+    """N pose hypotheses.
 
     Attributes:
         swarm: the particles. odds: [N] log-odds of the session being there, on its own way, against the most
@@ -211,38 +211,38 @@ class Search:
         """Number of poses that can be told apart."""
         return self.expected.places(len(self._free), NEAR * self.config.cell, NEAR_HEADING)
 
-    def begin(self, key: Array) -> Supposed:
-        """Supposed poses at random poses in all free cells."""
+    def begin(self, key: Array) -> Hypotheses:
+        """Pose hypotheses at random poses in all free cells."""
         errors, places, turns = jax.random.split(key, 3)
         cell = (jnp.arange(self.count) * len(self._free)) // self.count
         off = jax.random.uniform(places, (self.count, 2), self.dtype, -0.5, 0.5) * self._cell
         heading = jax.random.uniform(turns, (self.count, 1), self.dtype, -np.pi, np.pi)
         pose = jnp.concatenate([jnp.asarray(self._free)[cell] + off, heading], axis=1)
-        return self._suppose(errors, pose, 0.0)
+        return self._begin(errors, pose, 0.0)
 
-    def begin_at(self, key: Array, pose: np.ndarray, odds: float) -> Supposed:
-        """Supposed poses about one [3], with standard deviations of a cell and of half the same heading, and
+    def begin_at(self, key: Array, pose: np.ndarray, odds: float) -> Hypotheses:
+        """Pose hypotheses about one [3], with standard deviations of a cell and of half the same heading, and
         with log-odds to begin with."""
         errors, places = jax.random.split(key)
         spread = jnp.array([self.config.cell, self.config.cell, NEAR_HEADING / 2], self.dtype)
         draws = lax.optimization_barrier(jax.random.normal(places, (self.count, 3), self.dtype))
         at = jnp.asarray(pose, self.dtype)[None] + spread[None] * draws
-        return self._suppose(errors, at, odds)
+        return self._begin(errors, at, odds)
 
-    def _suppose(self, key: Array, pose: Array, odds: float) -> Supposed:
+    def _begin(self, key: Array, pose: Array, odds: float) -> Hypotheses:
         swarm = particles.start(self.config.drift, key, self.count, self.dtype)._replace(pose=pose)
         begun = jnp.full(self.count, odds, self.dtype)
-        return Supposed(swarm, begun, begun)
+        return Hypotheses(swarm, begun, begun)
 
     def move(
-        self, known: Supposed, odometry: Odometry, changed: Array, key: Array, pressed: Array
-    ) -> Supposed:
-        """The supposed poses after an odometry reading; see `particles.move`."""
+        self, known: Hypotheses, odometry: Odometry, changed: Array, key: Array, pressed: Array
+    ) -> Hypotheses:
+        """The pose hypotheses after an odometry reading; see `particles.move`."""
         swarm = particles.move(self.config.drift, known.swarm, odometry, changed, key, pressed)
         return known._replace(swarm=swarm)
 
-    def weigh(self, known: Supposed, features: ContactFeatures, touched: Array) -> tuple[Supposed, Array]:
-        """The supposed poses weighed by a report, and whether all weights vanished.
+    def weigh(self, known: Hypotheses, features: ContactFeatures, touched: Array) -> tuple[Hypotheses, Array]:
+        """The pose hypotheses weighed by a report, and whether all weights vanished.
 
         Args:
             touched: [W] bool, whiskers in contact at the report before.
@@ -262,23 +262,23 @@ class Search:
         likelihood += jnp.where(features.valid, TEMPER * REPEATED * body, 0)
         swarm, vanished = particles.weigh(known.swarm, likelihood)
         odds = known.odds + total(agreement["odds"], agreement["wall_odds"])
-        return Supposed(swarm, odds, jnp.maximum(known.best, odds)), vanished
+        return Hypotheses(swarm, odds, jnp.maximum(known.best, odds)), vanished
 
-    def resample(self, known: Supposed, key: Array) -> tuple[Supposed, Array, Array]:
-        """The supposed poses, resampled if few are effective; the effective number, and whether they were."""
+    def resample(self, known: Hypotheses, key: Array) -> tuple[Hypotheses, Array, Array]:
+        """The hypotheses, resampled if few are effective; the effective number, and whether they were."""
         share = particles.normalised_weights(known.swarm.weight)
         worth = particles.effective_count(share)
         pick, jitter = jax.random.split(key)
         needed = worth < MIN_EFFECTIVE * self.count
 
-        def draw() -> Supposed:
+        def draw() -> Hypotheses:
             drawn = particles.resample(self._resampling, share, pick)
             swarm = particles.copy_particles(self._resampling, known.swarm, drawn, jitter)
-            return Supposed(swarm, known.odds[drawn.ancestor], known.best[drawn.ancestor])
+            return Hypotheses(swarm, known.odds[drawn.ancestor], known.best[drawn.ancestor])
 
         return lax.cond(needed, draw, lambda: known), worth, needed
 
-    def best_cluster(self, known: Supposed) -> tuple[Array, Array, Array, Array, Array]:
+    def best_cluster(self, known: Hypotheses) -> tuple[Array, Array, Array, Array, Array]:
         """The hypotheses that are the same as the most likely one.
 
         Returns:

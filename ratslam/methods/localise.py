@@ -76,7 +76,7 @@ class LocaliseBackend(Backend):
 
     Args:
         recall: the backend that made the map. map: the finished map. log_odds: see `LocaliseConfig`.
-        here: whether the robot is supposed to stand where the map ended.
+        here: whether the robot is assumed to stand where the map ended.
     """
 
     SINGLE = ("belief",)

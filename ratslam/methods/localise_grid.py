@@ -1,4 +1,4 @@
-"""Localisation in a finished grid map: supposed poses anywhere in it, weighed by what whiskers meet there."""
+"""Localisation in a finished grid map: pose hypotheses anywhere in it, weighed by what whiskers meet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
 from ratslam.grid.expectation import Expectation, draw_surfaces
-from ratslam.grid.localiser import GridLocaliser, Search, Supposed
+from ratslam.grid.localiser import GridLocaliser, Hypotheses, Search
 from ratslam.grid.map import GridMap
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
@@ -39,11 +39,11 @@ class GridLocaliseOutcome(IntEnum):
 
     OK = 0
     RESAMPLED = 1
-    """The supposed poses were resampled."""
+    """The pose hypotheses were resampled."""
     BEGUN_ANEW = 2
-    """No supposed pose explains the session; the search begins anew, anywhere in the map."""
+    """No pose hypothesis explains the session; the search begins anew, anywhere in the map."""
     VANISHED = 3
-    """No supposed pose explains the report; the weights are left unchanged."""
+    """No pose hypothesis explains the report; the weights are left unchanged."""
     NOT_FINITE = 4
     """Odometry or contacts were NaN, infinite or impossibly large; treated as no motion and no contact."""
 
@@ -52,9 +52,9 @@ class GridLocaliseEvidence(NamedTuple):
     """Evidence of one step.
 
     Attributes:
-        pose: [3] the most likely pose, m, m, rad. covariance: [3, 3] of it. share: of the supposed poses that
-            are the same. log_odds: of the session being there, against the most alike place elsewhere, since
-            the search began. fall: by how much they are below their best. effective_particles: their
+        pose: [3] the most likely pose, m, m, rad. covariance: [3, 3] of it. share: of the pose hypotheses
+            that are the same. log_odds: of the session being there, against the most alike place elsewhere,
+            since the search began. fall: by how much they are below their best. effective_particles: their
             effective number. failed: bool, the search failed and begins anew. outcome: see
             `GridLocaliseOutcome`.
     """
@@ -77,7 +77,7 @@ class GridLocaliseState(NamedTuple):
             of the random stream's key.
     """
 
-    known: Supposed
+    known: Hypotheses
     motion: Array
     touched: Array
     key: Array
@@ -87,8 +87,8 @@ class GridLocaliseBackend(Backend):
     """Localisation in a finished grid map.
 
     Args:
-        made: the finished map, which has contacts. log_odds: see `LocaliseConfig`. count: supposed poses.
-        here: whether the robot is supposed to stand where the map ended.
+        made: the finished map, which has contacts. log_odds: see `LocaliseConfig`. count: pose hypotheses.
+        here: whether the robot is assumed to stand where the map ended.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class GridLocaliseBackend(Backend):
         self._whiskers = len(made.feelers.length)
 
     def init(self, key: Array, capacity: int) -> GridLocaliseState:
-        """Supposed poses all over the map, or where it ended. Nothing grows: `capacity` is not used."""
+        """Pose hypotheses all over the map, or where it ended. Nothing grows: `capacity` is not used."""
         del capacity
         first, key = jax.random.split(key)
         start = self._start
@@ -123,7 +123,7 @@ class GridLocaliseBackend(Backend):
     def kernel(
         self, state: GridLocaliseState, observation: Observation
     ) -> tuple[GridLocaliseState, Estimate, GridLocaliseEvidence]:
-        """Moves and weighs the supposed poses; begins anew if none explains the session."""
+        """Moves and weighs the pose hypotheses; begins anew if none explains the session."""
         key, draw, again, anew = jax.random.split(jax.random.wrap_key_data(state.key), 4)
         odometry, features, clean = contact_features(observation, state.touched, self.dtype)
         motion = jnp.asarray(observation.motion, jnp.int32)

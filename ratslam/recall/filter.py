@@ -128,8 +128,8 @@ def recognise(
 
 
 def view_cells(config: RecallConfig, memory: Memory) -> ViewCells:
-    """The view cells of a memory: one for each keyframe and sector shift; in single precision, as the pose
-    cells are."""
+    """The view cells [S, C] of a memory: one for each keyframe k and sector shift s, at the pose p_ks of a robot
+    that sees the view of k shifted by s sectors; in single precision, as the pose cells are."""
     shifts, single = sector_shifts(config), jnp.float32
     angles = (-shifts.astype(memory.angle.dtype) * memory.angle).astype(single)  # of the robot
     rows = memory.x, memory.y, memory.heading, memory.cosine, memory.sine
@@ -156,7 +156,7 @@ def place_of(memory: Memory, result: RecallResult) -> Array:
 def _entry(
     config: RecallConfig, cell: float, memory: Memory, cells: ViewCells, local: Array | float
 ) -> Array:
-    """[S, C] shares of what enters anew: spread over all view cells, and around the map's pose."""
+    """[S, C] shares of what enters anew, e_ks / sum e: over all view cells, and around the map's pose."""
     here = memory.current_pose().astype(cells.x.dtype)
     sd, sd_heading = (spread.astype(cells.x.dtype) for spread in memory.pose_spread(config, cell))
     apart = ((cells.x - here[0]) ** 2 + (cells.y - here[1]) ** 2) / sd**2

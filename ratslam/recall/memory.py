@@ -277,7 +277,11 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
 
 
 def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
-    """Adds body-frame motion [3] (m, m, rad) to the odometry since the newest keyframe."""
+    """Adds body-frame motion to the odometry since the newest keyframe (path integration between views).
+
+    Args:
+        odometry: [3] of one step, m, m, rad.
+    """
     return memory._replace(
         motion=compose(memory.motion, odometry),
         length=memory.length + jnp.hypot(odometry[0], odometry[1]),
