@@ -128,8 +128,8 @@ def recognise(
 
 
 def view_cells(config: RecallConfig, memory: Memory) -> ViewCells:
-    """The view cells [S, C] of a memory: one for each keyframe k and sector shift s, at the pose p_ks of a robot
-    that sees the view of k shifted by s sectors; in single precision, as the pose cells are."""
+    """The view cells [S, C] of a memory: one for each keyframe k and sector shift s, at the pose p_ks of a
+    robot that sees the view of k shifted by s sectors; in single precision, as the pose cells are."""
     shifts, single = sector_shifts(config), jnp.float32
     angles = (-shifts.astype(memory.angle.dtype) * memory.angle).astype(single)  # of the robot
     rows = memory.x, memory.y, memory.heading, memory.cosine, memory.sine
