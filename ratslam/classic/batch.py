@@ -1,13 +1,10 @@
-"""Many sessions in one compiled call: parameter sets, seeds, noise levels.
+"""Many sessions in one compiled call: parameter sets, seeds and noise levels of the published network.
 
-Sessions are computed a few at a time, each from beginning to end, because all at once exceed the processor's
-cache. On a GPU blocks may be as large as its memory.
-
-Many networks over one long course: parameter sets and noise, a segment of the course at a time.
-
-Every segment is computed for blocks of networks at the smallest window level; those that needed a larger one
-in it are computed again, one by one with all levels, from where the segment began. Memory is that of the
-networks' states and of one segment, whatever the length of the course.
+Sessions are computed a few at a time, because all at once exceed the processor's cache; on a GPU blocks may
+be as large as its memory. `networks` and `trials` compute each from beginning to end. `walk` takes many
+networks over a long course, a segment at a time: at the smallest window level, and those that needed a larger
+one again from where the segment began, one by one with all levels. Its memory is that of the networks' states
+and of one segment.
 """
 
 from __future__ import annotations
@@ -24,8 +21,7 @@ from jax import lax
 from ratslam.classic import pose_cells
 from ratslam.classic.cell_probe import activity_of
 from ratslam.classic.config import NetworkConfig, rings
-from ratslam.classic.excitation_inhibition import with_kernels
-from ratslam.classic.levels import Level, window_levels
+from ratslam.classic.levels import window_levels
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.core.estimates import Estimate
 from tactile.base.types import Array, Observation, Odometry
@@ -61,12 +57,8 @@ class Course(NamedTuple):
     energy: Array
 
 
-class Track(NamedTuple):
-    """Result: pose [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
-
-    pose: Array
-    outcome: Array
-    level: Array
+Track = tuple[Array, Array, Array]
+"""Decoded packets [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
 
 
 def networks(config: NetworkConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
@@ -76,7 +68,7 @@ def networks(config: NetworkConfig, sets: Network, course: Course, block: int = 
     again with all levels, which in a batch cost time even where they are not used.
     """
     track = jax.tree.map(np.array, _networks(config, 1, sets, course, block))
-    again = np.flatnonzero(np.any(track.level > 0, axis=1))
+    again = np.flatnonzero(np.any(track[2] > 0, axis=1))
     if len(again):
         room = np.resize(again, 1 << (len(again) - 1).bit_length())  # few shapes to compile
         chosen = jax.tree.map(lambda column: jnp.asarray(column)[room], sets)
@@ -94,13 +86,13 @@ def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: 
 
     def simulate(network: Network) -> Track:
         kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(level._replace(window=with_kernels(level.window, *kernels)) for level in used)
+        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in used)
 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
             cells, info = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
-            return cells, Track(cells.pose, info.outcome, info.level)
+            return cells, (cells.pose, info.outcome, info.level)
 
         return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
 
@@ -176,11 +168,8 @@ class CellTrack(NamedTuple):
     level: np.ndarray
 
 
-class _Walker(NamedTuple):
-    """One network on its way: its state, and the packets [M, 3] at which templates were first seen."""
-
-    cells: PoseCells
-    packet: Array
+Walker = tuple[PoseCells, Array]
+"""One network on its way: its state, and the packets [M, 3] at which templates were first seen."""
 
 
 class _Fleet:
@@ -196,15 +185,15 @@ class _Fleet:
         self._sets = jax.tree.map(lambda column: np.asarray(column, dtype), sets)
         self._count = len(self._sets.speed_noise)
         templates = int(np.max(course.template, initial=0)) + 1
-        start = jax.device_get(_start(config, dtype, templates))
-        self._walkers = [start] * self._count
+        start: Walker = (pose_cells.start(config, dtype), jnp.zeros((templates, 3), dtype))
+        self._walkers = [jax.device_get(start)] * self._count
         self._wait = np.zeros(self._count, int)  # segments until the smallest level alone is tried again
         self._failures = np.zeros(self._count, int)  # of the smallest level, one after the other
 
     def advance(self, rows: CellCourse, block: int) -> CellTrack:
         """The networks over a segment [S] of the course, `block` of them at a time where that is exact."""
         found: dict[int, CellTrack] = {}
-        small = [walker.cells.activity.level == 0 for walker in self._walkers]
+        small = [cells.activity.level == 0 for cells, _ in self._walkers]
         tried = [k for k in range(self._count) if small[k] and not self._wait[k]]
         for first in range(0, len(tried), block):
             found |= self._advance_together(rows, tried[first : first + block], block)
@@ -215,7 +204,7 @@ class _Fleet:
             if k not in found:
                 self._wait[k] = max(self._wait[k] - 1, 0)
                 own = self._of(k), self._walkers[k], rows, self._chosen
-                self._walkers[k], found[k] = jax.device_get(_walk_alone(self._config, *own))
+                self._walkers[k], found[k] = jax.device_get(_walk(self._config, *own, together=False))
         return jax.tree.map(lambda *tracks: np.stack(tracks), *(found[k] for k in range(self._count)))
 
     def _advance_together(self, rows: CellCourse, group: list[int], block: int) -> dict[int, CellTrack]:
@@ -223,16 +212,22 @@ class _Fleet:
         # A group is filled up with its first network, whose copies are thrown away.
         members = np.resize(group, block)
         members[len(group) :] = group[0]
-        states = [_at_smallest(self._walkers[k]) for k in members]
+        states = []
+        for cells, packet in (self._walkers[k] for k in members):
+            activity = cells.activity._replace(blocks=cells.activity.blocks[:1])
+            states.append((cells._replace(activity=activity), packet))
         together = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
         after, track = jax.device_get(
-            _walk_together(self._config, self._of(members), together, rows, self._chosen)
+            _walk(self._config, self._of(members), together, rows, self._chosen, together=True)
         )
         found = {}
         for j, k in enumerate(group):
             if not track.level[j].any():
-                state = jax.tree.map(lambda leaf, j=j: leaf[j], after)
-                self._walkers[k] = _with_larger_levels(state, self._walkers[k])
+                cells, packet = jax.tree.map(lambda leaf, j=j: leaf[j], after)
+                # With the blocks of the larger levels, whose contents do not count.
+                blocks = (*cells.activity.blocks, *self._walkers[k][0].activity.blocks[1:])
+                activity = cells.activity._replace(blocks=blocks)
+                self._walkers[k] = cells._replace(activity=activity), packet
                 self._failures[k], found[k] = 0, jax.tree.map(lambda leaf, j=j: leaf[j], track)
         return found
 
@@ -258,68 +253,40 @@ def walk(
         yield jax.tree.map(lambda column, left=steps - first: column[:, :left], track)
 
 
-@partial(jax.jit, static_argnames=("config", "dtype", "templates"))
-def _start(config: NetworkConfig, dtype: np.dtype, templates: int) -> _Walker:
-    return _Walker(pose_cells.start(config, dtype), jnp.zeros((templates, 3), dtype))
-
-
-def _at_smallest(walker: _Walker) -> _Walker:
-    """The walker with the block of the smallest level alone."""
-    activity = walker.cells.activity
-    activity = activity._replace(blocks=activity.blocks[:1])
-    return walker._replace(cells=walker.cells._replace(activity=activity))
-
-
-def _with_larger_levels(walker: _Walker, whole: _Walker) -> _Walker:
-    """The walker at the smallest level with the other blocks, which do not count, of one with all levels."""
-    activity = walker.cells.activity
-    activity = activity._replace(blocks=(*activity.blocks, *whole.cells.activity.blocks[1:]))
-    return walker._replace(cells=walker.cells._replace(activity=activity))
-
-
-@partial(jax.jit, static_argnames=("config", "chosen"))
-def _walk_together(
-    config: NetworkConfig, sets: CellSets, walkers: _Walker, rows: CellCourse, chosen: tuple[int, ...]
-) -> tuple[_Walker, CellTrack]:
-    """Networks over a segment, at the smallest level alone."""
-    levels = window_levels(config, np.dtype(rows.motion.dtype))[:1]
-    return jax.vmap(partial(_walk, config, levels), (0, 0, None, None))(sets, walkers, rows, chosen)
-
-
-@partial(jax.jit, static_argnames=("config", "chosen"))
-def _walk_alone(
-    config: NetworkConfig, own: CellSets, walker: _Walker, rows: CellCourse, chosen: tuple[int, ...]
-) -> tuple[_Walker, CellTrack]:
-    """One network over a segment, with all levels."""
-    levels = window_levels(config, np.dtype(rows.motion.dtype))
-    return _walk(config, levels, own, walker, rows, chosen)
-
-
+@partial(jax.jit, static_argnames=("config", "chosen", "together"))
 def _walk(
     config: NetworkConfig,
-    levels: tuple[Level, ...],
-    own: CellSets,
-    walker: _Walker,
+    sets: CellSets,
+    walker: Walker,
     rows: CellCourse,
     chosen: tuple[int, ...],
-) -> tuple[_Walker, CellTrack]:
-    dtype, network = rows.motion.dtype, own.network
-    kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-    tuned = tuple(level._replace(window=with_kernels(level.window, *kernels)) for level in levels)
+    together: bool,
+) -> tuple[Walker, CellTrack]:
+    """Networks over a segment: many `together` at the smallest level alone, or one with all levels."""
+    dtype = rows.motion.dtype
+    levels = window_levels(config, np.dtype(dtype))[: 1 if together else None]
     ring = rings(config, dtype)
 
-    def step(walker: _Walker, row: CellCourse) -> tuple[_Walker, CellTrack]:
-        faster, turn = 1 + own.speed_noise * row.noise[0], own.heading_noise * row.noise[1]
-        moved = Odometry(
-            row.motion[0] * faster, row.motion[1] * faster, row.motion[2] + turn, jnp.ones((), dtype)
-        )
-        seen = walker.packet[row.template]
-        # A template is learnt with the packet before the step.
-        packet = walker.packet.at[row.template].set(jnp.where(row.novel, walker.cells.pose, seen))
-        turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
-        recall, energy = (seen + turned) % ring, row.energy * network.energy
-        cells, info = pose_cells.step(config, tuned, walker.cells, moved, recall, energy)
-        active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
-        return _Walker(cells, packet), CellTrack(cells.pose, active, info.outcome, info.level)
+    def simulate(own: CellSets, walker: Walker) -> tuple[Walker, CellTrack]:
+        network = own.network
+        kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
+        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in levels)
 
-    return lax.scan(step, walker, rows)
+        def step(walker: Walker, row: CellCourse) -> tuple[Walker, CellTrack]:
+            cells, packet = walker
+            faster, turn = 1 + own.speed_noise * row.noise[0], own.heading_noise * row.noise[1]
+            moved = Odometry(
+                row.motion[0] * faster, row.motion[1] * faster, row.motion[2] + turn, jnp.ones((), dtype)
+            )
+            seen = packet[row.template]
+            # A template is learnt with the packet before the step.
+            packet = packet.at[row.template].set(jnp.where(row.novel, cells.pose, seen))
+            turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
+            recall, energy = (seen + turned) % ring, row.energy * network.energy
+            cells, info = pose_cells.step(config, tuned, cells, moved, recall, energy)
+            active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
+            return (cells, packet), CellTrack(cells.pose, active, info.outcome, info.level)
+
+        return lax.scan(step, walker, rows)
+
+    return (jax.vmap(simulate) if together else simulate)(sets, walker)

@@ -4,32 +4,15 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import excitation_inhibition as window
-from ratslam.classic.levels import Activity, Block, Level
+from ratslam.classic.levels import Activity, Level
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Array
-
-
-class HeldCells(NamedTuple):
-    """The windows of the level that holds the activity.
-
-    A window of 16^3 cells is read and summed in a fraction of the time that the whole torus takes.
-
-    Attributes:
-        level: int32. origin: [M, 3] int32 first cell of each window over x, y, heading, then zeros, for the
-            level with most windows. cells: [K * N * N] float32, the windows flattened, then zeros.
-    """
-
-    level: Array
-    origin: Array
-    cells: Array
 
 
 def choose_cells(
@@ -59,8 +42,14 @@ def choose_cells(
     return ((at[:, 2] * rings[1] + at[:, 1]) * rings[0] + at[:, 0]).astype(np.int32)
 
 
-def hold_cells(levels: tuple[Level, ...], activity: Activity) -> HeldCells:
-    """The activity at its own level."""
+def hold_cells(levels: tuple[Level, ...], activity: Activity) -> tuple[Array, Array, Array]:
+    """The windows of the level that holds the activity, for `active_cells`: a window of 16^3 cells is read
+    and summed in a fraction of the time that the whole torus takes.
+
+    Returns:
+        level, int32; origin [M, 3] int32, the first cell of each window over x, y, heading, then zeros, for
+        the level with most windows; cells [K * N * N] float32, the windows flattened, then zeros.
+    """
     size = int(np.prod(levels[-1].window.shape))
     most = max(level.windows for level in levels)
 
@@ -71,19 +60,22 @@ def hold_cells(levels: tuple[Level, ...], activity: Activity) -> HeldCells:
         return origin, jnp.pad(cells, (0, size - len(cells)))
 
     choices = [partial(held_at, k) for k in range(len(levels))]
-    return HeldCells(activity.level, *lax.switch(activity.level, choices))
+    return activity.level, *lax.switch(activity.level, choices)
 
 
-def active_cells(levels: tuple[Level, ...], held: HeldCells) -> tuple[np.ndarray, np.ndarray]:
+def active_cells(
+    levels: tuple[Level, ...], held: tuple[Array, Array, Array]
+) -> tuple[np.ndarray, np.ndarray]:
     """Indices [n] of the active cells in the flattened network and their activity [n] float32, on the host; a
     cell comes twice where two windows overlap."""
-    level = levels[int(held.level)]
+    number, origin, cells = held
+    level = levels[int(number)]
     shape = (level.windows, *level.window.shape)
-    at = np.flatnonzero(held.cells[: math.prod(shape)])
+    at = np.flatnonzero(cells[: math.prod(shape)])
     copy, *inside = np.unravel_index(at, shape)
-    x, y, heading = window.ring_sizes(level.window).tolist()
-    own = [(held.origin[copy, 2 - k] + inside[k]) % ring for k, ring in enumerate((heading, y, x))]
-    return (own[0] * y + own[1]) * x + own[2], held.cells[at]
+    x, y, heading = level.window.ring_sizes().tolist()
+    own = [(origin[copy, 2 - k] + inside[k]) % ring for k, ring in enumerate((heading, y, x))]
+    return (own[0] * y + own[1]) * x + own[2], cells[at]
 
 
 def activity_of(levels: tuple[Level, ...], activity: Activity, cell: np.ndarray) -> Array:
@@ -91,18 +83,16 @@ def activity_of(levels: tuple[Level, ...], activity: Activity, cell: np.ndarray)
 
     All levels are read and one is kept: reading a few cells costs less than a branch.
     """
-    rings = window.ring_sizes(levels[-1].window)
+    rings = levels[-1].window.ring_sizes()
     row, x = np.divmod(cell, rings[0])
     heading, y = np.divmod(row, rings[1])
     at = np.stack([x, y, heading], axis=1).astype(np.int32)
-    held = [_held(level, block, at) for level, block in zip(levels, activity.blocks, strict=True)]
+    held = []
+    for level, block in zip(levels, activity.blocks, strict=True):
+        size = np.array(level.window.shape[::-1], np.int32)
+        inside = (at[None] - block.origin[:, None]) % rings[None, None]  # [M, C, 3] places in each window
+        x, y, heading = jnp.moveaxis(jnp.minimum(inside, size[None, None] - 1), -1, 0)
+        found = block.activity[np.arange(level.windows, dtype=np.int32)[:, None], heading, y, x]
+        within = jnp.all(inside < size[None, None], axis=-1)
+        held.append(jnp.sum(jnp.where(within, found, 0.0), axis=0))
     return jnp.stack(held)[activity.level]
-
-
-def _held(level: Level, block: Block, at: np.ndarray) -> Array:
-    """[C] the activity that a block holds at cells [C, 3] over x, y, heading: 0 outside its windows."""
-    size = np.array(level.window.shape[::-1], np.int32)
-    inside = (at[None] - block.origin[:, None]) % window.ring_sizes(level.window)[None, None]
-    x, y, heading = jnp.moveaxis(jnp.minimum(inside, size[None, None] - 1), -1, 0)
-    held = block.activity[np.arange(level.windows, dtype=np.int32)[:, None], heading, y, x]
-    return jnp.sum(jnp.where(jnp.all(inside < size[None, None], axis=-1), held, 0.0), axis=0)

@@ -1,26 +1,21 @@
-"""Settings of the recording of pose cells.
-
-Settings of the attractor network of RatSLAM as published.
-"""
+"""Settings of the attractor network of RatSLAM as published, and of the recording of pose cells."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Discriminator, Field, PositiveFloat, PositiveInt, Tag, field_validator
+from pydantic import Discriminator, Field, PositiveFloat, PositiveInt, Tag, field_validator
 
 from ratslam.network.config import PoseCellConfig
 from tactile.base.settings import Settings
 
-
-def _form(value: Any) -> str:
-    return "list" if isinstance(value, list | tuple) else "number"
-
-
 CellIndex = Annotated[int, Field(ge=0)]
 Number = Annotated[CellIndex, Tag("number")]
 Positions = Annotated[tuple[tuple[CellIndex, CellIndex, CellIndex], ...], Tag("list")]
+Chosen = Annotated[
+    Number | Positions, Discriminator(lambda value: "list" if isinstance(value, list | tuple) else "number")
+]
 
 
 class CellSumsConfig(Settings):
@@ -50,20 +45,14 @@ class CellSumsConfig(Settings):
 class CellsConfig(Settings):
     """Recording of the pose cells."""
 
-    chosen: Annotated[Number | Positions, Discriminator(_form)] = 64
+    chosen: Chosen = 64
     """Cells whose activity is recorded at every step: their number, drawn from the whole network by
     `session.seed`; or the indices x, y, heading of each."""
     sums: CellSumsConfig | None = None
     """Sums of the activity of all cells; null: none."""
 
 
-def _odd(width: int) -> int:
-    if width % 2 == 0:
-        raise ValueError("must be odd, so that the kernel is centred on a cell")
-    return width
-
-
-Width = Annotated[int, Field(ge=3, le=15), AfterValidator(_odd)]
+Width = Annotated[int, Field(ge=3, le=15)]
 
 
 class AttractorConfig(Settings):
@@ -84,6 +73,13 @@ class AttractorConfig(Settings):
     engine: Literal["window", "dense"] = "window"
     """`window`: compute the smallest window of cells that is exact; `dense`: always the whole torus. The
     results are equal."""
+
+    @field_validator("excite_width", "inhibit_width")
+    @classmethod
+    def _is_odd(cls, width: int) -> int:
+        if width % 2 == 0:
+            raise ValueError("must be odd, so that the kernel is centred on a cell")
+        return width
 
 
 class NetworkConfig(AttractorConfig, PoseCellConfig):

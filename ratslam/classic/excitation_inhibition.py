@@ -72,6 +72,136 @@ class Window(NamedTuple):
         """Whether the window is the whole torus."""
         return all(axis.wraps for axis in self.axes)
 
+    def with_kernels(self, excite: Array, inhibit: Array, threshold: Array) -> Window:
+        """The window with kernels of the same widths but other standard deviations, which may be traced.
+
+        Args:
+            excite, inhibit: standard deviations, cells. threshold: global inhibition.
+        """
+        return self._replace(
+            excite=_gaussian(len(self.excite), excite),
+            inhibit=_gaussian(len(self.inhibit), inhibit),
+            sigma=excite,
+            threshold=threshold,
+        )
+
+    def ring_sizes(self) -> np.ndarray:
+        """[3] int32 cells of the torus along x, y and heading."""
+        return np.array([axis.ring for axis in self.axes[::-1]], np.int32)
+
+    def origin_centred_on(self, pose: Array) -> Array:
+        """[3] int32 first cell of a window centred on a pose; 0 along full rings."""
+        piece = np.array([not axis.wraps for axis in self.axes[::-1]])
+        return jnp.where(
+            piece, (jnp.floor(pose).astype(jnp.int32) - self.cells_before_centre()) % self.ring_sizes(), 0
+        )
+
+    def cells_before_centre(self) -> np.ndarray:
+        """[3] int32 cells from the window's first cell to its centre, over x, y, heading."""
+        return np.array([axis.size // 2 - 1 for axis in self.axes[::-1]], np.int32)
+
+    def excite_and_inhibit(self, activity: Array) -> Array:
+        """Activity after excitation, inhibition and threshold, not normalised. Both kernels are separable."""
+        window, before, inside = self, 0, activity.shape[2]
+        x, reach = window.axes[2], len(window.excite) // 2 + len(window.inhibit) // 2
+        if x.wraps and not _uses_matrices(x) and x.size + 2 * reach <= EVEN_ROW:
+            before, after = reach, EVEN_ROW - x.size - reach
+            ends = activity[:, :, -before:], activity, activity[:, :, :after]
+            activity = lax.optimization_barrier(jnp.concatenate(ends, axis=2))
+            window = window._replace(axes=(*window.axes[:2], Axis(EVEN_ROW, x.ring, False)))
+        excited = _convolve(window, window.excite, activity)
+        left = (excited - _convolve(window, window.inhibit, excited))[:, :, before : before + inside]
+        return jnp.where(left >= window.threshold, left - window.threshold, 0.0)
+
+    def integrate(self, activity: Array, origin: Array, motion: Array, lag: Array, shift: Array) -> Array:
+        """Path integration: every heading layer moves in its own direction.
+
+        Args:
+            motion: [3] body-frame motion, cells: each layer moves along its own heading, then all layers
+                shift. lag: [3] extra motion in the frame of the network, cells, the same for every layer.
+                Together less than a cell along each axis.
+            shift: [3] int32, -1 to 1, motion of the window itself.
+        """
+        heading = self.axes[0]
+        layer = (origin[2] + np.arange(heading.size, dtype=np.int32)) % heading.ring
+        along, across = rotate(motion[0], motion[1], layer.astype(motion.dtype) * self.unit)
+        moved = shift.astype(motion.dtype)
+        activity = _translate(self, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
+        activity = _translate(self, activity, 2, (along + (lag[0] - moved[0]))[:, None, None])
+        return _translate(self, activity, 0, motion[2] + lag[2] - moved[2])
+
+    def deposit(self, activity: Array, origin: Array, pose: Array, energy: Array) -> Array:
+        """Adds `energy` at a pose, shared trilinearly among its eight neighbour cells; shares outside the
+        window are dropped."""
+        low = jnp.floor(pose)
+        share = pose - low
+        low = low.astype(jnp.int32) - origin
+        corner = np.array([[x, y, th] for th in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
+        weight = jnp.prod(jnp.where(corner == 1, share[None], 1 - share[None]), axis=1)
+        at = (low[None] + corner) % self.ring_sizes()[None]
+        return activity.at[at[:, 2], at[:, 1], at[:, 0]].add(energy * weight, mode="drop")
+
+    def holds_deposit(self, origin: Array, pose: Array) -> Array:
+        """bool: a deposit at the pose would leave the margin of the window empty."""
+        low = (jnp.floor(pose).astype(jnp.int32) - origin) % self.ring_sizes()
+        size = np.array([axis.size for axis in self.axes[::-1]], np.int32)
+        piece = np.array([not axis.wraps for axis in self.axes[::-1]])
+        fits = (low >= self.margin) & (low + 1 < size - self.margin)
+        return jnp.all(fits | ~piece)
+
+    def deposit_gain(self, pose: Array) -> Array:
+        """Factor on the energy of a deposit between cells that makes it excite as much as one on a cell.
+
+        Along one axis, a deposit with share f on the next cell is excited at its own position to
+        (1 - f) g(f) + f g(1 - f) of its energy, where g is the excitation kernel.
+        """
+        f = pose - jnp.floor(pose)
+        sharp = -0.5 / self.sigma**2
+        return 1 / jnp.prod((1 - f) * jnp.exp(sharp * f**2) + f * jnp.exp(sharp * (1 - f) ** 2))
+
+    def peak_index(self, activity: Array, origin: Array) -> Array:
+        """int32 index of the cell with the largest activity, in the flattened torus."""
+        first, ring = origin[::-1], self.ring_sizes()[::-1]
+        heading, y, x = (
+            (a + b) % n for a, b, n in zip(_peak(self, activity, first), first, ring, strict=True)
+        )
+        return (heading * ring[1] + y) * ring[2] + x
+
+    def margin_is_empty(self, activity: Array) -> Array:
+        """bool: no activity in the margin."""
+        if self.is_torus:
+            return jnp.bool_(True)
+        return jnp.max(jnp.where(self.margin_mask, activity, 0.0)) <= 0
+
+    def decode(self, activity: Array, origin: Array) -> tuple[Array, Array]:
+        """Circular mean and circular standard deviation of the strongest packet: [3], [3] in cells.
+
+        Only the box around the peak counts, so other packets do not bias the mean. The peak is found one axis
+        at a time, which needs one pass over the cells instead of a scalar search.
+        """
+        first = origin[::-1]
+        box, low = activity, []
+        for k, (axis, peak) in enumerate(zip(self.axes, _peak(self, activity, first), strict=True)):
+            if axis.wraps:
+                at = (peak + np.arange(-BOX, BOX + 1, dtype=np.int32)) % axis.size
+                box, begin = jnp.take(box, at, axis=k), peak - BOX
+            else:
+                begin = jnp.clip(peak - BOX, 0, axis.size - 2 * BOX - 1)
+                box = lax.dynamic_slice_in_dim(box, begin, 2 * BOX + 1, k)
+            low.append(begin)
+        # Circular moments of the marginals [3, 2 BOX + 1] over heading, y, x, each on its ring.
+        around = (first + jnp.stack(low))[:, None] + np.arange(2 * BOX + 1, dtype=np.int32)[None]
+        mass = jnp.stack([jnp.sum(box, (1, 2)), jnp.sum(box, (0, 2)), jnp.sum(box, (0, 1))])
+        cells = self.ring_sizes()[::-1]
+        at, ring = around % cells[:, None], cells.astype(activity.dtype)
+        unit = (2 * np.pi / ring).astype(mass.dtype)
+        angle = at.astype(mass.dtype) * unit[:, None]
+        s, c = jnp.sum(mass * jnp.sin(angle), 1), jnp.sum(mass * jnp.cos(angle), 1)
+        mean = (jnp.arctan2(s, c) / unit) % ring
+        length = jnp.minimum(jnp.hypot(s, c) / jnp.sum(mass, 1), 1.0)
+        spread = jnp.sqrt(-2 * jnp.log(length)) / unit
+        return jnp.where(mean >= ring, 0.0, mean)[::-1], spread[::-1]
+
 
 def make_window(config: NetworkConfig, inner: int | None, dtype: np.dtype) -> Window:
     """A window that is exact for activity within `inner` cells along each axis; None: the whole torus."""
@@ -93,125 +223,6 @@ def make_window(config: NetworkConfig, inner: int | None, dtype: np.dtype) -> Wi
     return Window((heading, y, x), excite, inhibit, sigma, threshold, unit, margin, margin_mask, gap)
 
 
-def with_kernels(window: Window, excite: Array, inhibit: Array, threshold: Array) -> Window:
-    """The window with kernels of the same widths but other standard deviations, which may be traced.
-
-    Args:
-        excite, inhibit: standard deviations, cells. threshold: global inhibition.
-    """
-    return window._replace(
-        excite=_gaussian(len(window.excite), excite),
-        inhibit=_gaussian(len(window.inhibit), inhibit),
-        sigma=excite,
-        threshold=threshold,
-    )
-
-
-def ring_sizes(window: Window) -> np.ndarray:
-    """[3] int32 cells of the torus along x, y and heading."""
-    return np.array([axis.ring for axis in window.axes[::-1]], np.int32)
-
-
-def origin_centred_on(window: Window, pose: Array) -> Array:
-    """[3] int32 first cell of a window centred on a pose; 0 along full rings."""
-    piece = np.array([not axis.wraps for axis in window.axes[::-1]])
-    return jnp.where(
-        piece, (jnp.floor(pose).astype(jnp.int32) - cells_before_centre(window)) % ring_sizes(window), 0
-    )
-
-
-def cells_before_centre(window: Window) -> np.ndarray:
-    """[3] int32 cells from the window's first cell to its centre, over x, y, heading."""
-    return np.array([axis.size // 2 - 1 for axis in window.axes[::-1]], np.int32)
-
-
-def excite_and_inhibit(window: Window, activity: Array) -> Array:
-    """Activity after excitation, inhibition and threshold, not normalised. Both kernels are separable."""
-    before, inside = 0, activity.shape[2]
-    x, reach = window.axes[2], len(window.excite) // 2 + len(window.inhibit) // 2
-    if x.wraps and not _uses_matrices(x) and x.size + 2 * reach <= EVEN_ROW:
-        before, after = reach, EVEN_ROW - x.size - reach
-        ends = activity[:, :, -before:], activity, activity[:, :, :after]
-        activity = lax.optimization_barrier(jnp.concatenate(ends, axis=2))
-        window = window._replace(axes=(*window.axes[:2], Axis(EVEN_ROW, x.ring, False)))
-    excited = _convolve(window, window.excite, activity)
-    left = (excited - _convolve(window, window.inhibit, excited))[:, :, before : before + inside]
-    return jnp.where(left >= window.threshold, left - window.threshold, 0.0)
-
-
-def integrate(
-    window: Window, activity: Array, origin: Array, motion: Array, lag: Array, shift: Array
-) -> Array:
-    """Path integration: every heading layer moves in its own direction.
-
-    Args:
-        motion: [3] body-frame motion, cells: each layer moves along its own heading, then all layers shift.
-            lag: [3] extra motion in the frame of the network, cells, the same for every layer. Together less
-            than a cell along each axis.
-        shift: [3] int32, -1 to 1, motion of the window itself.
-    """
-    heading = window.axes[0]
-    layer = (origin[2] + np.arange(heading.size, dtype=np.int32)) % heading.ring
-    along, across = rotate(motion[0], motion[1], layer.astype(motion.dtype) * window.unit)
-    moved = shift.astype(motion.dtype)
-    activity = _translate(window, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
-    activity = _translate(window, activity, 2, (along + (lag[0] - moved[0]))[:, None, None])
-    return _translate(window, activity, 0, motion[2] + lag[2] - moved[2])
-
-
-def deposit(window: Window, activity: Array, origin: Array, pose: Array, energy: Array) -> Array:
-    """Adds `energy` at a pose, shared trilinearly among its eight neighbour cells; shares outside the window
-    are dropped."""
-    low = jnp.floor(pose)
-    share = pose - low
-    low = low.astype(jnp.int32) - origin
-    corner = np.array([[x, y, th] for th in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
-    weight = jnp.prod(jnp.where(corner == 1, share[None], 1 - share[None]), axis=1)
-    at = (low[None] + corner) % ring_sizes(window)[None]
-    return activity.at[at[:, 2], at[:, 1], at[:, 0]].add(energy * weight, mode="drop")
-
-
-def holds_deposit(window: Window, origin: Array, pose: Array) -> Array:
-    """bool: a deposit at the pose would leave the margin of the window empty."""
-    low = (jnp.floor(pose).astype(jnp.int32) - origin) % ring_sizes(window)
-    size = np.array([axis.size for axis in window.axes[::-1]], np.int32)
-    piece = np.array([not axis.wraps for axis in window.axes[::-1]])
-    fits = (low >= window.margin) & (low + 1 < size - window.margin)
-    return jnp.all(fits | ~piece)
-
-
-def decode(window: Window, activity: Array, origin: Array) -> tuple[Array, Array]:
-    """Circular mean and circular standard deviation of the strongest packet: [3], [3] in cells.
-
-    Only the box around the peak counts, so other packets do not bias the mean. The peak is found one axis at
-    a time, which needs one pass over the cells instead of a scalar search.
-    """
-    first = origin[::-1]
-    box, low = activity, []
-    for k, (axis, at) in enumerate(zip(window.axes, _peak(window, activity, first), strict=True)):
-        box, begins = _box_along(axis, box, at, k)
-        low.append(begins)
-    around = (first + jnp.stack(low))[:, None] + np.arange(2 * BOX + 1, dtype=np.int32)[None]
-    marginals = jnp.stack([jnp.sum(box, (1, 2)), jnp.sum(box, (0, 2)), jnp.sum(box, (0, 1))])
-    ring = ring_sizes(window)[::-1]
-    mean, spread = _circular_moments(marginals, around % ring[:, None], ring.astype(activity.dtype))
-    return mean[::-1], spread[::-1]
-
-
-def peak_index(window: Window, activity: Array, origin: Array) -> Array:
-    """int32 index of the cell with the largest activity, in the flattened torus."""
-    first, ring = origin[::-1], ring_sizes(window)[::-1]
-    heading, y, x = ((a + b) % n for a, b, n in zip(_peak(window, activity, first), first, ring, strict=True))
-    return (heading * ring[1] + y) * ring[2] + x
-
-
-def margin_is_empty(window: Window, activity: Array) -> Array:
-    """bool: no activity in the margin."""
-    if window.is_torus:
-        return jnp.bool_(True)
-    return jnp.max(jnp.where(window.margin_mask, activity, 0.0)) <= 0
-
-
 def rotate(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
     """A vector rotated by an angle, rad."""
     c, s = jnp.cos(angle), jnp.sin(angle)
@@ -221,17 +232,6 @@ def rotate(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
 def ring_difference(difference: Array, size: Array) -> Array:
     """A difference of positions on a ring, in cells, wrapped to [-size/2, size/2)."""
     return (difference + size / 2) % size - size / 2
-
-
-def deposit_gain(window: Window, pose: Array) -> Array:
-    """Factor on the energy of a deposit between cells that makes it excite as much as a deposit on a cell.
-
-    Along one axis, a deposit with share f on the next cell is excited at its own position to
-    (1 - f) g(f) + f g(1 - f) of its energy, where g is the excitation kernel.
-    """
-    f = pose - jnp.floor(pose)
-    sharp = -0.5 / window.sigma**2
-    return 1 / jnp.prod((1 - f) * jnp.exp(sharp * f**2) + f * jnp.exp(sharp * (1 - f) ** 2))
 
 
 def _convolve(window: Window, kernel: Array, activity: Array) -> Array:
@@ -321,24 +321,6 @@ def _first_peak(axis: Axis, marginal: Array, first: Array) -> Array:
     at = (first + np.arange(axis.size, dtype=np.int32)) % axis.ring
     tied = marginal >= jnp.max(marginal) * (1 - TIE)
     return jnp.argmin(jnp.where(tied, at, axis.ring)).astype(jnp.int32)
-
-
-def _box_along(axis: Axis, activity: Array, peak: Array, k: int) -> tuple[Array, Array]:
-    """The 2 BOX + 1 cells around a peak along axis k, and the index of the first."""
-    if axis.wraps:
-        at = (peak + np.arange(-BOX, BOX + 1, dtype=np.int32)) % axis.size
-        return jnp.take(activity, at, axis=k), peak - BOX
-    low = jnp.clip(peak - BOX, 0, axis.size - 2 * BOX - 1)
-    return lax.dynamic_slice_in_dim(activity, low, 2 * BOX + 1, k), low
-
-
-def _circular_moments(mass: Array, at: Array, ring: np.ndarray) -> tuple[Array, Array]:
-    unit = (2 * np.pi / ring).astype(mass.dtype)
-    angle = at.astype(mass.dtype) * unit[:, None]
-    s, c = jnp.sum(mass * jnp.sin(angle), 1), jnp.sum(mass * jnp.cos(angle), 1)
-    mean = (jnp.arctan2(s, c) / unit) % ring
-    length = jnp.minimum(jnp.hypot(s, c) / jnp.sum(mass, 1), 1.0)
-    return jnp.where(mean >= ring, 0.0, mean), jnp.sqrt(-2 * jnp.log(length)) / unit
 
 
 def _gaussian(width: int, sigma: Any) -> Any:

@@ -1,13 +1,10 @@
-"""The experience map: a pose graph of places, connected by the odometry between them.
+"""The experience map: a pose graph of places (experiences), connected by the odometry between them.
 
-The growable arrays are the state; networkx graphs are made from them on request. Motion accumulates in the
-body frame of the current node and restarts at every new node, so a link remains valid when the solver moves
-its nodes. Source: Milford & Wyeth 2004; Ball et al. 2013, section 6.
-
-Places (experiences): pairs of a view template and a pose of the packet.
-
-A place is created when a view is new at a pose, linked when a known place is reached by a new link, and set
-when it is reached by a known one. Source: Milford & Wyeth 2004; Ball et al. 2013, section 5.
+A place is a pair of a view template and a pose of the packet. It is created when a view is new at a pose,
+linked when a known place is reached by a new link, and set when it is reached by a known one (Milford & Wyeth
+2004; Ball et al. 2013, sections 5 and 6). Motion accumulates in the body frame of the current node and
+restarts at every new node, so a link remains valid when the solver moves its nodes. The growable arrays are
+the state; networkx graphs are made from them on request.
 """
 
 from __future__ import annotations
@@ -94,17 +91,13 @@ class ExperienceConfig(Settings):
 
 
 class Travel(NamedTuple):
-    """Motion since the current node: pose [3] in its frame, variance [3], length in m, duration in s."""
+    """Motion since the current node: pose [3] in its frame, variance [3], length in m, duration in s. At the
+    node it is the difference of the heading from the stored one."""
 
     motion: np.ndarray
-    variance: np.ndarray
-    length: float
-    duration: float
-
-
-def travel_from_node(relative: float) -> Travel:
-    """No travel yet: at a node, with a heading that differs by `relative` rad from the stored one."""
-    return Travel(np.array([0.0, 0.0, relative]), np.zeros(3), 0.0, 0.0)
+    variance: np.ndarray = np.zeros(3)
+    length: float = 0.0
+    duration: float = 0.0
 
 
 class ExperienceMap(Checkpointed, Map):
@@ -135,7 +128,7 @@ class ExperienceMap(Checkpointed, Map):
         self._link_of: dict[tuple[int, int], int] = {}
         self._growing = GrowingGraph()
         self._current = -1
-        self._travel = travel_from_node(0.0)
+        self._travel = Travel(np.zeros(3))
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the current node's pose and the motion since; before the first node, dead reckoning."""
@@ -208,7 +201,10 @@ class ExperienceMap(Checkpointed, Map):
         if action == Action.CREATE:
             self._create(place, int(evidence.template), relative)
         elif action in (Action.LINK, Action.SET) and self.config.closures and self._find_node(place) >= 0:
-            self._reach(self._find_node(place), relative)
+            node = self._find_node(place)
+            self._reached.append((len(self._step_node.rows), self._made.rows[node]))
+            measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
+            self._arrive(node, measured, relative, closure=True)
         self._step_node.append(self._current)
         self._step_motion.append(self._travel.motion)
         return estimate
@@ -239,27 +235,23 @@ class ExperienceMap(Checkpointed, Map):
         while len(self._node_of.rows) <= place:
             self._node_of.append(-1)
         self._node_of.rows[place] = node
-        if self._current >= 0:
-            self._link(node, measured, closure=False)
-        self._arrive(node, relative)
-        self._relax()
+        self._arrive(node, measured, relative, closure=False)
 
-    def _reach(self, node: int, relative: float) -> None:
-        measured = compose(self._travel.motion, np.array([0.0, 0.0, -relative]))
-        self._reached.append((len(self._step_node.rows), self._made.rows[node]))
+    def _arrive(self, node: int, measured: np.ndarray, relative: float, closure: bool) -> None:
+        """Links a node with the one before, goes on from it, and solves the map."""
         if self._current >= 0 and node != self._current:
-            self._link(node, measured, closure=True)
-        self._arrive(node, relative)
-        self._solve()
-        self._relax()
-
-    def _arrive(self, node: int, relative: float) -> None:
+            self._link(node, measured, closure)
         self._current = node
-        self._travel = travel_from_node(relative)
+        self._travel = Travel(np.array([0.0, 0.0, relative]))
+        self._solve(closure)
 
     def _link(self, node: int, measured: np.ndarray, closure: bool) -> None:
         """Adds a link, or merges another traversal of a known one by the inverse-variance mean."""
-        information = 1 / self._variance(closure)
+        variance = self._travel.variance + self.config.noise.least**2
+        if closure:
+            xy, heading = self.config.match_sd**2, self.config.match_sd_heading**2
+            variance = variance + np.array([xy, xy, heading])
+        information = 1 / variance
         evidence = np.array([1.0, self._travel.length, self._travel.duration])
         known = self._link_of.get((self._current, node))
         backwards = known is None and (node, self._current) in self._link_of
@@ -283,16 +275,10 @@ class ExperienceMap(Checkpointed, Map):
         self._information.rows[known] = total
         self._record.rows[known] += evidence
 
-    def _variance(self, closure: bool) -> np.ndarray:
-        variance = self._travel.variance + self.config.noise.least**2
-        if closure:
-            xy, heading = self.config.match_sd**2, self.config.match_sd_heading**2
-            variance = variance + np.array([xy, xy, heading])
-        return variance
-
-    def _solve(self) -> None:
+    def _solve(self, closure: bool) -> None:
+        """Moves the nodes: by least squares at a loop closure, or by the relaxation after every action."""
         solver = self.config.solver
-        if isinstance(solver, LeastSquares):
+        if isinstance(solver, LeastSquares) and closure:
             kernels = {
                 "none": no_kernel,
                 "huber": huber(solver.scale),
@@ -304,10 +290,7 @@ class ExperienceMap(Checkpointed, Map):
                 equations=self._growing.equations(len(poses), edges),
             )  # fmt: skip
             self._pose.rows[:] = solution.poses
-
-    def _relax(self) -> None:
-        solver = self.config.solver
-        if isinstance(solver, Relaxation) and len(self._ends.rows):
+        elif isinstance(solver, Relaxation) and len(self._ends.rows):
             ends, motion = self._ends.rows, self._motion.rows
             self._pose.rows[:] = relax(
                 self._pose.rows, ends[:, 0], ends[:, 1], np.hypot(motion[:, 0], motion[:, 1]),

@@ -1,16 +1,12 @@
-"""Window levels: the sizes of window that the network is computed on, and the activity held at one of them.
+"""Window levels: a step of the published network, computed on the smallest window where it is exact.
 
 A settled packet fills some 200 cells, however large the torus is. The levels are, from small to large: one
 small window that moves with the packet; two small windows with one common normalisation, for a packet and a
-distant injection; one larger window; the whole torus.
+distant injection; one larger window; the whole torus. Activity is held at one of them.
 
-One step of the network at one window level, and whether its result is that of the whole torus.
-
-The adaptive window: every step of the network is computed at the smallest window level that is exact.
-
-A step is tried at the smallest level that holds the activity; where the result would not be exact, it is
-computed again from the same activity one level up. Unused levels cost nothing: each is the body of a loop
-that does not run.
+A step is tried at the smallest level that holds the activity; where the result would not be that of the whole
+torus, it is computed again from the same activity one level up. Unused levels cost nothing: each is the body
+of a loop that does not run.
 """
 
 from __future__ import annotations
@@ -24,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic import excitation_inhibition as window
 from ratslam.classic.config import NetworkConfig
-from ratslam.classic.excitation_inhibition import Window
+from ratslam.classic.excitation_inhibition import TIE, Window, make_window, ring_difference, rotate
 from ratslam.core.estimates import PoseCellActivity
 from tactile.base.types import Array
 
@@ -34,6 +29,8 @@ SETTLED = 10
 """Cells across a settled packet, inside the small window (16^3 cells with the default kernels)."""
 WIDE = 26
 """Cells inside the larger window (32^3)."""
+SUM_TOLERANCE = 64
+"""Tolerance on the sum of activity after a step, in units of rounding."""
 LARGEST_SHARE = 0.5
 """Levels with more than this share of the cells of the torus are omitted."""
 
@@ -64,16 +61,16 @@ class Activity(NamedTuple):
 
 def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
     """The levels from the smallest to the whole torus."""
-    torus = Level(window.make_window(config, None, dtype), 1)
+    torus = Level(make_window(config, None, dtype), 1)
     if config.engine == "dense":
         return (torus,)
-    small, wide = (window.make_window(config, inner, dtype) for inner in (SETTLED, WIDE))
+    small, wide = (make_window(config, inner, dtype) for inner in (SETTLED, WIDE))
     lower = [Level(small, 1, follows_pose=True), Level(small, 2), Level(wide, 1)]
     most = LARGEST_SHARE * np.prod(torus.window.shape)
     return (*(level for level in lower if level.windows * np.prod(level.window.shape) <= most), torus)
 
 
-def empty_block(level: Level, dtype: np.dtype) -> Block:
+def _empty_block(level: Level, dtype: np.dtype) -> Block:
     """A block without activity."""
     shape = (level.windows, *level.window.shape)
     return Block(jnp.zeros(shape, dtype), jnp.zeros((level.windows, 3), jnp.int32))
@@ -82,9 +79,9 @@ def empty_block(level: Level, dtype: np.dtype) -> Block:
 def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
     """Unit activity at a pose [3], shared among its neighbour cells, at the smallest level."""
     smallest, dtype = levels[0].window, pose.dtype
-    origin = window.origin_centred_on(smallest, pose)
-    cells = window.deposit(smallest, jnp.zeros(smallest.shape, dtype), origin, pose, jnp.ones((), dtype))
-    above = tuple(empty_block(level, dtype) for level in levels[1:])
+    origin = smallest.origin_centred_on(pose)
+    cells = smallest.deposit(jnp.zeros(smallest.shape, dtype), origin, pose, jnp.ones((), dtype))
+    above = tuple(_empty_block(level, dtype) for level in levels[1:])
     return Activity((Block(cells[None], origin[None]), *above), jnp.int32(0))
 
 
@@ -95,7 +92,7 @@ def to_full_torus(levels: tuple[Level, ...], activity: Activity) -> Array:
 
 def activity_sums(levels: tuple[Level, ...], activity: Activity) -> PoseCellActivity:
     """The activity summed over the headings, and over x and y; on the host, without compiling."""
-    sizes = window.ring_sizes(levels[-1].window)
+    sizes = levels[-1].window.ring_sizes()
     xy, heading = np.zeros(sizes[1::-1]), np.zeros(sizes[2])
     block = activity.blocks[int(activity.level)]
     for cells, origin in zip(np.asarray(block.activity), np.asarray(block.origin), strict=True):
@@ -108,29 +105,23 @@ def activity_sums(levels: tuple[Level, ...], activity: Activity) -> PoseCellActi
     return PoseCellActivity(xy, heading)
 
 
-def from_full_torus(levels: tuple[Level, ...], activity: Array) -> Activity:
-    """Activity [K, N, N] of the whole torus, at the last level."""
-    below = tuple(empty_block(level, activity.dtype) for level in levels[:-1])
-    return Activity((*below, Block(activity[None], jnp.zeros((1, 3), jnp.int32))), jnp.int32(len(levels) - 1))
-
-
 def block_at(levels: tuple[Level, ...], k: int, activity: Activity, origin: Array) -> Block:
     """The activity at level k, from whichever level up to k holds it; a new window begins at `origin` [3]."""
 
     def transfer_from(j: int) -> Callable[[], Block]:
         if j == k:
             return lambda: activity.blocks[k]
-        return lambda: transfer(levels[j], activity.blocks[j], levels[k], origin)
+        return lambda: _transfer(levels[j], activity.blocks[j], levels[k], origin)
 
     return lax.switch(jnp.minimum(activity.level, k), [transfer_from(j) for j in range(k + 1)])
 
 
-def transfer(source: Level, block: Block, target: Level, origin: Array) -> Block:
+def _transfer(source: Level, block: Block, target: Level, origin: Array) -> Block:
     """A block at another level: the same windows and empty ones, or one window from `origin` [3] on."""
     more = target.windows - source.windows
     if more > 0:
         return jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, more)] + [(0, 0)] * (leaf.ndim - 1)), block)
-    ring = window.ring_sizes(source.window)[::-1]
+    ring = source.window.ring_sizes()[::-1]
 
     def cut(cells: Array, first: Array) -> Array:
         for k, axis in enumerate(target.window.axes):
@@ -144,7 +135,7 @@ def transfer(source: Level, block: Block, target: Level, origin: Array) -> Block
     return Block(cells[None], origin[None])
 
 
-def extent(shape: Window, block: Block) -> tuple[Array, Array, Array]:
+def _extent(shape: Window, block: Block) -> tuple[Array, Array, Array]:
     """[3] first and last cells with activity over x, y, heading of one window, and bool: there are any."""
     cells, dtype = block.activity > 0, block.activity.dtype
     low, high = [], []
@@ -154,16 +145,6 @@ def extent(shape: Window, block: Block) -> tuple[Array, Array, Array]:
         high.append(axis.size - 1 - jnp.argmax(among[::-1]))
     first = block.origin.astype(dtype)
     return first + jnp.stack(low).astype(dtype), first + jnp.stack(high).astype(dtype), jnp.any(cells)
-
-
-def total(activity: Activity) -> Array:
-    """The sum of all activity."""
-    sums = jnp.stack([jnp.sum(block.activity) for block in activity.blocks])
-    return sums[activity.level]
-
-
-SUM_TOLERANCE = 64
-"""Tolerance on the sum of activity after a step, in units of rounding."""
 
 
 class StepInput(NamedTuple):
@@ -217,11 +198,11 @@ def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepR
     carry = (jnp.int32(0), block, exact, jnp.bool_(False))
     _, block, exact, died = lax.while_loop(goes_on, substep, carry)
     block = _strongest_first(level, block)
-    pose, spread = window.decode(level.window, block.activity[0], block.origin[0])
+    pose, spread = level.window.decode(block.activity[0], block.origin[0])
     return block, StepResult(pose, spread, died, jnp.int32(0)), exact
 
 
-def equal_sums(a: Array, b: Array | float) -> Array:
+def _equal_sums(a: Array, b: Array | float) -> Array:
     """bool: sums of activity that differ by rounding only."""
     return jnp.abs(a - b) <= SUM_TOLERANCE * jnp.finfo(a.dtype).eps
 
@@ -229,7 +210,7 @@ def equal_sums(a: Array, b: Array | float) -> Array:
 def _inject(level: Level, block: Block, inputs: StepInput) -> tuple[Block, Array]:
     """Energy goes into the window of the packet nearby, otherwise into a window of its own."""
     shape, given = level.window, inputs.energy > 0
-    near = jax.vmap(lambda origin: window.holds_deposit(shape, origin, inputs.injection))(block.origin)
+    near = jax.vmap(lambda origin: shape.holds_deposit(origin, inputs.injection))(block.origin)
     if level.windows == 1:
         at, room, origin = jnp.int32(0), near[0], block.origin
     else:
@@ -237,10 +218,10 @@ def _inject(level: Level, block: Block, inputs: StepInput) -> tuple[Block, Array
         open_new = ~jnp.any(near & ~free)
         at = jnp.argmax(jnp.where(open_new, free, near & ~free)).astype(jnp.int32)
         room = ~open_new | jnp.any(free)
-        centred = window.origin_centred_on(shape, inputs.injection)
+        centred = shape.origin_centred_on(inputs.injection)
         fresh = jnp.where(open_new & given & room, centred, block.origin[at])
         origin = block.origin.at[at].set(fresh)
-    cells = window.deposit(shape, block.activity[at], origin[at], inputs.injection, inputs.energy)
+    cells = shape.deposit(block.activity[at], origin[at], inputs.injection, inputs.energy)
     return Block(block.activity.at[at].set(cells), origin), room | ~given
 
 
@@ -250,14 +231,13 @@ def _attract(level: Level, block: Block, seed: Array) -> tuple[Array, Array]:
 
     Uniform activity always dies out: both kernels sum to 1, so excitation and inhibition cancel.
     """
-    cells = _each_window(level, partial(window.excite_and_inhibit, level.window), block.activity)
+    cells = _each_window(level, level.window.excite_and_inhibit, block.activity)
     total = jnp.sum(cells)
     dead = ~(total > 0)
 
     def reseed() -> Array:
-        one = window.deposit(
-            level.window, jnp.zeros_like(cells[0]), block.origin[0], seed, jnp.ones_like(total)
-        )
+        empty = jnp.zeros_like(cells[0])
+        one = level.window.deposit(empty, block.origin[0], seed, jnp.ones_like(total))
         return jnp.zeros_like(cells).at[0].set(one)
 
     normalised = cells / jnp.where(dead, 1.0, total)
@@ -271,39 +251,36 @@ def _integrate(level: Level, block: Block, inputs: StepInput, s: Array) -> tuple
     unit, done = shape.unit, s.astype(inputs.motion.dtype)
     # Odometry is given in the frame at the start of the step; the packet has turned since, and lags behind.
     angle = inputs.heading_lag - done * (inputs.motion[2] + inputs.lag[2])
-    moved = jnp.stack([*window.rotate(inputs.motion[0], inputs.motion[1], angle * unit), inputs.motion[2]])
+    moved = jnp.stack([*rotate(inputs.motion[0], inputs.motion[1], angle * unit), inputs.motion[2]])
     origin = block.origin
     if not shape.is_torus:
         if level.follows_pose:
             middle = _predict(shape, inputs, done + 1, inputs.pose)[None]
         else:
-            middle = jax.vmap(partial(_predict_middle, shape, inputs))(block)
-        origin = jax.vmap(partial(window.origin_centred_on, shape))(middle)
-    ring = window.ring_sizes(shape)[None]
+            # The middle of each window's activity after this sub-step; an empty window stays.
+            low, high, some = jax.vmap(partial(_extent, shape))(block)
+            one = jnp.ones_like(inputs.energy)
+            middle = jax.vmap(partial(_predict, shape, inputs, one))((low + high) / 2)
+            unmoved = (block.origin + shape.cells_before_centre()[None]).astype(low.dtype)
+            middle = jnp.where(some[:, None], middle, unmoved)
+        origin = jax.vmap(shape.origin_centred_on)(middle)
+    ring = shape.ring_sizes()[None]
     # A window that is behind its packet catches up by one cell per sub-step.
     shift = jnp.clip((origin - block.origin + ring // 2) % ring - ring // 2, -1, 1)
     origin = (block.origin + shift) % ring
 
     def translate(cells: Array, first: Array, by: Array) -> Array:
-        return window.integrate(shape, cells, first, moved, inputs.lag, by)
+        return shape.integrate(cells, first, moved, inputs.lag, by)
 
     cells = _each_window(level, translate, block.activity, block.origin, shift)
-    complete = jnp.all(jax.vmap(partial(window.margin_is_empty, shape))(cells))
-    return Block(cells, origin), (complete & equal_sums(jnp.sum(cells), 1.0)) | shape.is_torus
+    complete = jnp.all(jax.vmap(shape.margin_is_empty)(cells))
+    return Block(cells, origin), (complete & _equal_sums(jnp.sum(cells), 1.0)) | shape.is_torus
 
 
 def _predict(shape: Window, inputs: StepInput, substeps: Array, pose: Array) -> Array:
     """[3] approximate pose of a packet some sub-steps after it was at `pose` [3]."""
-    x, y = window.rotate(inputs.motion[0], inputs.motion[1], pose[2] * shape.unit)
+    x, y = rotate(inputs.motion[0], inputs.motion[1], pose[2] * shape.unit)
     return pose + substeps * (jnp.stack([x, y, inputs.motion[2]]) + inputs.lag)
-
-
-def _predict_middle(shape: Window, inputs: StepInput, block: Block) -> Array:
-    """[3] approximate middle of the activity of one window after this sub-step."""
-    low, high, some = extent(shape, block)
-    at = _predict(shape, inputs, jnp.ones_like(inputs.energy), (low + high) / 2)
-    unmoved = (block.origin + window.cells_before_centre(shape)).astype(low.dtype)
-    return jnp.where(some, at, unmoved)
 
 
 def _packets_apart(level: Level, block: Block) -> Array:
@@ -311,10 +288,10 @@ def _packets_apart(level: Level, block: Block) -> Array:
     if level.windows == 1:
         return jnp.bool_(True)
     shape = level.window
-    low, high, some = jax.vmap(partial(extent, shape))(block)
-    ring = window.ring_sizes(shape).astype(low.dtype)
+    low, high, some = jax.vmap(partial(_extent, shape))(block)
+    ring = shape.ring_sizes().astype(low.dtype)
     middle, half = (low + high) / 2, (high - low) / 2
-    between = jnp.abs(window.ring_difference(middle[0] - middle[1], ring)) - half[0] - half[1]
+    between = jnp.abs(ring_difference(middle[0] - middle[1], ring)) - half[0] - half[1]
     return jnp.any(between > shape.gap) | ~jnp.all(some)
 
 
@@ -323,8 +300,8 @@ def _strongest_first(level: Level, block: Block) -> Block:
     if level.windows == 1:
         return block
     peak = jnp.max(block.activity, axis=(1, 2, 3))
-    tied = peak >= jnp.max(peak) * (1 - window.TIE)
-    place = jax.vmap(partial(window.peak_index, level.window))(block.activity, block.origin)
+    tied = peak >= jnp.max(peak) * (1 - TIE)
+    place = jax.vmap(level.window.peak_index)(block.activity, block.origin)
     front = jnp.argmin(jnp.where(tied, place, jnp.iinfo(jnp.int32).max))
     return jax.tree.map(lambda leaf: jnp.roll(leaf, -front, axis=0), block)
 
@@ -349,28 +326,22 @@ def step_at_smallest_level(
         return Activity((block,), missing), result._replace(level=missing)
     zero = jnp.zeros_like(inputs.pose)
     carry = (activity.level, activity.blocks[0], StepResult(zero, zero, jnp.bool_(False), jnp.int32(0)))
+
     # Loops of at most one round: XLA copies the results of a branch, but not the unchanged values of a loop.
-    to_try, block, result = lax.while_loop(_is_smallest, partial(_smallest, levels, inputs), carry)
+    def at_smallest(carry: Any) -> Any:
+        block, result, exact = step_at(levels[0], carry[1], inputs)
+        return jnp.where(exact, len(levels), 1).astype(jnp.int32), block, result
+
+    def at_larger(carry: Any) -> Any:
+        for k in range(1, len(levels)):
+            attempt = partial(_attempt, levels, k, activity.blocks[0], activity.level, inputs)
+            carry = lax.cond(carry[0] == k, attempt, lambda carry: carry, carry)
+        return carry
+
+    to_try, block, result = lax.while_loop(lambda carry: carry[0] == 0, at_smallest, carry)
     now = Activity((block, *activity.blocks[1:]), jnp.int32(0))
-    larger = partial(_larger, levels, activity.blocks[0], activity.level, inputs)
-    _, after, result = lax.while_loop(lambda carry: carry[0] < len(levels), larger, (to_try, now, result))
+    _, after, result = lax.while_loop(lambda carry: carry[0] < len(levels), at_larger, (to_try, now, result))
     return after, result
-
-
-def _is_smallest(carry: Any) -> Array:
-    return carry[0] == 0
-
-
-def _smallest(levels: tuple[Level, ...], inputs: StepInput, carry: Any) -> Any:
-    block, result, exact = step_at(levels[0], carry[1], inputs)
-    return jnp.where(exact, len(levels), 1).astype(jnp.int32), block, result
-
-
-def _larger(levels: tuple[Level, ...], smallest: Block, held: Array, inputs: StepInput, carry: Any) -> Any:
-    for k in range(1, len(levels)):
-        attempt = partial(_attempt, levels, k, smallest, held, inputs)
-        carry = lax.cond(carry[0] == k, attempt, lambda carry: carry, carry)
-    return carry
 
 
 def _attempt(
@@ -385,12 +356,18 @@ def _attempt(
     _, now, _ = carry
     level, last = levels[k], k == len(levels) - 1
     before = Activity((smallest, *now.blocks[1:]), held)
-    source = block_at(
-        levels, k, before, window.origin_centred_on(level.window, _middle(levels, before, inputs))
-    )
+    source = block_at(levels, k, before, level.window.origin_centred_on(_middle(levels, before, inputs)))
     block, result, exact = step_at(level, source, inputs)
-    exact = (exact & equal_sums(total(before), jnp.sum(source.activity))) | last
-    low, fits = _at_smallest(levels, level, block, result.pose)
+    total = jnp.stack([jnp.sum(block.activity) for block in before.blocks])[held]
+    exact = (exact & _equal_sums(total, jnp.sum(source.activity))) | last
+    smallest_window = levels[0].window
+    if level.window is smallest_window:
+        low = jax.tree.map(lambda leaf: leaf[:1], block)
+        fits = jnp.max(block.activity[1:]) <= 0
+    else:
+        low = _transfer(level, block, levels[0], smallest_window.origin_centred_on(result.pose))
+        fits = jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
+        fits &= smallest_window.margin_is_empty(low.activity[0])
     blocks = list(now.blocks)
     blocks[0], blocks[k] = low, jax.tree.map(partial(jnp.where, exact), block, now.blocks[k])
     to_try = jnp.where(exact, len(levels), k + 1).astype(jnp.int32)
@@ -398,22 +375,12 @@ def _attempt(
     return to_try, after, result._replace(level=jnp.int32(k))
 
 
-def _at_smallest(levels: tuple[Level, ...], level: Level, block: Block, pose: Array) -> tuple[Block, Array]:
-    """The block moved to the smallest level, and bool: all of its activity fits there."""
-    smallest = levels[0]
-    if level.window is smallest.window:
-        return jax.tree.map(lambda leaf: leaf[:1], block), jnp.max(block.activity[1:]) <= 0
-    low = transfer(level, block, smallest, window.origin_centred_on(smallest.window, pose))
-    held = jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
-    return low, held & window.margin_is_empty(smallest.window, low.activity[0])
-
-
 def _middle(levels: tuple[Level, ...], activity: Activity, inputs: StepInput) -> Array:
     """[3] midway between the packet and the second one, or else the position of the injection."""
-    ring = window.ring_sizes(levels[0].window).astype(inputs.pose.dtype)
+    ring = levels[0].window.ring_sizes().astype(inputs.pose.dtype)
     other = jnp.where(inputs.energy > 0, inputs.injection, inputs.pose)
     for k, level in enumerate(levels):
         if level.windows > 1:
-            low, high, some = extent(level.window, jax.tree.map(lambda leaf: leaf[1], activity.blocks[k]))
+            low, high, some = _extent(level.window, jax.tree.map(lambda leaf: leaf[1], activity.blocks[k]))
             other = jnp.where((activity.level == k) & some, (low + high) / 2, other)
-    return inputs.pose + window.ring_difference(other - inputs.pose, ring) / 2
+    return inputs.pose + ring_difference(other - inputs.pose, ring) / 2

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.classic.config import NetworkConfig, rings, units
-from ratslam.classic.excitation_inhibition import TIE, deposit_gain, ring_difference, rotate
+from ratslam.classic.excitation_inhibition import TIE, ring_difference, rotate
 from ratslam.classic.levels import (
     Activity,
     Level,
@@ -108,7 +108,7 @@ def step(
     substeps = jnp.minimum(needed, float(MOST_SUBSTEPS))
     moved, lag = moved * (substeps / needed), lag * (substeps / needed)
 
-    energy = deposit_gain(levels[0].window, recall) * energy
+    energy = levels[0].window.deposit_gain(recall) * energy
     parts = moved / substeps, lag / substeps
     inputs = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
     activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, inputs)

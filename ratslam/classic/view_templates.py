@@ -107,9 +107,17 @@ def normalise(config: TemplateConfig, view: Array) -> Array:
         view = jnp.where(
             mean > 0, jnp.clip(view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0)), 0, 1), view
         )
-    if config.patch:
-        view = _patch_normalise(view, config.patch, config.patch_sd)
-    return view
+    if not config.patch:
+        return view
+    half, (rows, columns, _) = config.patch, view.shape
+    padded = jnp.pad(view, ((half, half), (half, half), (0, 0)), mode="edge")
+    window = range(2 * half + 1)
+    patches = jnp.stack([padded[y : y + rows, x : x + columns] for y in window for x in window])
+    mean, sd = jnp.mean(patches, axis=0), jnp.std(patches, axis=0)
+    # Rounding gives a constant patch a deviation near 1e-17, which is not a signal.
+    varied = sd > max(config.patch_sd, 1e-6)
+    scaled = (view - mean) / jnp.where(varied, sd, 1.0)
+    return jnp.where(varied, jnp.clip((scaled + 3) / 6, 0, 1), 0.5)
 
 
 def is_seen(config: TemplateConfig, observation: Observation, visible: Array) -> Array:
@@ -203,15 +211,3 @@ def learn(
         ),
         room | ~novel,
     )
-
-
-def _patch_normalise(view: Array, half: int, flat: float) -> Array:
-    rows, columns, _ = view.shape
-    padded = jnp.pad(view, ((half, half), (half, half), (0, 0)), mode="edge")
-    window = range(2 * half + 1)
-    patches = jnp.stack([padded[y : y + rows, x : x + columns] for y in window for x in window])
-    mean, sd = jnp.mean(patches, axis=0), jnp.std(patches, axis=0)
-    # Rounding gives a constant patch a deviation near 1e-17, which is not a signal.
-    varied = sd > max(flat, 1e-6)
-    scaled = (view - mean) / jnp.where(varied, sd, 1.0)
-    return jnp.where(varied, jnp.clip((scaled + 3) / 6, 0, 1), 0.5)

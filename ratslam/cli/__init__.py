@@ -21,7 +21,7 @@ from tactile.base.files import FULL
 
 COMMANDS = (
     run.add_run, live.add_commands, maps.add_localise, maps.add_merge, maps.add_map, maps.add_path,
-    run.add_look, doctor.add_doctor, doctor.add_fit, tools.add_export, tools.add_check, tools.add_tools,
+    run.add_look, doctor.add_commands, tools.add_export, tools.add_check, tools.add_tools,
 )  # fmt: skip
 """The commands that are always there, in the order of the help."""
 INSTALLED = "ratslam.commands"
@@ -74,33 +74,22 @@ def _run_command(arguments: argparse.Namespace) -> int:
     except InputError as error:
         print("\n".join(f"ratslam: error: {line}" for line in str(error).split("\n")), file=sys.stderr)
     except OSError as error:
-        print(f"ratslam: error: {printable(_describe(error))}", file=sys.stderr)
-        if _is_of_printing(error):
-            _leave_output()
+        # The file, what is wrong with it, and what to do. All files are named in their errors: without a name
+        # nothing could be printed.
+        printing = error.filename is None and error.errno in (errno.EPIPE, *FULL)
+        where = "the output: " if printing else f"{error.filename}: " if error.filename else ""
+        full = "free some space or choose another folder with -o"
+        cure = full if error.errno in FULL else "check the path and its permissions"
+        cures = [cure] if error.errno in FULL or error.filename else []
+        text = "; ".join([error.strerror or str(error), *getattr(error, "__notes__", ()), *cures])
+        print(f"ratslam: error: {printable(where + text)}", file=sys.stderr)
+        if printing:  # what was not printed stays so; else Python would try again at the end, and say so
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         print("ratslam: interrupted", file=sys.stderr)
         return INTERRUPTED
     return INPUT_ERROR
-
-
-def _describe(error: OSError) -> str:
-    """The file, what is wrong with it, and what to do."""
-    where = "the output: " if _is_of_printing(error) else f"{error.filename}: " if error.filename else ""
-    full = "free some space or choose another folder with -o"
-    cure = full if error.errno in FULL else "check the path and its permissions"
-    cures = [cure] if error.errno in FULL or error.filename else []
-    return where + "; ".join([error.strerror or str(error), *getattr(error, "__notes__", ()), *cures])
-
-
-def _is_of_printing(error: OSError) -> bool:
-    """Whether nothing could be printed: all files are named in their errors."""
-    return error.filename is None and error.errno in (errno.EPIPE, *FULL)
-
-
-def _leave_output() -> None:
-    """What was not printed stays so: without this, Python would try again at the end, and say so."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Program(argparse.ArgumentParser):

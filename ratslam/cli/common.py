@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import shtab
 
-from ratslam.core.compilation import add_xla_flags
 from ratslam.runs.settings.packaged import packaged_configs
 from tactile.base.files import require_new_file, require_own_folder
 
@@ -176,11 +175,11 @@ def prepare_jax(keep_compiled: bool = True) -> None:
             sessions in one process.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what fails is raised; a slow compilation is no bug
+    from ratslam.core.compilation import add_xla_flags, cache_settings, keep_kernels
+
     os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))
     if not keep_compiled:
         return
-    from ratslam.core.compilation import cache_settings, keep_kernels
-
     for name, value in cache_settings().items():
         os.environ.setdefault(name.upper(), str(value))  # for child processes
     keep_kernels()

@@ -1,7 +1,4 @@
-"""The command doctor.
-
-The command fit.
-"""
+"""The commands doctor, which says what a recording, run or robot is, and fit, which measures a rig."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ FAULTY = 1
 """Exit code if a fault was found."""
 
 
-def add_doctor(commands: Commands) -> None:
+def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     doctor = commands.add(
         "doctor", _doctor, "say what a recording, run or robot is, and what to do",
@@ -43,6 +40,20 @@ def add_doctor(commands: Commands) -> None:
         "--live", action="store_true", help="check the robot of a live session; moves nothing"
     )
     add_set(doctor)
+
+    fit = commands.add(
+        "fit", _fit, "measure wheels, whiskers and head from a record", "fit create_lab -o rig.yaml", "look"
+    )
+    fit.add_argument(
+        "record", type=Path, metavar="RECORD",
+        help="recording, or the configuration (YAML, or name of a packaged one) that reads it",
+    )  # fmt: skip
+    fit.add_argument(
+        "-o", "--output", type=Path, metavar="YAML",
+        help="write the settings to a new file, for `include: [FILE]` in a configuration",
+    )  # fmt: skip
+    fit.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the bootstrap (default 0)")
+    add_set(fit)
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
@@ -89,23 +100,6 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     text = first + dump_data(diagnosis.config)
     make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
-
-
-def add_fit(commands: Commands) -> None:
-    """Registers the commands of this module."""
-    fit = commands.add(
-        "fit", _fit, "measure wheels, whiskers and head from a record", "fit create_lab -o rig.yaml", "look"
-    )
-    fit.add_argument(
-        "record", type=Path, metavar="RECORD",
-        help="recording, or the configuration (YAML, or name of a packaged one) that reads it",
-    )  # fmt: skip
-    fit.add_argument(
-        "-o", "--output", type=Path, metavar="YAML",
-        help="write the settings to a new file, for `include: [FILE]` in a configuration",
-    )  # fmt: skip
-    fit.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the bootstrap (default 0)")
-    add_set(fit)
 
 
 def _fit(arguments: argparse.Namespace) -> int:

@@ -1,11 +1,4 @@
-"""The command map: what is in a saved map, what differs between two, undoing a closure sequence, cropping.
-
-The command localise.
-
-The command merge.
-
-The command path.
-"""
+"""The commands on saved maps: map (info, diff, undo, crop), localise, merge and path."""
 
 from __future__ import annotations
 
@@ -24,9 +17,7 @@ from tactile.base.errors import InputError, tell
 from tactile.base.files import require_new_file
 
 if TYPE_CHECKING:
-    from ratslam.places.route import Way
     from ratslam.runs.saved_map import SavedMap
-    from ratslam.runs.settings.run_config import RunConfig
 
 
 def add_map(commands: Commands) -> None:
@@ -85,88 +76,9 @@ def _info(arguments: argparse.Namespace) -> int:
     from ratslam.runs.map_care import map_info
 
     info = map_info(saved)
-    print(json.dumps(info, indent=2) if arguments.json else render_info(info))
-    return 0
-
-
-def _diff(arguments: argparse.Namespace) -> int:
-    first, second = _read(arguments.map), _read(arguments.other)
-    from ratslam.runs.map_care import map_difference
-
-    found = map_difference(first, second)
-    print(json.dumps(found, indent=2) if arguments.json else render_difference(found))
-    return 0
-
-
-def _undo(arguments: argparse.Namespace) -> int:
-    output: Path | None = arguments.output
-    prepare_jax()
-    from ratslam.runs.map_care import finish_undo, replaced_file, undo_sequence
-
-    if output is None:
-        output = arguments.map = replaced_file(arguments.map)
-        finished = finish_undo(output)
-        if finished is not None:
-            folder = output.parent
-            print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
-        if finished == arguments.sequence:
-            return 0
-    saved = _read(arguments.map)
-    rewritten = undo_sequence(saved, arguments.sequence, output)
-    print(f"{output}: the map without sequence {arguments.sequence}")
-    if rewritten:
-        print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
-    return 0
-
-
-def _crop(arguments: argparse.Namespace) -> int:
-    box = None if arguments.box is None else read_box(arguments.box)
-    steps = None if arguments.steps is None else read_steps(arguments.steps)
-    saved = _read(arguments.map)
-    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
-    from ratslam.runs.map_care import Choose, crop_saved
-
-    choose: Choose
-    if box is not None:
-        choose = partial(keyframes_in_box, box=box)
-    elif steps is not None:
-        choose = partial(keyframes_of_steps, first=steps[0], last=steps[1])
-    else:
-        choose = partial(keyframes_of_piece, piece=arguments.piece)
-    count = crop_saved(saved, choose, arguments.output)
-    print(f"{arguments.output}: {count} of {saved.steps} steps")
-    return 0
-
-
-def read_box(text: str) -> tuple[float, float, float, float]:
-    """The box of a text `X0,Y0,X1,Y1`, m.
-
-    Raises:
-        InputError: it is not a box.
-    """
-    try:
-        x0, y0, x1, y1 = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError("--box", repr(text), "four numbers X0,Y0,X1,Y1, m") from None
-    if not (x0 < x1 and y0 < y1):  # nor with NaN
-        raise InputError("--box", repr(text), "X0 < X1 and Y0 < Y1, m")
-    return x0, y0, x1, y1
-
-
-def read_steps(text: str) -> tuple[int, int]:
-    """The steps A to B - 1 of a text `A:B`; without A from the first, without B to the last.
-
-    Raises:
-        InputError: they are not steps.
-    """
-    first, colon, last = text.partition(":")
-    if not colon or not all(part.isdecimal() or not part for part in (first, last)):
-        raise InputError("--steps", repr(text), "A:B with whole numbers from 0")
-    return int(first or 0), int(last) if last else sys.maxsize
-
-
-def render_info(info: dict) -> str:
-    """The text of `map_info`."""
+    if arguments.json:
+        print(json.dumps(info, indent=2))
+        return 0
     box = "{:.2f}, {:.2f} to {:.2f}, {:.2f} m".format(*info["box_m"]) if info["box_m"] else "empty"
     lines = [
         f"map         {info['path']}, {info['format']}, sha256 {info['digest'][:12]}",
@@ -195,13 +107,21 @@ def render_info(info: dict) -> str:
         lines.append(f"doubt       {info['doubt']:.2f}, probability that the map is worse than odometry")
     elif info["unjudged"]:
         lines.append(f"doubt       none: {info['unjudged']}")
-    return "\n".join(lines)
+    print("\n".join(lines))
+    return 0
 
 
-def render_difference(found: dict) -> str:
-    """The text of `map_difference`."""
+def _diff(arguments: argparse.Namespace) -> int:
+    first, second = _read(arguments.map), _read(arguments.other)
+    from ratslam.runs.map_care import map_difference
+
+    found = map_difference(first, second)
+    if arguments.json:
+        print(json.dumps(found, indent=2))
+        return 0
     if found["same"]:
-        return "the same map"
+        print("the same map")
+        return 0
     lines = [
         "steps     {} and {}".format(*found["steps"]),
         "places    {common} in both, {removed} only in the first, {added} only in the second".format(**found),
@@ -216,7 +136,61 @@ def render_difference(found: dict) -> str:
         )
     lines.append(f"sensor    {found['sensor'] or 'the same'}")
     lines += [f"setting   {key}: {one!r} and {other!r}" for key, (one, other) in found["settings"].items()]
-    return "\n".join(lines)
+    print("\n".join(lines))
+    return 0
+
+
+def _undo(arguments: argparse.Namespace) -> int:
+    output: Path | None = arguments.output
+    prepare_jax()
+    from ratslam.runs.map_care import finish_undo, replaced_file, undo_sequence
+
+    if output is None:
+        output = arguments.map = replaced_file(arguments.map)
+        finished = finish_undo(output)
+        if finished is not None:
+            folder = output.parent
+            print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
+        if finished == arguments.sequence:
+            return 0
+    saved = _read(arguments.map)
+    rewritten = undo_sequence(saved, arguments.sequence, output)
+    print(f"{output}: the map without sequence {arguments.sequence}")
+    if rewritten:
+        print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
+    return 0
+
+
+def _crop(arguments: argparse.Namespace) -> int:
+    box, steps = arguments.box, arguments.steps
+    x0 = y0 = x1 = y1 = 0.0
+    first = last = ""
+    if box is not None:
+        try:
+            x0, y0, x1, y1 = (float(part) for part in box.split(","))
+        except ValueError:
+            raise InputError("--box", repr(box), "four numbers X0,Y0,X1,Y1, m") from None
+        if not (x0 < x1 and y0 < y1):  # nor with NaN
+            raise InputError("--box", repr(box), "X0 < X1 and Y0 < Y1, m")
+    if steps is not None:
+        first, colon, last = steps.partition(":")
+        if not colon or not all(part.isdecimal() or not part for part in (first, last)):
+            raise InputError("--steps", repr(steps), "A:B with whole numbers from 0")
+    saved = _read(arguments.map)
+    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
+    from ratslam.runs.map_care import Choose, crop_saved
+
+    choose: Choose
+    if box is not None:
+        choose = partial(keyframes_in_box, box=(x0, y0, x1, y1))
+    elif steps is not None:
+        end = int(last) if last else sys.maxsize
+        choose = partial(keyframes_of_steps, first=int(first or 0), last=end)
+    else:
+        choose = partial(keyframes_of_piece, piece=arguments.piece)
+    count = crop_saved(saved, choose, arguments.output)
+    print(f"{arguments.output}: {count} of {saved.steps} steps")
+    return 0
 
 
 CONFIGURATIONS = (".yaml", ".yml", "")
@@ -245,12 +219,18 @@ def add_localise(commands: Commands) -> None:
 def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.verdict import summarise
-    from ratslam.runs.localise import localise
+    from ratslam.runs.localise import check_assignments, localise, recorded_alike
     from ratslam.runs.saved_map import read_map
+    from ratslam.runs.settings.run_config import load_config
     from ratslam.service.viewer_link import open_viewer
 
     target, saved = open_target(arguments), read_map(arguments.map, tell)
-    config = _read_recording(arguments, saved)
+    file: Path = arguments.recording
+    if file.suffix in CONFIGURATIONS and not file.is_dir():
+        config = load_config(file, arguments.set)
+    else:
+        config = recorded_alike(file, saved, arguments.set)
+    check_assignments(arguments.set, saved)
     place = arguments.map.name.removesuffix(".npz") or "map"
     directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"
     with open_viewer(target) as observers:
@@ -260,19 +240,6 @@ def _localise(arguments: argparse.Namespace) -> int:
     print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
     print(summarise(directory, card, f"localising in {arguments.map}"))
     return INTERRUPTED if interrupted else 0
-
-
-def _read_recording(arguments: argparse.Namespace, saved: SavedMap) -> RunConfig:
-    from ratslam.runs.localise import check_assignments, recorded_alike
-    from ratslam.runs.settings.run_config import load_config
-
-    file: Path = arguments.recording
-    if file.suffix in CONFIGURATIONS and not file.is_dir():
-        config = load_config(file, arguments.set)
-    else:
-        config = recorded_alike(file, saved, arguments.set)
-    check_assignments(arguments.set, saved)
-    return config
 
 
 def add_merge(commands: Commands) -> None:
@@ -347,13 +314,9 @@ def _path(arguments: argparse.Namespace) -> int:
         return NO_WAY
     if arguments.output is not None:
         draw_map_way(arguments.output, made, saved, way)
-    content = way._asdict() | {"poses": way.poses.tolist()}
-    print(json.dumps(content) if arguments.json else render_way(way, goal))
-    return 0
-
-
-def render_way(way: Way, goal: Place) -> str:
-    """A way to a goal as text."""
+    if arguments.json:
+        print(json.dumps(way._asdict() | {"poses": way.poses.tolist()}))
+        return 0
     places = way.experiences
     lines = [
         f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
@@ -367,7 +330,8 @@ def render_way(way: Way, goal: Place) -> str:
         f"expected {way.expected:.0f} s, as a link may be blocked: one driven n times before is counted as "
         "free with probability (n + 1) / (n + 2)"
     )
-    return "\n".join(lines)
+    print("\n".join(lines))
+    return 0
 
 
 def read_place(text: str, where: str) -> Place:

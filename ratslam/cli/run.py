@@ -1,7 +1,4 @@
-"""The commands run and simulate.
-
-The commands that look at a run: watch, score, report.
-"""
+"""The commands that make a run, run and simulate, and those that look at one: watch, score, report."""
 
 from __future__ import annotations
 
@@ -110,11 +107,11 @@ def _score(arguments: argparse.Namespace) -> int:
         )
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
-    print(card.model_dump_json(indent=2) if arguments.json else render_scores(arguments.log, card))
+    print(card.model_dump_json(indent=2) if arguments.json else _render_scores(arguments.log, card))
     return 0
 
 
-def render_scores(path: Path, card: Scorecard) -> str:
+def _render_scores(path: Path, card: Scorecard) -> str:
     """All figures as text: the table, that of the grid in a run directory with one, warnings and health."""
     from evaluation.metrics.occupancy_score import GridScore, render_grid_scores
     from evaluation.metrics.scorecard import render_health, render_scorecard, render_warnings
@@ -230,7 +227,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with open_viewer(target) as observers:
         card, interrupted = run(config, directory, arguments.resume, observers)
     if arguments.full:
-        print(f"{render_scores(directory, card)}\n")
+        print(f"{_render_scores(directory, card)}\n")
     print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")
     if not arguments.full:
         print(f"python -m ratslam score {directory} prints all figures")

@@ -1,9 +1,5 @@
-"""The command tools, of what is seldom needed: recover, convert, schema, version, completion.
-
-The command check: conformance checks of registered parts.
-
-The command export.
-"""
+"""The commands check (conformance of registered parts), export, and tools, of what is seldom needed: recover,
+convert, schema, version, completion."""
 
 from __future__ import annotations
 
@@ -135,10 +131,17 @@ def add_check(commands: Commands) -> None:
         "check", None, "check a backend, source, touch front end or metric", "check backend recall", "files"
     )
     kinds = Commands(check)
-    backend = kinds.add("backend", _backend, "check a SLAM method", "check backend recall")
-    source = kinds.add("source", _source, "check a source or recording format", "check source my_robot")
-    touch = kinds.add("touch", _touch, "check a touch front end", "check touch my_taxels --source my_array")
-    metric = kinds.add("metric", _metric, "check a metric", "check metric my_error")
+    backend = kinds.add("backend", partial(_check, "backend"), "check a SLAM method", "check backend recall")
+    source = kinds.add(
+        "source", partial(_check, "source"), "check a source or recording format", "check source my_robot"
+    )
+    touch = kinds.add(
+        "touch",
+        partial(_check, "touch"),
+        "check a touch front end",
+        "check touch my_taxels --source my_array",
+    )
+    metric = kinds.add("metric", partial(_check, "metric"), "check a metric", "check metric my_error")
     for parser in (backend, source, touch, metric):
         parser.add_argument("name", metavar="NAME", help="name under which it is registered")
         parser.add_argument(
@@ -159,42 +162,35 @@ def add_check(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def _backend(arguments: argparse.Namespace) -> int:
-    prepare_jax()
-    from ratslam.service.backend_checks import check_backend
+def _check(kind: str, arguments: argparse.Namespace) -> int:
+    """Prints the result of each check of a part of this kind."""
+    name, settings = arguments.name, arguments.set
+    results: Iterator[Result]
+    if kind == "backend":
+        prepare_jax()
+        from ratslam.service.backend_checks import check_backend
 
-    tell("the checks take a minute or two, and several on a busy machine")
+        tell("the checks take a minute or two, and several on a busy machine")
+        results = check_backend(name, settings)
+    elif kind == "source":
+        from ratslam.service.source_checks import SAMPLES, check_source
 
-    return _report(arguments, check_backend(arguments.name, arguments.set))
+        results = check_source(name, settings, arguments.touch, arguments.samples or SAMPLES)
+    elif kind == "touch":
+        from ratslam.service.touch_checks import check_touch
 
+        results = check_touch(name, settings, arguments.source)
+    else:
+        from ratslam.service.metric_checks import check_metric
 
-def _source(arguments: argparse.Namespace) -> int:
-    from ratslam.service.source_checks import SAMPLES, check_source
-
-    most = arguments.samples or SAMPLES
-    return _report(arguments, check_source(arguments.name, arguments.set, arguments.touch, most))
-
-
-def _touch(arguments: argparse.Namespace) -> int:
-    from ratslam.service.touch_checks import check_touch
-
-    return _report(arguments, check_touch(arguments.name, arguments.set, arguments.source))
-
-
-def _metric(arguments: argparse.Namespace) -> int:
-    from ratslam.service.metric_checks import check_metric
-
-    return _report(arguments, check_metric(arguments.name, arguments.set))
-
-
-def _report(arguments: argparse.Namespace, results: Iterator[Result]) -> int:
+        results = check_metric(name, settings)
     statuses = []
     for result in results:
         statuses.append(result.status)
         print(result.line(), flush=True)
     failed, skipped = statuses.count("FAIL"), statuses.count("-")
     rest = f", {skipped} not run" if skipped else ""
-    print(f"{arguments.name}: {len(statuses)} checks, {failed} failed{rest}")
+    print(f"{name}: {len(statuses)} checks, {failed} failed{rest}")
     return FAILED if failed else 0
 
 

@@ -1,9 +1,8 @@
-"""An append-only array.
+"""Append-only arrays, and many records of one kind packed into a few arrays.
 
-Many records of one kind packed into a few arrays: one array per dtype, one row per record.
-
-The transfer to and from a compiled function costs time per array, not per number. The shapes and names of the
-records are the static part of a pytree.
+Packed records are one array per dtype with one row per record, because the transfer to and from a compiled
+function costs time per array, not per number. The shapes and names of the records are the static part of a
+pytree.
 """
 
 from __future__ import annotations
@@ -55,20 +54,16 @@ class GrowableArray:
         self._count = len(rows)
 
 
-class Leaf(NamedTuple):
-    """Place of one array of a record: index of the packed array, columns first to last, shape."""
-
-    array: int
-    first: int
-    last: int
-    shape: tuple[int, ...]
-
-
 class Layout(NamedTuple):
-    """Layout of one kind of record; dtypes and widths are those of the packed arrays."""
+    """Layout of one kind of record.
+
+    Attributes:
+        tree: its tree structure. leaves: place of each array of it: index of the packed array, columns first
+            to last, shape. dtypes, widths: of the packed arrays.
+    """
 
     tree: Any
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[tuple[int, int, int, tuple[int, ...]], ...]
     dtypes: tuple[np.dtype, ...]
     widths: tuple[int, ...]
 
@@ -87,11 +82,11 @@ class PackedRecords:
     def put(self, k: Array, record: Any) -> PackedRecords:
         """A copy with `record` in row k (traced)."""
         parts: list[list[Array]] = [[] for _ in self.arrays]
-        for leaf, value in zip(self.layout.leaves, jax.tree.leaves(record), strict=True):
-            parts[leaf.array].append(jnp.reshape(value, -1))
+        for (array, *_), value in zip(self.layout.leaves, jax.tree.leaves(record), strict=True):
+            parts[array].append(jnp.reshape(value, -1))
         arrays = (
-            lax.dynamic_update_index_in_dim(array, jnp.concatenate(part), k, 0)
-            for array, part in zip(self.arrays, parts, strict=True)
+            lax.dynamic_update_index_in_dim(rows, jnp.concatenate(part), k, 0)
+            for rows, part in zip(self.arrays, parts, strict=True)
         )
         return PackedRecords(self.layout, tuple(arrays))
 
@@ -139,12 +134,12 @@ def layout_of(example: Any) -> Layout:
         array = dtypes.index(dtype)
         first, last = widths[array], widths[array] + int(np.prod(value.shape))
         widths[array] = last
-        leaves.append(Leaf(array, first, last, tuple(value.shape)))
+        leaves.append((array, first, last, tuple(value.shape)))
     return Layout(tree, tuple(leaves), tuple(dtypes), tuple(widths))
 
 
 def _record(layout: Layout, arrays: Sequence[Array]) -> Any:
-    values = [arrays[leaf.array][leaf.first : leaf.last].reshape(leaf.shape) for leaf in layout.leaves]
+    values = [arrays[array][first:last].reshape(shape) for array, first, last, shape in layout.leaves]
     return jax.tree.unflatten(layout.tree, values)
 
 

@@ -1,10 +1,11 @@
-"""The interface of a SLAM method.
+"""The interface of a SLAM method: `Backend`, a pure kernel with its state, and `Map`, which folds its
+results.
 
-A backend is a pure kernel and a map that folds the kernel's results. The kernel has no access to the map and
-the map none to the kernel's state, so the kernel can be scanned, batched and replayed bit for bit. The only
-feedback of the map to the kernel is a plain record, applied to the state at fixed step counts.
-
-The smallest map: the path of a backend's own estimates.
+A step of RatSLAM (Milford & Wyeth 2004) has two halves: local view and odometry move the pose cells, and what
+they say builds the experience map. Here the first half is the kernel, the second the map. The kernel has no
+access to the map and the map none to the kernel's state, so the kernel can be scanned, batched and replayed
+bit for bit. The only feedback of the map to the kernel is a plain record, applied to the state at fixed step
+counts. `PathMap` is the smallest map: the path of a backend's own estimates.
 """
 
 from __future__ import annotations
@@ -75,10 +76,19 @@ class Map(Protocol):
     """
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
-        """Adds one step; returns the estimate completed by the map (confirmed places)."""
+        """Adds one step.
+
+        Args:
+            observation: the odometry (m, m, rad), view or whiskers that the kernel was given. estimate,
+                evidence: what it returned for them, host NumPy.
+
+        Returns:
+            the estimate completed by the map (confirmed places).
+        """
 
     def feedback(self) -> Feedback:
-        """The record that the kernel takes over, or None."""
+        """The record that the kernel takes over at the next multiple of `ratslam.core.session.CHUNK` steps,
+        or None."""
         return None
 
     def merge(self) -> MergedRows | None:
@@ -170,7 +180,15 @@ class Backend(Protocol):
     SINGLE: ClassVar[tuple[str, ...]] = ()
 
     def init(self, key: Array, capacity: int) -> State:
-        """The state before the first step, with `capacity` rows in the arrays that grow."""
+        """The state before the first step.
+
+        Args:
+            key: of the random stream (`jax.random`), for methods that draw. capacity: rows of the arrays that
+                grow; all sessions of one capacity share a compiled kernel.
+
+        Returns:
+            a pytree of arrays whose shapes and dtypes depend on `capacity` alone.
+        """
 
     def rows(self, state: State) -> int:
         """Largest number of rows in use; a step adds at most one."""
@@ -213,7 +231,16 @@ class Backend(Protocol):
         raise ValueError("the checkpoint has no state")
 
     def kernel(self, state: State, observation: Observation) -> tuple[State, Estimate, Evidence]:
-        """One step; pure, so that it can be jitted, scanned and vmapped."""
+        """One step; pure, so that it can be jitted, scanned and vmapped.
+
+        Args:
+            state: after the step before. observation: body-frame odometry, m, m, rad; the view [R, C, K]; a
+                place id; contacts of whiskers. Values may be NaN (`ratslam.core.session.finite_values`).
+
+        Returns:
+            the state after the step, of the same shapes and dtypes; the estimate of the pose [3] in the
+            method's own frame, m, m, rad; and the evidence, from which the map is made.
+        """
 
     def activity(self, state: State) -> PoseCellActivity | None:
         """The activity of the pose cells, of a method that has them; must compile nothing."""

@@ -42,9 +42,16 @@ class Checkpointed:
             array.replace(arrays[name])
         for name in self.VALUES:
             before = getattr(self, name)
-            values = [
-                _convert(arrays[f"{name.lstrip('_')}/{k}"], old) for k, old in enumerate(_as_tuple(before))
-            ]
+            values = []
+            for k, old in enumerate(_as_tuple(before)):
+                value = arrays[f"{name.lstrip('_')}/{k}"]
+                if not isinstance(old, np.ndarray):
+                    values.append(type(old)(value))
+                    continue
+                if value.ndim != old.ndim or value.dtype != old.dtype:
+                    found = f"{value.dtype} with {value.ndim} dimensions"
+                    raise ValueError(f"an array of {found} instead of {old.dtype} with {old.ndim}")
+                values.append(np.array(value))
             if not isinstance(before, tuple):
                 setattr(self, name, values[0])
             else:
@@ -67,15 +74,6 @@ def with_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndar
 
 def _as_tuple(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
-
-
-def _convert(value: np.ndarray, like: Any) -> Any:
-    if not isinstance(like, np.ndarray):
-        return type(like)(value)
-    if value.ndim != like.ndim or value.dtype != like.dtype:
-        found = f"{value.dtype} with {value.ndim} dimensions"
-        raise ValueError(f"an array of {found} instead of {like.dtype} with {like.ndim}")
-    return np.array(value)
 
 
 def fill_missing(arrays: dict[str, np.ndarray]) -> None:

@@ -1,17 +1,9 @@
-"""Loops compiled by Numba.
+"""How JAX and Numba compile: precision, flags of the compiler, kernels kept on disk, compiled loops.
 
-The cache of compiled kernels on disk: a later process loads what it would compile again.
-
-JAX's global float64 switch.
-
-Importing ratslam changes no JAX setting. A program calls `prepare_precision` before it makes a `Session`;
-`ratslam.runs` does so for every run.
-
-The flags of JAX's compiler that make steps fast on a CPU.
-
-JAX reads XLA_FLAGS of the environment when it first computes, for the whole process. The commands set it;
-importing ratslam does not, so that a program sets it before its first session:
-`os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))`.
+Importing ratslam changes no setting of JAX. A program calls `prepare_precision` before it makes a `Session`;
+`ratslam.runs` does so for every run. JAX reads XLA_FLAGS of the environment when it first computes, for the
+whole process; the commands set it, and a program does before its first session, because steps are faster
+then: `os.environ["XLA_FLAGS"] = add_xla_flags(os.environ.get("XLA_FLAGS", ""))`.
 """
 
 from __future__ import annotations
@@ -48,9 +40,13 @@ FOLDER = "jax_compilation_cache_dir"
 def cache_settings() -> dict[str, str | int]:
     """JAX's settings of the cache, by name. Each kind of processor has its own folder, because a kernel may
     use what another processor lacks; of other versions JAX finds nothing there."""
+    lines = CPUINFO.read_text(errors="replace").splitlines() if CPUINFO.exists() else []
+    skills = [line for line in lines if line.startswith(("flags", "Features"))][:1]
+    digest = hashlib.sha256((platform.processor() + "".join(skills)).encode()).hexdigest()
+    processor = f"{platform.machine()}-{digest[:12]}"
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return {
-        FOLDER: str(Path(home) / "ratslam" / "jax" / processor_name()),
+        FOLDER: str(Path(home) / "ratslam" / "jax" / processor),
         # The defaults do not cache kernels that compile as fast as ours do on a CPU.
         "jax_persistent_cache_min_compile_time_secs": 0,
         "jax_persistent_cache_min_entry_size_bytes": -1,
@@ -64,14 +60,6 @@ def keep_kernels() -> None:
             jax.config.update(name, value)
 
 
-def processor_name() -> str:
-    """A name of the kind of processor: its architecture, and a digest of what it can do."""
-    lines = CPUINFO.read_text(errors="replace").splitlines() if CPUINFO.exists() else []
-    skills = [line for line in lines if line.startswith(("flags", "Features"))][:1]
-    digest = hashlib.sha256((platform.processor() + "".join(skills)).encode()).hexdigest()
-    return f"{platform.machine()}-{digest[:12]}"
-
-
 Precision = Literal["float64", "float32"]
 
 
@@ -79,19 +67,6 @@ def prepare_precision(precision: Precision) -> None:
     """Enables JAX's 64-bit types for `float64`; `float32` works with them enabled or not."""
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
-
-
-def check_precision(precision: Precision) -> None:
-    """Checks that JAX can compute in this precision.
-
-    Raises:
-        ValueError: float64 while JAX's 64-bit types are disabled.
-    """
-    if precision == "float64" and not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "precision float64, but JAX's 64-bit types are disabled; call"
-            " ratslam.core.compilation.prepare_precision('float64') before JAX is used"
-        )
 
 
 FLAGS = (

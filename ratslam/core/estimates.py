@@ -1,6 +1,5 @@
-"""The estimate of one step, and the change of the robot's place.
-
-Localisation in a finished map: the states of a session, and its course step by step.
+"""What a step tells: the estimate of the pose, the change of the robot's place, what is drawn of a map; and
+the states of a session that is localised in a finished map, step by step.
 """
 
 from __future__ import annotations
@@ -89,15 +88,18 @@ class Localisation(IntEnum):
     LOST = 2
     """It was known, but the views since do not fit it, or none showed known ground for too long."""
     NOT_THIS_MAP = 3
-    """So many views fit nowhere that the session is most likely not in this map, or in a part that was never
+    """Most views match no keyframe: the session is most likely not in this map, or in a part that was never
     driven."""
 
 
 class LocalisedPose(NamedTuple):
-    """Attributes:
-    state: see `Localisation`. pose: [3] the most likely pose in the map, m, m, rad; by odometry alone where
-        none is supposed. covariance: [3, 3] of it, were it the right one. mass: its probability against all
-        other poses and against not being in this map. log_odds: of the session being there.
+    """The pose of a session in a finished map at one step.
+
+    Attributes:
+        state: see `Localisation`. pose: [3] the most likely pose in the map, m, m, rad; by odometry alone
+            while there is no hypothesis. covariance: [3, 3] of it, if it is the right one. mass: its
+            probability against all other poses and against not being in this map. log_odds: of the session
+            being there.
     """
 
     state: Localisation

@@ -5,7 +5,7 @@ one observation, replay up to `CHUNK`, and both give the same bits. At the start
 to a power of two that depends only on the rows in use, the kernel follows the map where rows of its memory
 are merged or restored, and it takes over the map's feedback.
 
-Observations without values that are NaN or infinite.
+`finite_values` masks what is NaN or infinite, for every kernel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jax import lax
 from ratslam.core.arrays import Layout, PackedRecords, allocate, layout_of
 from ratslam.core.backend import Backend, Evidence, Map, State
 from ratslam.core.checkpoint import with_prefix
-from ratslam.core.compilation import Precision, check_precision
+from ratslam.core.compilation import Precision
 from ratslam.core.estimates import Estimate
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation, Odometry
@@ -33,7 +33,7 @@ CHUNK = 16
 MOST_STATE = 1 << 30
 """Largest state of a new session, bytes."""
 UNKNOWN = -1
-"""`Session.earlier` of a checkpoint that does not tell it."""
+"""`Session.earlier` after a checkpoint of an early version, which does not hold it."""
 
 
 class Probe(NamedTuple):
@@ -104,15 +104,25 @@ class Session:
         precision: Precision = "float64",
         probe: Probe | None = None,
     ) -> None:
-        check_precision(precision)
+        if precision == "float64" and not jax.config.read("jax_enable_x64"):
+            raise ValueError(
+                "precision float64, but JAX's 64-bit types are disabled; call"
+                " ratslam.core.compilation.prepare_precision('float64') before JAX is used"
+            )
         self.backend, self._probe = backend, probe
         self.reserve = reserve
         self._layout: Layout | None = None
         # Compiled as one: each operation by itself would be compiled too.
         self._init = jax.jit(backend.init, static_argnums=1)
-        run = run_chunk if probe is None else partial(run_probed_chunk, probe)
+        run = run_chunk if probe is None else partial(_run_probed_chunk, probe)
         self._run_chunk = jax.jit(partial(run, backend.kernel), donate_argnums=0)
-        self._check_memory()
+        capacity = capacity_at(0, reserve)
+        state = jax.eval_shape(lambda key: backend.init(key, capacity), jax.random.key(0))
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+        if size > MOST_STATE:
+            found = f"a state of {size >> 20} MiB, with rows for {capacity} steps"
+            cure = "fewer cells or particles, smaller views, or a smaller session.reserve"
+            raise InputError("session", found, f"at most {MOST_STATE >> 20} MiB at the start", cure)
         self.restart(seed)
 
     def restart(self, seed: int = 0) -> None:
@@ -123,21 +133,20 @@ class Session:
         self.map: Map = self.backend.new_map()
         self.state = self._init(jax.random.key(seed), self._capacity)
 
-    def _check_memory(self) -> None:
-        capacity = capacity_at(0, self.reserve)
-        state = jax.eval_shape(lambda key: self.backend.init(key, capacity), jax.random.key(0))
-        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-        if size > MOST_STATE:
-            found = f"a state of {size >> 20} MiB, with rows for {capacity} steps"
-            cure = "fewer cells or particles, smaller views, or a smaller session.reserve"
-            raise InputError("session", found, f"at most {MOST_STATE >> 20} MiB at the start", cure)
-
     def step(self, observation: Observation) -> Step:
-        """Folds one observation, live."""
+        """Folds one observation, live.
+
+        Args:
+            observation: body-frame odometry since the one before, m, m, rad, with a view [R, C, K], a place
+                id or whiskers; of the same shapes in every step.
+
+        Returns:
+            the estimate and evidence of the kernel, and the pose [3] in the map frame, m, m, rad.
+        """
         return self._advance([observation])[0]
 
     def replay(self, observations: Iterable[Observation]) -> Iterator[Step]:
-        """Folds many observations, a chunk at a time; bit-identical to `step` for each."""
+        """Folds many observations, a chunk of up to `CHUNK` at a time; bit-identical to `step` for each."""
         remaining = iter(observations)
         # Chunks end at multiples of CHUNK, wherever the session stands when the replay begins.
         while chunk := list(islice(remaining, CHUNK - self.steps % CHUNK)):
@@ -228,17 +237,13 @@ class Session:
         if capacity > self._capacity:
             self.state, self._capacity = self.backend.grow(self.state, capacity), capacity
 
-    def _cover(self, feedback: Any) -> None:
-        """Grows what covers the ground to that of the map."""
-        sides = self.backend.sides(feedback)
-        sides = tuple(map(max, sides, self._sides)) if self._sides else sides
-        if sides != self._sides:
-            self.state, self._sides = self.backend.cover(self.state, sides), sides
-
     def follow_map(self, merged: Any, feedback: Any) -> None:
         """Lets the state follow the map, at the start of each chunk: `Map.merge` and `Map.feedback`."""
         self._hold(self.backend.rows(self.state) if merged is None else merged.rows)
-        self._cover(feedback)
+        sides = self.backend.sides(feedback)  # of what covers the ground: it grows with the map
+        sides = tuple(map(max, sides, self._sides)) if self._sides else sides
+        if sides != self._sides:
+            self.state, self._sides = self.backend.cover(self.state, sides), sides
         if merged is not None:
             self.state = self.backend.merge_rows(self.state, merged)
         self.state = self.backend.apply_map_feedback(self.state, feedback)
@@ -289,7 +294,7 @@ def run_chunk(kernel: Any, state: Any, chunk: PackedRecords, count: Any) -> tupl
     return lax.fori_loop(0, count, body, (state, results))
 
 
-def run_probed_chunk(
+def _run_probed_chunk(
     probe: Probe, kernel: Any, state: Any, chunk: PackedRecords, count: Any, begun: Any
 ) -> tuple[Any, PackedRecords, PackedRecords | None]:
     """`run_chunk` with the record of `probe.each` after the kernel's results, and the records of

@@ -1,12 +1,9 @@
-"""What a whisker would meet at each place and heading of a finished map, in classes.
+"""What a whisker would meet at each place and heading of a finished grid map, in classes.
 
-The class of a whisker is where along it the first surface lies, and what is known about the place of its
-contacts. It is looked up in a table, so that many supposed poses are compared with a report at once.
-
-The surfaces of a finished grid map, drawn sharply from its contacts along its path.
-
-The maps of the particles are soft, so that each finds its way while it maps. Where a session is looked for in
-a finished map, soft walls hide what tells two places apart. The footprints are ours.
+`draw_surfaces` draws the map anew from its contacts along its path, sharply: the maps of the particles are
+soft, so that each finds its way while it maps, but soft walls hide what tells two places apart. `Expectation`
+tabulates for every pose where along each whisker the first surface lies, and what is known about the place of
+its contacts, so that many pose hypotheses are compared with a report at once.
 """
 
 from __future__ import annotations
@@ -162,8 +159,11 @@ BODY = 2 / 3
 """Radius within which it is looked for, as a share of the robot's."""
 
 
-class Expectation(NamedTuple):
+class Expectation:
     """Tables of a finished map with S x S cells.
+
+    Args:
+        feelers: the whiskers of the reports. body: radius of the robot, m; 0: without a body.
 
     Attributes:
         whiskers: for each length of whisker [L, HEADINGS * S * S] class with its base in a cell. length: [W]
@@ -171,14 +171,33 @@ class Expectation(NamedTuple):
             S] see `Surfaces`. side: S. cell: m.
     """
 
-    whiskers: np.ndarray
-    length: np.ndarray
-    base: np.ndarray
-    angle: np.ndarray
-    body: np.ndarray
-    direction: np.ndarray
-    side: int
-    cell: float
+    def __init__(self, surfaces: Surfaces, feelers: PlanarWhiskers, body: float) -> None:
+        lengths, self.length = np.unique(feelers.length, return_inverse=True)
+        self.base, self.side, self.cell = feelers.base, surfaces.side, surfaces.cell
+        self.angle = np.arctan2(feelers.direction[:, 1], feelers.direction[:, 0])
+        self.direction = surfaces.direction.reshape(2, -1)
+        centres, evidence = surfaces.centres(), surfaces.evidence
+        whiskers = []
+        for length in lengths.tolist():
+            tables = []
+            for turn in np.arange(HEADINGS) * 2 * np.pi / HEADINGS:
+                ahead = length * np.array([np.cos(turn), np.sin(turn)])
+                first = np.full(centres.shape[:2], len(SHARES))  # the nearest point with a surface
+                for k in range(len(SHARES) - 1, -1, -1):
+                    first[surfaces.at(evidence, centres + SHARES[k] * ahead) > SURFACE] = k
+                tip = np.digitize(surfaces.at(evidence, centres + CONTACT * ahead), [FREE, TOUCHED])
+                tables.append((first // 2 * TIPS + tip).astype(np.uint8).reshape(-1))
+            whiskers.append(np.concatenate(tables))
+        self.whiskers = np.stack(whiskers)
+        self.body = np.zeros(self.side**2, np.uint8)
+        radius = BODY * body
+        if radius:
+            angle = np.arange(8) * np.pi / 4
+            rim = np.concatenate(
+                [np.zeros((1, 2)), radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)]
+            )
+            most = np.max([surfaces.at(evidence, centres + off) for off in rim], axis=0)
+            self.body = np.digitize(most, BODY_LIMITS).astype(np.uint8).reshape(-1)
 
     def places(self, free: int, apart: float, apart_heading: float) -> float:
         """Number of poses that can be told apart.
@@ -220,40 +239,6 @@ class Expectation(NamedTuple):
         inside = jnp.all((at >= 0) & (at < self.side), axis=-1)
         at = jnp.where(inside[..., None], at, 0.0).astype(jnp.int32)
         return at[..., 1] * self.side + at[..., 0], inside
-
-
-def expect(surfaces: Surfaces, feelers: PlanarWhiskers, body: float) -> Expectation:
-    """The tables of surfaces for these whiskers and a robot of radius `body`, m."""
-    lengths, row = np.unique(feelers.length, return_inverse=True)
-    tables = [_whisker_table(surfaces, float(length)) for length in lengths]
-    side = surfaces.side
-    return Expectation(
-        np.stack(tables), row, feelers.base, np.arctan2(feelers.direction[:, 1], feelers.direction[:, 0]),
-        _body_table(surfaces, BODY * body), surfaces.direction.reshape(2, -1), side, surfaces.cell,
-    )  # fmt: skip
-
-
-def _whisker_table(surfaces: Surfaces, length: float) -> np.ndarray:
-    """[HEADINGS * S * S] uint8."""
-    centres, tables = surfaces.centres(), []
-    for turn in np.arange(HEADINGS) * 2 * np.pi / HEADINGS:
-        ahead = length * np.array([np.cos(turn), np.sin(turn)])
-        first = np.full(centres.shape[:2], len(SHARES))
-        for k in range(len(SHARES) - 1, -1, -1):
-            first[surfaces.at(surfaces.evidence, centres + SHARES[k] * ahead) > SURFACE] = k
-        tip = np.digitize(surfaces.at(surfaces.evidence, centres + CONTACT * ahead), [FREE, TOUCHED])
-        tables.append((first // 2 * TIPS + tip).astype(np.uint8).reshape(-1))
-    return np.concatenate(tables)
-
-
-def _body_table(surfaces: Surfaces, radius: float) -> np.ndarray:
-    """[S * S] uint8; all 0 for a robot without a body."""
-    if not radius:
-        return np.zeros(surfaces.side**2, np.uint8)
-    angle = np.arange(8) * np.pi / 4
-    rim = np.concatenate([np.zeros((1, 2)), radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
-    most = np.max([surfaces.at(surfaces.evidence, surfaces.centres() + off) for off in rim], axis=0)
-    return np.digitize(most, BODY_LIMITS).astype(np.uint8).reshape(-1)
 
 
 def _placed(pose: Array, points: Array) -> Array:

@@ -1,6 +1,5 @@
-"""Log-likelihoods of a report given the maps of N particles (Fox et al. 2012, eq. 1 and 2, and others).
-
-Footprint kernels: the change of the map around an observation (Fox et al. 2012, II-E and II-F).
+"""Log-likelihoods of a report given the maps of N particles (Fox et al. 2012, eq. 1 and 2, and others), and
+footprint kernels: the change of the map around an observation (II-E and II-F, eq. 3 and 4).
 
 All kernels are computed on windows of `size` x `size` cells; places are in cells of the window. Each has a
 maximum of 1, to be multiplied by its log-odds.

@@ -1,15 +1,12 @@
 """Localisation of a session in a finished grid map, which does not change.
 
-The search for a session in a finished grid map: supposed poses as particles, from anywhere in the map.
+`Search` moves and weighs pose hypotheses as particles, from anywhere in the map (global localisation: Fox et
+al. 1999; Thrun et al. 2001). Whether the session is in the map at all is judged beside them, by log-odds
+against the best pose in another place that looks alike; `GridLocaliser` holds the states that follow.
 
-Global localisation by particles is Fox et al. 1999 and Thrun et al. 2001. That the session is in the map at
-all is judged beside them, by odds against the best pose in another place that looks alike.
-
-How much a report speaks for a supposed pose in a finished map.
-
-Reports were counted in arenas 100 to 119: at the true poses of sessions in the map of their arena, and at the
-best of the four poses at which the walls of *another* arena fit, as `Expectation` classes them. The classes
-are in shares of a whisker's length, so the counts do not depend on its size. The method is ours.
+How much a report speaks for a pose was counted in arenas 100 to 119: at the true poses of sessions in the map
+of their arena, and at the best of the four poses at which the walls of *another* arena fit, as `Expectation`
+classes them. The classes are in shares of a whisker's length, so the counts do not depend on its size.
 """
 
 from __future__ import annotations
@@ -32,46 +29,34 @@ from ratslam.core.estimates import (
     Localisation,
     LocalisedCourse,
     LocalisedPose,
-    Scalar,
     pieces_of,
 )
 from ratslam.grid import particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures
-from ratslam.grid.expectation import CLASSES, CROSSINGS, TIPS, Expectation
+from ratslam.grid.expectation import CLASSES, Expectation
 from ratslam.grid.particles import Particles
 from tactile.base.types import Array, Observation, Odometry
 
 UNEXPLAINED = 4
 """The session is not in the map if this many searches in a row have failed."""
 LEAST_SHARE = 0.5
-"""Share of the supposed poses that are the best one below which a found pose is lost."""
-
-
-class SavedGrid(NamedTuple):
-    """What a session shows of the map that it is localised in.
-
-    Attributes:
-        grid: the drawn map. digest: numbers that tell it from other maps.
-    """
-
-    grid: GridDrawing
-    digest: np.ndarray
+"""Share of the pose hypotheses that are the best one below which a found pose is lost."""
 
 
 class GridLocaliser(Checkpointed, Map):
     """The map of the localise backend for grid maps: the poses of a session in a finished map.
 
     Args:
-        saved: the finished map. log_odds: above which a pose is found.
-        known: whether the session is supposed to begin at a known pose.
+        drawn: the finished map as it is drawn. digest: numbers that tell it from other maps.
+        log_odds: above which a pose is found. known: whether the session is assumed to begin at a known pose.
     """
 
     VALUES = ("_state", "_failed", "_now_pose", "_now_covariance", "_now_mass", "_now_log_odds")
     PARTS = ("_course",)
 
-    def __init__(self, saved: SavedGrid, log_odds: float, known: bool = False) -> None:
-        self.saved, self._needed = saved, log_odds
+    def __init__(self, drawn: GridDrawing, digest: np.ndarray, log_odds: float, known: bool = False) -> None:
+        self._drawn, self._digest, self._needed = drawn, digest, log_odds
         self._state = int(Localisation.FOUND if known else Localisation.SEARCHING)
         self._failed = 0  # searches that failed in a row
         self._now_pose, self._now_covariance = np.zeros(3), np.zeros((3, 3))
@@ -104,11 +89,14 @@ class GridLocaliser(Checkpointed, Map):
 
     def grid(self) -> GridDrawing:
         """The finished map."""
-        return self.saved.grid
+        return self._drawn
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the finished map."""
-        return {"localisation.csv": self._course.write, "grid.npz": self._write}
+        return {
+            "localisation.csv": self._course.write,
+            "grid.npz": lambda path: np.savez_compressed(path, **self._drawn._asdict()),
+        }
 
     # Changes
 
@@ -134,7 +122,7 @@ class GridLocaliser(Checkpointed, Map):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole state, with what tells the finished map from others."""
-        return super().arrays() | {"digest": self.saved.digest.copy()}
+        return super().arrays() | {"digest": self._digest.copy()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`.
@@ -142,7 +130,7 @@ class GridLocaliser(Checkpointed, Map):
         Raises:
             ValueError: the finished map has changed since.
         """
-        if not np.array_equal(arrays["digest"], self.saved.digest):
+        if not np.array_equal(arrays["digest"], self._digest):
             raise ValueError("a session in another map, or in this one before it was changed")
         super().restore(arrays)
 
@@ -164,9 +152,6 @@ class GridLocaliser(Checkpointed, Map):
             if self._state == Localisation.NOT_THIS_MAP:
                 self._state = int(Localisation.SEARCHING)
 
-    def _write(self, path: Path) -> None:
-        np.savez_compressed(path, **self.saved.grid._asdict())
-
 
 def _chance(log_odds: float) -> float:
     return float(1 / (1 + np.exp(-np.clip(log_odds, -700, 700))))
@@ -175,7 +160,7 @@ def _chance(log_odds: float) -> float:
 REPEATED = 0.5
 """Weight of what reports repeat, free whiskers and the robot's body, against new contacts and walls."""
 TEMPER = 0.6
-"""Weight of all of it where supposed poses compete: the map is wrong alike for many reports."""
+"""Weight of all of it where pose hypotheses compete: the map is wrong alike for many reports."""
 SPREAD, TURN = 0.12, 0.01
 """Displacement of a copy: standard deviation in cells of the map, and rad."""
 MIN_EFFECTIVE = 0.5
@@ -186,8 +171,8 @@ NEAR, NEAR_HEADING = 3.0, 0.5
 """Poses that are the same: within this distance, cells of the map, and this difference in heading, rad."""
 
 
-class Supposed(NamedTuple):
-    """N supposed poses.
+class Hypotheses(NamedTuple):
+    """N pose hypotheses.
 
     Attributes:
         swarm: the particles. odds: [N] log-odds of the session being there, on its own way, against the most
@@ -197,21 +182,6 @@ class Supposed(NamedTuple):
     swarm: Particles
     odds: Array
     best: Array
-
-
-class Cluster(NamedTuple):
-    """The supposed poses that are the same as the most likely one.
-
-    Attributes:
-        pose: [3] their mean, m, m, rad. covariance: [3, 3]. share: of all weights. log_odds: mean of their
-            log-odds. fall: by how much these are below their best.
-    """
-
-    pose: Array
-    covariance: Array
-    share: Scalar
-    log_odds: Scalar
-    fall: Scalar
 
 
 class Search:
@@ -226,13 +196,12 @@ class Search:
         self,
         config: GridConfig,
         expected: Expectation,
-        agreement: Agreement,
         free: np.ndarray,
         count: int,
         dtype: np.dtype,
     ) -> None:
         self.config, self.expected, self.count, self.dtype = config, expected, count, dtype
-        self.agreement = Agreement(*(values.astype(dtype) for values in agreement))
+        self.agreement = {name: values.astype(dtype) for name, values in counted_agreement().items()}
         self._free, self._cell = free.astype(dtype), expected.cell
         jitter = {"length": SPREAD * config.cell, "heading": TURN}
         self._resampling = config.resampling.model_copy(update=jitter)
@@ -242,38 +211,38 @@ class Search:
         """Number of poses that can be told apart."""
         return self.expected.places(len(self._free), NEAR * self.config.cell, NEAR_HEADING)
 
-    def begin(self, key: Array) -> Supposed:
-        """Supposed poses at random poses in all free cells."""
+    def begin(self, key: Array) -> Hypotheses:
+        """Pose hypotheses at random poses in all free cells."""
         errors, places, turns = jax.random.split(key, 3)
         cell = (jnp.arange(self.count) * len(self._free)) // self.count
         off = jax.random.uniform(places, (self.count, 2), self.dtype, -0.5, 0.5) * self._cell
         heading = jax.random.uniform(turns, (self.count, 1), self.dtype, -np.pi, np.pi)
         pose = jnp.concatenate([jnp.asarray(self._free)[cell] + off, heading], axis=1)
-        return self._suppose(errors, pose, 0.0)
+        return self._begin(errors, pose, 0.0)
 
-    def begin_at(self, key: Array, pose: np.ndarray, odds: float) -> Supposed:
-        """Supposed poses about one [3], with standard deviations of a cell and of half the same heading, and
+    def begin_at(self, key: Array, pose: np.ndarray, odds: float) -> Hypotheses:
+        """Pose hypotheses about one [3], with standard deviations of a cell and of half the same heading, and
         with log-odds to begin with."""
         errors, places = jax.random.split(key)
         spread = jnp.array([self.config.cell, self.config.cell, NEAR_HEADING / 2], self.dtype)
         draws = lax.optimization_barrier(jax.random.normal(places, (self.count, 3), self.dtype))
         at = jnp.asarray(pose, self.dtype)[None] + spread[None] * draws
-        return self._suppose(errors, at, odds)
+        return self._begin(errors, at, odds)
 
-    def _suppose(self, key: Array, pose: Array, odds: float) -> Supposed:
+    def _begin(self, key: Array, pose: Array, odds: float) -> Hypotheses:
         swarm = particles.start(self.config.drift, key, self.count, self.dtype)._replace(pose=pose)
         begun = jnp.full(self.count, odds, self.dtype)
-        return Supposed(swarm, begun, begun)
+        return Hypotheses(swarm, begun, begun)
 
     def move(
-        self, known: Supposed, odometry: Odometry, changed: Array, key: Array, pressed: Array
-    ) -> Supposed:
-        """The supposed poses after an odometry reading; see `particles.move`."""
+        self, known: Hypotheses, odometry: Odometry, changed: Array, key: Array, pressed: Array
+    ) -> Hypotheses:
+        """The pose hypotheses after an odometry reading; see `particles.move`."""
         swarm = particles.move(self.config.drift, known.swarm, odometry, changed, key, pressed)
         return known._replace(swarm=swarm)
 
-    def weigh(self, known: Supposed, features: ContactFeatures, touched: Array) -> tuple[Supposed, Array]:
-        """The supposed poses weighed by a report, and whether all weights vanished.
+    def weigh(self, known: Hypotheses, features: ContactFeatures, touched: Array) -> tuple[Hypotheses, Array]:
+        """The pose hypotheses weighed by a report, and whether all weights vanished.
 
         Args:
             touched: [W] bool, whiskers in contact at the report before.
@@ -282,35 +251,40 @@ class Search:
         seen = self.expected.whisker_classes(pose)
         free = features.free & ~touched & ~features.turning
         wall = self.expected.wall_classes(pose, features.on_wall, features.direction)
-        body = jnp.asarray(agreement.body)[self.expected.body_classes(pose)]
+        body = jnp.asarray(agreement["body"])[self.expected.body_classes(pose)]
 
         def total(whisker: np.ndarray, walls: np.ndarray) -> Array:
             met = jnp.where(features.new[None], jnp.asarray(whisker[CONTACT])[seen], 0)
             passed = jnp.where(free[None], REPEATED * jnp.asarray(whisker[FREE])[seen], 0)
             return jnp.sum(met + passed, axis=1) + jnp.where(features.wall, jnp.asarray(walls)[wall], 0)
 
-        likelihood = TEMPER * total(agreement.whisker, agreement.wall)
+        likelihood = TEMPER * total(agreement["whisker"], agreement["wall"])
         likelihood += jnp.where(features.valid, TEMPER * REPEATED * body, 0)
         swarm, vanished = particles.weigh(known.swarm, likelihood)
-        odds = known.odds + total(agreement.odds, agreement.wall_odds)
-        return Supposed(swarm, odds, jnp.maximum(known.best, odds)), vanished
+        odds = known.odds + total(agreement["odds"], agreement["wall_odds"])
+        return Hypotheses(swarm, odds, jnp.maximum(known.best, odds)), vanished
 
-    def resample(self, known: Supposed, key: Array) -> tuple[Supposed, Array, Array]:
-        """The supposed poses, resampled if few are effective; the effective number, and whether they were."""
+    def resample(self, known: Hypotheses, key: Array) -> tuple[Hypotheses, Array, Array]:
+        """The hypotheses, resampled if few are effective; the effective number, and whether they were."""
         share = particles.normalised_weights(known.swarm.weight)
         worth = particles.effective_count(share)
         pick, jitter = jax.random.split(key)
         needed = worth < MIN_EFFECTIVE * self.count
 
-        def draw() -> Supposed:
+        def draw() -> Hypotheses:
             drawn = particles.resample(self._resampling, share, pick)
             swarm = particles.copy_particles(self._resampling, known.swarm, drawn, jitter)
-            return Supposed(swarm, known.odds[drawn.ancestor], known.best[drawn.ancestor])
+            return Hypotheses(swarm, known.odds[drawn.ancestor], known.best[drawn.ancestor])
 
         return lax.cond(needed, draw, lambda: known), worth, needed
 
-    def best_cluster(self, known: Supposed) -> Cluster:
-        """The most likely pose and those near it."""
+    def best_cluster(self, known: Hypotheses) -> tuple[Array, Array, Array, Array, Array]:
+        """The hypotheses that are the same as the most likely one.
+
+        Returns:
+            their mean pose [3], m, m, rad; its covariance [3, 3]; their share of all weights; the mean of
+            their log-odds; by how much these are below their best.
+        """
         share, pose = particles.normalised_weights(known.swarm.weight), known.swarm.pose
         side = BIN * self.config.cell
         across = int(np.ceil(self._extent / side))
@@ -325,22 +299,19 @@ class Search:
         within = jnp.where(index == most, share, 0.0)
         mean, _ = particles.weighted_mean(pose, within / jnp.sum(within))
         for _ in range(2):
-            within = jnp.where(self._same(pose, mean), share, 0.0)
+            turned = pose[:, 2] - mean[2]
+            turned -= 2 * np.pi * jnp.round(turned / (2 * np.pi))
+            apart = jnp.hypot(pose[:, 0] - mean[0], pose[:, 1] - mean[1])
+            same = (apart < NEAR * self.config.cell) & (jnp.abs(turned) < NEAR_HEADING)
+            within = jnp.where(same, share, 0.0)
             total = jnp.sum(within)
             mean, _ = particles.weighted_mean(pose, within / jnp.maximum(total, 1e-12))
         off = pose - mean[None]
         off = off.at[:, 2].add(-2 * np.pi * jnp.round(off[:, 2] / (2 * np.pi)))
         part = within / jnp.maximum(total, 1e-12)
         covariance = jnp.sum(part[:, None, None] * off[:, :, None] * off[:, None, :], axis=0)
-        return Cluster(
-            mean, covariance, jnp.minimum(total, 1.0), part @ known.odds, part @ (known.best - known.odds)
-        )
-
-    def _same(self, pose: Array, mean: Array) -> Array:
-        turned = pose[:, 2] - mean[2]
-        turned -= 2 * np.pi * jnp.round(turned / (2 * np.pi))
-        apart = jnp.hypot(pose[:, 0] - mean[0], pose[:, 1] - mean[1])
-        return (apart < NEAR * self.config.cell) & (jnp.abs(turned) < NEAR_HEADING)
+        fall = part @ (known.best - known.odds)
+        return mean, covariance, jnp.minimum(total, 1.0), part @ known.odds, fall
 
 
 PRIOR = 3.0
@@ -363,36 +334,23 @@ _DRIVEN_BODY = [0.97, 0.01, 0.01, 0.01]
 """Bodies at true poses, and the shares of the classes anywhere on driven ground."""
 
 
-class Agreement(NamedTuple):
-    """Log-likelihoods of a report's parts by class.
+def counted_agreement() -> dict[str, np.ndarray]:
+    """Log-likelihoods of a report's parts by class, as counted.
 
-    Attributes:
-        whisker: [2, CLASSES] of a free whisker and of a new contact at a true pose. wall: [WALL_CLASSES].
-            body: [4], less those anywhere. odds, wall_odds: as `whisker` and `wall`, less those at an alike
-            pose elsewhere.
+    Returns:
+        whisker [2, CLASSES]: of a free whisker and of a new contact at a true pose; wall [WALL_CLASSES];
+        body [4]: less those anywhere; odds, wall_odds: as `whisker` and `wall`, less those at an alike pose
+        elsewhere.
     """
-
-    whisker: np.ndarray
-    wall: np.ndarray
-    body: np.ndarray
-    odds: np.ndarray
-    wall_odds: np.ndarray
-
-
-def counted_agreement() -> Agreement:
-    """The log-likelihoods as counted."""
-    true, alike = (_chances(np.array(counts, float)) for counts in (_TRUE, _ALIKE))
+    chances = []  # logarithms of the chances of no contact and of a contact
+    for counted in (_TRUE, _ALIKE):
+        counts = np.array(counted, float).reshape(2, CLASSES)
+        counts = counts + PRIOR * counts.sum(axis=1, keepdims=True) / counts.sum()
+        chances.append(np.log(counts / counts.sum(axis=0)))
+    true, alike = chances
     wall, other = (_shares(np.array(counts, float)) for counts in (_TRUE_WALLS, _ALIKE_WALLS))
     body = _shares(np.array(_TRUE_BODY, float)) - np.log(_DRIVEN_BODY)
-    return Agreement(true, wall, body, true - alike, wall - other)
-
-
-def _chances(counts: np.ndarray) -> np.ndarray:
-    """[2, CLASSES] logarithms of the chances of no contact and of a contact."""
-    assert counts.shape == (2, CROSSINGS, TIPS)
-    counts = counts.reshape(2, CLASSES)
-    counts = counts + PRIOR * counts.sum(axis=1, keepdims=True) / counts.sum()
-    return np.log(counts / counts.sum(axis=0))
+    return {"whisker": true, "wall": wall, "body": body, "odds": true - alike, "wall_odds": wall - other}
 
 
 def _shares(counts: np.ndarray) -> np.ndarray:

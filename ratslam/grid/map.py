@@ -1,10 +1,8 @@
 """The map of the grid filter: the mean path of the surviving particles, and contacts drawn along it.
 
-The map drawn from contacts along a path (Fox et al. 2012, II-E and II-F).
-
-A wall of known direction is drawn as an edge (eq. 4), other contacts as blobs (eq. 3). Each footprint is a
-probability that tends to 0.5 far away, where eq. 3 and 4 as printed tend to 0 and would erase the map;
-footprints are added as log-odds.
+A wall of known direction is drawn as an edge (Fox et al. 2012, II-F, eq. 4), other contacts as blobs (II-E,
+eq. 3). Each footprint is a probability that tends to 0.5 far away, where eq. 3 and 4 as printed tend to 0 and
+would erase the map; footprints are added as log-odds.
 """
 
 from __future__ import annotations
@@ -61,13 +59,8 @@ def contact_log(
     return ContactLog(valid, contact & counts & finite, ~contact & counts, turning, point, wall)
 
 
-class _Footprint(NamedTuple):
-    """Centre [2] in m, probability there, standard deviation in m, and a wall's direction in rad or NaN."""
-
-    place: np.ndarray
-    chance: float
-    sd: float
-    direction: float
+_Footprint = tuple[np.ndarray, float, float, float]
+"""Centre [2] in m, probability there, standard deviation in m, and a wall's direction in rad or NaN."""
 
 
 def draw_occupancy(
@@ -80,26 +73,25 @@ def draw_occupancy(
     """
     drawing, cell, most = config.drawing, config.cell, config.drawing.max_log_odds
     evidence = np.zeros((side, side))
-    for footprint in _footprints(drawing, config.body, whiskers, path, log):
-        reach = FAR * (drawing.edge_sd if np.isfinite(footprint.direction) else footprint.sd)
-        place = footprint.place / cell + (side - 1) / 2
+    for centre, most_likely, sd, direction in _footprints(drawing, config.body, whiskers, path, log):
+        is_edge = np.isfinite(direction)
+        reach = FAR * (drawing.edge_sd if is_edge else sd)
+        place = centre / cell + (side - 1) / 2
         low = np.clip(np.ceil(place - reach / cell), 0, side).astype(int)
         high = np.clip(np.floor(place + reach / cell) + 1, 0, side).astype(int)
         across, up = (np.arange(low[k], high[k]) * cell - place[k] * cell for k in (0, 1))
-        chance = 0.5 + (footprint.chance - 0.5) * _shape(drawing, footprint, across[None, :], up[:, None])
+        across, up = across[None, :], up[:, None]
+        away = across**2 + up**2
+        if is_edge:  # eq. 4; direction from the contact modulo pi, so that the edge extends both ways
+            off = np.mod(np.arctan2(up, across) - direction + np.pi / 2, np.pi) - np.pi / 2
+            off = np.where(away > 0, off, 0.0)
+            shape = np.exp(-away / (2 * drawing.edge_sd**2) - off**2 / (2 * drawing.edge_sector**2))
+        else:  # eq. 3
+            shape = np.exp(-away / (2 * sd**2))
+        chance = 0.5 + (most_likely - 0.5) * shape
         rows = slice(low[1], high[1]), slice(low[0], high[0])
         evidence[rows] = np.clip(evidence[rows] + logit(chance), -most, most)
     return expit(evidence + logit(config.prior))
-
-
-def _shape(config: DrawingConfig, footprint: _Footprint, across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    away = across**2 + up**2
-    if not np.isfinite(footprint.direction):
-        return np.exp(-away / (2 * footprint.sd**2))
-    # Direction from the contact modulo pi, so that the edge extends both ways.
-    off = np.mod(np.arctan2(up, across) - footprint.direction + np.pi / 2, np.pi) - np.pi / 2
-    off = np.where(away > 0, off, 0.0)
-    return np.exp(-away / (2 * config.edge_sd**2) - off**2 / (2 * config.edge_sector**2))
 
 
 def _footprints(
@@ -116,29 +108,24 @@ def _footprints(
             made += pending
             pending, before = [], np.zeros_like(before)
             continue
-        made += [_Footprint(_at(pose, p), config.free, config.free_sd, np.nan) for p in middles[log.free[k]]]
+        made += [(_at(pose, p), config.free, config.free_sd, np.nan) for p in middles[log.free[k]]]
         if body:
-            made.append(_Footprint(pose[:2], config.body, body, np.nan))
+            made.append((pose[:2], config.body, body, np.nan))
         if not contact.any():
             made += pending
             pending = []
         new = log.point[k][contact & ~before & ~log.turning[k]]
-        pending += [_Footprint(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in new]
+        pending += [(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in new]
         distance = np.hypot(*log.wall[k])
         if np.isfinite(distance) and distance > 1e-6 and contact.any():
             pending = []
-            made.append(_edge(config, pose, log.wall[k], log.point[k][contact].mean(axis=0)))
+            # The wall goes through its nearest point; its edge is drawn where the contacts project on it.
+            normal, middle = log.wall[k] / distance, log.point[k][contact].mean(axis=0)
+            place = _at(pose, middle + normal * (distance - normal @ middle))
+            direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
+            made.append((place, config.contact, config.blob_sd, float(direction)))
         before = contact
     return made + pending
-
-
-def _edge(config: DrawingConfig, pose: np.ndarray, foot: np.ndarray, middle: np.ndarray) -> _Footprint:
-    """The edge of a wall with its nearest point at `foot` [2] and contacts around `middle` [2], base_link."""
-    distance = np.hypot(*foot)
-    normal = foot / distance
-    place = _at(pose, middle + normal * (distance - normal @ middle))
-    direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
-    return _Footprint(place, config.contact, config.blob_sd, float(direction))
 
 
 def _at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -188,10 +175,7 @@ class GridMap(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """The map as arrays: probability [S, S], origin [2] m of its lower left corner, cell m."""
-        return {"grid.npz": self._write}
-
-    def _write(self, path: Path) -> None:
-        np.savez_compressed(path, **self.grid()._asdict())
+        return {"grid.npz": lambda path: np.savez_compressed(path, **self.grid()._asdict())}
 
     def contacts(self) -> ContactLog:
         """The contacts of all reports."""

@@ -1,16 +1,11 @@
-"""Particles: motion, weights and resampling.
+"""Particles of the grid filter: motion, weights, resampling; their ancestors; their maps.
 
 Each particle carries estimates of the odometry's errors: scale errors constant over the session, scale errors
-constant over a movement, and a heading drift constant over the session.
-
-The genealogy of particles: the paths of the ancestors of the particles that survived.
-
-Memory is bounded: of more than `MAX_POSES` poses, the older half is replaced by the weighted mean path.
-
-The maps of N particles, read and written through small windows, so that work is independent of map size.
-
-A map holds evidence (log-odds, 0 where unexplored) and a vector field of doubled wall directions. Places are
-in cells. Cells outside the map always count as unexplored.
+constant over a movement, and a heading drift constant over the session. `Genealogy` keeps the paths of the
+ancestors of the particles that survived. The maps of all particles are read and written through small
+windows, so that work is independent of map size: a map holds evidence (log-odds, 0 where unexplored) and a
+vector field of doubled wall directions. Places are in cells. Cells outside the map always count as
+unexplored.
 """
 
 from __future__ import annotations
@@ -92,7 +87,12 @@ def move(
     move = jnp.where(changed, config.move * draws[:2].T, particles.move)
     scale = 1 + particles.session + move + config.step * draws[2:4].T
     if config.slip:
-        scale *= _kept_shares(config.slip, odometry, pressed, len(draws[0]), key, dtype)
+        # Shares of distance and turn that remain: a robot that begins the step in contact and drives forward
+        # stands still while its wheels turn; how far it turns is unknown.
+        count, slip = len(draws[0]), config.slip
+        lost = slip * jax.random.uniform(jax.random.fold_in(key, SLIP_STREAM), (count,), dtype)
+        kept = jnp.stack([jnp.full(count, 1 - slip, dtype), 1 - lost], axis=1)
+        scale *= jnp.where(pressed & (odometry.dx > 0), kept, 1.0)
     x, y, heading = particles.pose.T
     error = odometry.dtheta * (scale[:, 1] - 1) + config.heading * draws[4]
     if particles.heading_rate is not None:
@@ -104,16 +104,6 @@ def move(
     turned -= 2 * jnp.pi * jnp.round(turned / (2 * jnp.pi))  # large angles lose precision in float32
     pose = jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, turned], axis=1)
     return particles._replace(pose=pose, move=move)
-
-
-def _kept_shares(
-    slip: float, odometry: Odometry, pressed: Array | bool, count: int, key: Array, dtype: jnp.dtype
-) -> Array:
-    """[N, 2] shares of distance and turn that remain of a step's odometry: a robot that begins it in contact
-    and drives forward stands still while its wheels turn; how far it turns is unknown."""
-    lost = slip * jax.random.uniform(jax.random.fold_in(key, SLIP_STREAM), (count,), dtype)
-    kept = jnp.stack([jnp.full(count, 1 - slip, dtype), 1 - lost], axis=1)
-    return jnp.where(pressed & (odometry.dx > 0), kept, 1.0)
 
 
 def weigh(particles: Particles, likelihood: Array) -> tuple[Particles, Array]:
@@ -215,7 +205,8 @@ MAX_POSES = 4_000_000
 
 
 class Genealogy(Checkpointed):
-    """Poses and ancestors of N particles at each report."""
+    """Poses and ancestors of N particles at each report. Memory is bounded: of more than `MAX_POSES` poses,
+    the older half is replaced by the weighted mean path."""
 
     VALUES = ("_weight",)
 
@@ -235,32 +226,27 @@ class Genealogy(Checkpointed):
         self._ancestor.append(ancestor)
         self._weight = np.asarray(weights, float)
         if len(self._pose.rows) * self.count > MAX_POSES and len(self._pose.rows) > 1:
-            self._settle(len(self._pose.rows) // 2)
+            older = len(self._pose.rows) // 2
+            for pose in self._mean_path()[:older]:
+                self._settled.append(pose)
+            self._pose.replace(self._pose.rows[older:].copy())
+            self._ancestor.replace(self._ancestor.rows[older:].copy())
 
     def path(self) -> np.ndarray:
         """[T, 3] the weighted mean of the ancestral paths of the present particles."""
         return np.concatenate([self._settled.rows, self._mean_path()])
 
     def _mean_path(self) -> np.ndarray:
-        pose, ancestor = self._pose.rows, self._ancestor.rows
+        pose, ancestor, weight = self._pose.rows, self._ancestor.rows, self._weight
         path = np.zeros((len(pose), 3))
         here = np.arange(self.count)
         for k in range(len(pose) - 1, -1, -1):
             if k + 1 < len(pose):
                 here = ancestor[k][here]
-            path[k] = _mean(pose[k][here], self._weight)
+            now = pose[k][here]
+            heading = np.arctan2(weight @ np.sin(now[:, 2]), weight @ np.cos(now[:, 2]))
+            path[k] = [*(weight @ now[:, :2]), heading]
         return path
-
-    def _settle(self, reports: int) -> None:
-        for pose in self._mean_path()[:reports]:
-            self._settled.append(pose)
-        self._pose.replace(self._pose.rows[reports:].copy())
-        self._ancestor.replace(self._ancestor.rows[reports:].copy())
-
-
-def _mean(pose: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    heading = np.arctan2(weight @ np.sin(pose[:, 2]), weight @ np.cos(pose[:, 2]))
-    return np.array([*(weight @ pose[:, :2]), heading])
 
 
 EVIDENCE, COSINE, SINE = 0, 1, 2

@@ -1,7 +1,5 @@
-"""A live session on an arm with a whisker head: self-test, calibration, route, whisks.
-
-Steers the arm of a live session to goals by the estimates of its mapper.
-"""
+"""A live session on an arm with a whisker head: self-test, calibration, route, whisks; and the steering to
+goals by the estimates of the mapper."""
 
 from __future__ import annotations
 
@@ -88,7 +86,7 @@ class GoalSteering:
     def __init__(self, route: GoalRoute, rig: Rig, mapper: Mapper, whisks: Sequence[WhiskReport]) -> None:
         self.route, self.ends = route, list[dict[str, Any]]()
         self._rig, self._mapper, self._whisks = rig, mapper, whisks
-        self._mapped = self._told = 0  # results taken; whisks of which the route was told
+        self._mapped = self._seen = 0  # results taken; whisks that the route has taken note of
 
     def advance(self, arm: MovableArm) -> bool:
         """See `robot.live.arm_route.ArmRoute`."""
@@ -116,12 +114,12 @@ class GoalSteering:
         self._mapper.receive()
         mapped, count = self._mapper.mapped, len(self._whisks)
         if len(mapped) > self._mapped and mapped[-1].number < count:
-            result, self._mapped, self._told = mapped[-1], len(mapped), count
+            result, self._mapped, self._seen = mapped[-1], len(mapped), count
             pose = None if result.lost else np.asarray(result.pose, np.float64)
             now, arm = self._rig.odometer.pose(time.monotonic()), self._whisks[result.number].pose
             self._note(self.route.see(pose, result.points, arm, now))
-        elif count > self._told and count - len(mapped) > STALE:
-            self._told = count
+        elif count > self._seen and count - len(mapped) > STALE:
+            self._seen = count
             self._note(self.route.rest())
 
     def _note(self, state: DriveState) -> None:
@@ -169,7 +167,7 @@ class ArmSession:
         assert config.live is not None
         self._config, self._path = config, path
         self.rig = Rig(config.live, config.touch.head, stopped)
-        self.job = mapping_job(config, directory)
+        self.job = _mapping_job(config, directory)
         self.total = config.live.whisks or (
             None if goals else ceil(path.duration * config.live.plan.whisking.rate)
         )
@@ -229,7 +227,7 @@ class ArmSession:
         }
 
 
-def mapping_job(config: RunConfig, directory: Path) -> MappingJob:
+def _mapping_job(config: RunConfig, directory: Path) -> MappingJob:
     """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     head = ur10_head(config.touch.head)

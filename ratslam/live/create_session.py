@@ -17,7 +17,7 @@ from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig, MotionReport, run_create_loop
 from robot.live.create_selftest import find_devices, start_and_check
 from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
-from robot.world.arena import Arena, make_arena, wall_segments
+from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
 from tactile.base.types import StepEnd
 
@@ -55,7 +55,7 @@ class CreateSession:
         assert config.live.create is not None
         self.rig = CreateRig(config.live, stopped)
         plan = config.live.create.plan
-        self.job = mapping_job(config, plan, directory)
+        self.job = _mapping_job(config, plan, directory)
         self.total = plan.reports
         self._count = 0
         self._ends: Counter[StepEnd] = Counter()
@@ -91,13 +91,18 @@ class CreateSession:
         }
 
 
-def mapping_job(config: RunConfig, plan: CreateSimulationConfig, directory: Path) -> MappingJob:
+def _mapping_job(config: RunConfig, plan: CreateSimulationConfig, directory: Path) -> MappingJob:
     """The job of the mapper, with the description of the robot for the recording."""
     assert config.live is not None
     arena = make_arena(plan.arena, plan.seed)
     info = describe_create(plan, arena)
     live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
     whiskers = len(plan.whiskers.mounts)
+    # Largest distance of a wall from the start along the robot's first x or y axis, m.
+    x, y, heading = arena.start
+    offset = wall_segments(arena).reshape(-1, 2) - [x, y]
+    c, s = np.cos(heading), np.sin(heading)
+    ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
     return MappingJob(
         mapped_config(config, directory, plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)),
         info.model_copy(update={"provenance": {**info.provenance, "live": live}}),
@@ -105,14 +110,5 @@ def mapping_job(config: RunConfig, plan: CreateSimulationConfig, directory: Path
         (1, whiskers, 1),
         whiskers,
         1 / plan.behaviour.step,
-        farthest_wall(arena),
+        float(np.abs([ahead, left]).max()),
     )
-
-
-def farthest_wall(arena: Arena) -> float:
-    """Largest distance of a wall from the start along the robot's first x or y axis, m."""
-    x, y, heading = arena.start
-    offset = wall_segments(arena).reshape(-1, 2) - [x, y]
-    c, s = np.cos(heading), np.sin(heading)
-    ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-    return float(np.abs([ahead, left]).max())

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -81,9 +80,17 @@ def run_live_session(
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:
-                report = json.dumps(_report(fault, robot, mapper, standing), indent=2) + "\n"
+                report = {
+                    "outcome": fault.outcome.name.lower(),
+                    "detail": fault.detail,
+                    "standing": standing,
+                    f"{robot.unit}s": robot.count,
+                    **robot.report(),
+                    "mapper_s": quantiles([result.seconds for result in mapper.mapped]),
+                }
+                text = json.dumps(report, indent=2) + "\n"
                 with suppress(OSError):  # a full disk has been reported
-                    (directory / SESSION_REPORT).write_text(report, encoding="utf-8")
+                    (directory / SESSION_REPORT).write_text(text, encoding="utf-8")
     return fault, card
 
 
@@ -117,14 +124,3 @@ def _run(robot: LiveRobot, mapper: Mapper) -> None:
         except SessionFault as error:
             robot.rig.record_event("fault", str(error.fault))
             raise
-
-
-def _report(fault: Fault, robot: LiveRobot, mapper: Mapper, standing: bool) -> dict[str, Any]:
-    return {
-        "outcome": fault.outcome.name.lower(),
-        "detail": fault.detail,
-        "standing": standing,
-        f"{robot.unit}s": robot.count,
-        **robot.report(),
-        "mapper_s": quantiles([result.seconds for result in mapper.mapped]),
-    }

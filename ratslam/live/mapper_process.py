@@ -22,14 +22,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
-from ratslam.core.session import Step
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
 from robot.sources.source import Sample, SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.types import Observation
 from tactile.calibration import Calibration
-from tactile.frontend import TouchConfig
 from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
@@ -144,7 +141,17 @@ class Mapper:
         """Reads the messages of the process."""
         try:
             while self._line.poll():
-                self._take(self._line.recv())
+                message = self._line.recv()
+                if isinstance(message, MappedSample):
+                    self.mapped.append(message)
+                elif isinstance(message, Scorecard):
+                    self._card = message
+                elif isinstance(message, InputError):
+                    self._refusal = message
+                elif message is True:
+                    self._stages += 1
+                else:
+                    self._failed = str(message)
         except (EOFError, OSError):
             self._failed = self._failed or "its connection broke"
 
@@ -178,18 +185,6 @@ class Mapper:
         if not self.alive:
             raise InputError("live", f"the mapper ended: {self.failure}", "")
         return self._stages
-
-    def _take(self, message: Any) -> None:
-        if isinstance(message, MappedSample):
-            self.mapped.append(message)
-        elif isinstance(message, Scorecard):
-            self._card = message
-        elif isinstance(message, InputError):
-            self._refusal = message
-        elif message is True:
-            self._stages += 1
-        else:
-            self._failed = str(message)
 
     def _send(self) -> None:
         while True:
@@ -271,7 +266,9 @@ def run_mapper(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
+    from ratslam.core.estimates import Action
     from ratslam.runs.build_session import build_session
+    from ratslam.runs.goal_planner import felt_points
     from ratslam.runs.runner import check_finished_map, open_runner
     from ratslam.runs.settings.completion import complete
     from ratslam.service.viewer_link import open_viewer
@@ -302,22 +299,15 @@ def _map(line: Connection) -> None:
             for sample in source:
                 (step,) = runner.process([sample])
                 took = time.monotonic() - fed.received
-                _send(line, _mapped_sample(fed.count - 1, sample.reading, step, config.touch, took))
+                estimate, touch = step.estimate, config.touch
+                points = felt_points(sample.reading, touch.image, ur10_head(touch.head))
+                result = MappedSample(
+                    fed.count - 1, np.asarray(step.pose), int(estimate.place),
+                    Action(int(estimate.action)).name.lower(), took, step.doubt, bool(estimate.lost), points,
+                )  # fmt: skip
+                _send(line, result)
             if runner.session.steps:
                 _send(line, runner.finish(fed.interrupted))
-
-
-def _mapped_sample(
-    number: int, observed: Observation, step: Step, touch: TouchConfig, seconds: float
-) -> MappedSample:
-    from ratslam.core.estimates import Action
-    from ratslam.runs.goal_planner import felt_points
-
-    estimate = step.estimate
-    action = Action(int(estimate.action)).name.lower()
-    points = felt_points(observed, touch.image, ur10_head(touch.head))
-    pose, lost = np.asarray(step.pose), bool(estimate.lost)
-    return MappedSample(number, pose, int(estimate.place), action, seconds, step.doubt, lost, points)
 
 
 def _send(line: Connection, message: Any) -> None:

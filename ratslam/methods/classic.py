@@ -14,7 +14,7 @@ from ratslam.classic.config import network_of, rings, units
 from ratslam.classic.experience_map import ExperienceMap, Places
 from ratslam.classic.levels import activity_sums, window_levels
 from ratslam.classic.pose_cells import Outcome, PoseCells
-from ratslam.classic.view_templates import Match, Templates
+from ratslam.classic.view_templates import Templates
 from ratslam.core.backend import Backend, PoseCellProbe, enlarge
 from ratslam.core.estimates import Estimate, PoseCellActivity, Scalar
 from ratslam.core.session import finite_values
@@ -93,13 +93,17 @@ class ClassicBackend(Backend):
     def kernel(
         self, state: ClassicState, observation: Observation
     ) -> tuple[ClassicState, Estimate, ClassicEvidence]:
-        """Matches the view, injects activity, moves the packet, learns a template and decides on the
-        place."""
+        """One step of RatSLAM (Milford & Wyeth 2004; Ball et al. 2013): matches the view, injects activity,
+        moves the packet, learns a template and decides on the place."""
         config = self.config
         odometry, view, visible, clean = finite_values(self.dtype, observation)
         view = view_templates.normalise(config.templates, view)
         seen = view_templates.is_seen(config.templates, observation, visible)
-        match = self._match(state.templates, view, observation.label, seen)
+        if config.templates.source == "labels":
+            match = view_templates.match_label(state.templates, observation.label)
+        else:
+            match = view_templates.match_view(config.templates, self.view_shape, state.templates, view)
+        match = match._replace(error=jnp.where(seen, match.error, jnp.inf))
         memory, energy = view_templates.recall(config.templates, state.templates, match, seen)
         memory, learnt = view_templates.learn(
             memory,
@@ -154,10 +158,3 @@ class ClassicBackend(Backend):
     def new_map(self) -> ExperienceMap:
         """An empty experience map."""
         return ExperienceMap(self.config.experience)
-
-    def _match(self, store: Templates, view: Array, label: Array, seen: Array) -> Match:
-        if self.config.templates.source == "labels":
-            match = view_templates.match_label(store, label)
-        else:
-            match = view_templates.match_view(self.config.templates, self.view_shape, store, view)
-        return match._replace(error=jnp.where(seen, match.error, jnp.inf))

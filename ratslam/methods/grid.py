@@ -174,8 +174,15 @@ class GridBackend(Backend):
 
     def _likelihood(self, state: GridState, pose: Array, features: ContactFeatures) -> Array:
         config = self.config.likelihood
-        if config.model != "evidence":
-            return self._printed_likelihood(state.maps, pose, features)
+        if config.model != "evidence":  # as printed
+            cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
+            evidence = particles.interpolate(state.maps, EVIDENCE, cell)
+            shape = (len(pose), self.whiskers, SEGMENTS)
+            likelihood = likelihoods.printed_likelihood(
+                self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
+                features.touching, features.free | features.touching, self.counted,
+            )  # fmt: skip
+            return jnp.where(features.valid, likelihood, 0.0)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
         evidence = particles.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
         shafts = jnp.repeat(features.free, len(FREE_POINTS))
@@ -203,16 +210,6 @@ class GridBackend(Backend):
             sharp = jnp.minimum(WALL_DIRECTIONS, 1 / (16 * features.sd**2))
             aligned += likelihoods.wall_direction(config, state.wall_directions, 4 * direction, sharp)
         return likelihood + jnp.where(features.wall, aligned, 0.0)
-
-    def _printed_likelihood(self, maps: Array, pose: Array, features: ContactFeatures) -> Array:
-        cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
-        evidence = particles.interpolate(maps, EVIDENCE, cell)
-        shape = (len(pose), self.whiskers, SEGMENTS)
-        likelihood = likelihoods.printed_likelihood(
-            self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
-            features.touching, features.free | features.touching, self.counted,
-        )  # fmt: skip
-        return jnp.where(features.valid, likelihood, 0.0)
 
     def _resample(
         self, swarm: Particles, share: Array, worth: Array, valid: Array, pick: Array, jitter: Array

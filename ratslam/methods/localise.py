@@ -1,5 +1,5 @@
-"""Localisation in a finished map: recall without adding keyframes, and supposed poses that explain the whole
-session."""
+"""Localisation in a finished keyframe map: recall without new keyframes, and pose hypotheses that have to
+explain the whole session."""
 
 from __future__ import annotations
 
@@ -63,9 +63,8 @@ class LocaliseEvidence(NamedTuple):
 
 
 class LocaliseState(NamedTuple):
-    """Attributes:
-    memory: the keyframes of the map. belief: of the pose cells. seen: number of views compared so far.
-    """
+    """State of the kernel: the keyframes of the map, the belief of the pose cells, and the number of views
+    compared so far."""
 
     memory: Memory
     belief: Belief
@@ -77,7 +76,7 @@ class LocaliseBackend(Backend):
 
     Args:
         recall: the backend that made the map. map: the finished map. log_odds: see `LocaliseConfig`.
-        here: whether the robot is supposed to stand where the map ended.
+        here: whether the robot is assumed to stand where the map ended.
     """
 
     SINGLE = ("belief",)

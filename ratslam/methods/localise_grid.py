@@ -1,4 +1,4 @@
-"""Localisation in a finished grid map: supposed poses anywhere in it, weighed by what whiskers meet there."""
+"""Localisation in a finished grid map: pose hypotheses anywhere in it, weighed by what whiskers meet."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jax import lax
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Action, Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
-from ratslam.grid.expectation import draw_surfaces, expect
-from ratslam.grid.localiser import GridLocaliser, SavedGrid, Search, Supposed, counted_agreement
+from ratslam.grid.expectation import Expectation, draw_surfaces
+from ratslam.grid.localiser import GridLocaliser, Hypotheses, Search
 from ratslam.grid.map import GridMap
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
@@ -39,11 +39,11 @@ class GridLocaliseOutcome(IntEnum):
 
     OK = 0
     RESAMPLED = 1
-    """The supposed poses were resampled."""
+    """The pose hypotheses were resampled."""
     BEGUN_ANEW = 2
-    """No supposed pose explains the session; the search begins anew, anywhere in the map."""
+    """No pose hypothesis explains the session; the search begins anew, anywhere in the map."""
     VANISHED = 3
-    """No supposed pose explains the report; the weights are left unchanged."""
+    """No pose hypothesis explains the report; the weights are left unchanged."""
     NOT_FINITE = 4
     """Odometry or contacts were NaN, infinite or impossibly large; treated as no motion and no contact."""
 
@@ -52,9 +52,9 @@ class GridLocaliseEvidence(NamedTuple):
     """Evidence of one step.
 
     Attributes:
-        pose: [3] the most likely pose, m, m, rad. covariance: [3, 3] of it. share: of the supposed poses that
-            are the same. log_odds: of the session being there, against the most alike place elsewhere, since
-            the search began. fall: by how much they are below their best. effective_particles: their
+        pose: [3] the most likely pose, m, m, rad. covariance: [3, 3] of it. share: of the pose hypotheses
+            that are the same. log_odds: of the session being there, against the most alike place elsewhere,
+            since the search began. fall: by how much they are below their best. effective_particles: their
             effective number. failed: bool, the search failed and begins anew. outcome: see
             `GridLocaliseOutcome`.
     """
@@ -70,12 +70,14 @@ class GridLocaliseEvidence(NamedTuple):
 
 
 class GridLocaliseState(NamedTuple):
-    """Attributes:
-    known: the supposed poses. motion: the last report's `Motion`. touched: [W] its contacts. key: data of the
-        random stream's key.
+    """State of the search.
+
+    Attributes:
+        known: the pose hypotheses. motion: the last report's `Motion`. touched: [W] its contacts. key: data
+            of the random stream's key.
     """
 
-    known: Supposed
+    known: Hypotheses
     motion: Array
     touched: Array
     key: Array
@@ -85,8 +87,8 @@ class GridLocaliseBackend(Backend):
     """Localisation in a finished grid map.
 
     Args:
-        made: the finished map, which has contacts. log_odds: see `LocaliseConfig`. count: supposed poses.
-        here: whether the robot is supposed to stand where the map ended.
+        made: the finished map, which has contacts. log_odds: see `LocaliseConfig`. count: pose hypotheses.
+        here: whether the robot is assumed to stand where the map ended.
     """
 
     def __init__(
@@ -100,15 +102,15 @@ class GridLocaliseBackend(Backend):
             raise InputError(
                 "localise.map", "a map without driven ground", "one in which a session can be found"
             )
-        expected = expect(surfaces, made.feelers, config.body)
-        self._search = Search(config, expected, counted_agreement(), free, count, self.dtype)
+        expected = Expectation(surfaces, made.feelers, config.body)
+        self._search = Search(config, expected, free, count, self.dtype)
         self._needed = log_odds + float(np.log(self._search.places())) + ALIKE
-        self._saved = SavedGrid(made.grid(), path.copy())
+        self._drawn, self._path = made.grid(), path.copy()
         self._start = path[-1] if here else None
         self._whiskers = len(made.feelers.length)
 
     def init(self, key: Array, capacity: int) -> GridLocaliseState:
-        """Supposed poses all over the map, or where it ended. Nothing grows: `capacity` is not used."""
+        """Pose hypotheses all over the map, or where it ended. Nothing grows: `capacity` is not used."""
         del capacity
         first, key = jax.random.split(key)
         start = self._start
@@ -121,16 +123,16 @@ class GridLocaliseBackend(Backend):
     def kernel(
         self, state: GridLocaliseState, observation: Observation
     ) -> tuple[GridLocaliseState, Estimate, GridLocaliseEvidence]:
-        """Moves and weighs the supposed poses; begins anew if none explains the session."""
+        """Moves and weighs the pose hypotheses; begins anew if none explains the session."""
         key, draw, again, anew = jax.random.split(jax.random.wrap_key_data(state.key), 4)
         odometry, features, clean = contact_features(observation, state.touched, self.dtype)
         motion = jnp.asarray(observation.motion, jnp.int32)
         pressed = jnp.any(state.touched)
         known = self._search.move(state.known, odometry, motion != state.motion, draw, pressed)
         known, vanished = self._search.weigh(known, features, state.touched)
-        found = self._search.best_cluster(known)
+        pose, covariance, share, odds, fall = self._search.best_cluster(known)
         known, worth, drawn = self._search.resample(known, again)
-        failed = (found.log_odds < -self._hopeless / 2) | (found.fall > self._hopeless)
+        failed = (odds < -self._hopeless / 2) | (fall > self._hopeless)
         known = lax.cond(failed, lambda: self._search.begin(anew), lambda: known)
 
         outcome = jnp.where(drawn, GridLocaliseOutcome.RESAMPLED, GridLocaliseOutcome.OK)
@@ -138,16 +140,16 @@ class GridLocaliseBackend(Backend):
         outcome = jnp.where(failed, GridLocaliseOutcome.BEGUN_ANEW, outcome)
         outcome = jnp.where(clean, outcome, GridLocaliseOutcome.NOT_FINITE).astype(jnp.int32)
         place = jnp.int32(-1)  # a grid has no places
-        spread = jnp.sqrt(jnp.diag(found.covariance))
-        estimate = Estimate(found.pose, spread, place, place, jnp.int32(Action.NONE), jnp.bool_(True))
-        evidence = GridLocaliseEvidence(*found, worth, failed, outcome)
+        spread = jnp.sqrt(jnp.diag(covariance))
+        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), jnp.bool_(True))
+        evidence = GridLocaliseEvidence(pose, covariance, share, odds, fall, worth, failed, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridLocaliseState(known, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
     def new_map(self) -> GridLocaliser:
         """A session of which nothing is known but perhaps its start."""
-        return GridLocaliser(self._saved, self._needed, self._start is not None)
+        return GridLocaliser(self._drawn, self._path, self._needed, self._start is not None)
 
 
 def build(

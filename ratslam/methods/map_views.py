@@ -1,14 +1,14 @@
-"""Views compared with the keyframes of a finished map, which does not change.
+"""Views compared with the keyframes of a finished map, and ties between the pieces of a growing one.
 
-Ties between pieces of a growing map: the newest piece is placed on another one like a session on a map.
-
-A sequence of closures between pieces strains no odometry, so a false one would be accepted as easily as a
-true one. A placement of the whole piece has to explain all its views.
+`MapViews` compares the views of a session, or of the map itself, with keyframes that do not change.
+`PieceTies` places the newest piece of a map on an older one like a session on a map: a sequence of closures
+between pieces strains no odometry, so a false one would be accepted as easily as a true one, and a placement
+of the whole piece has to explain all its views.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from ratslam.recall import filter
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import MapFeedback, Memory, corrected_motion, first_keyframes, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory, frozen_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
 
@@ -43,17 +43,9 @@ TOGETHER = 64
 """Number of views compared in one compiled call."""
 
 
-class Look(NamedTuple):
-    """One view compared with a memory.
-
-    Attributes:
-        result: of recall. gain: [S, C] log-likelihood at each sector shift and keyframe less that at a new
-            place. shows: bool, whether the view can be compared.
-    """
-
-    result: filter.RecallResult
-    gain: Array
-    shows: Array
+Look = tuple[filter.RecallResult, Array, Array]
+"""One view compared with a memory: the result of recall; gain [S, C], log-likelihood at each sector shift and
+keyframe less that at a new place; bool, whether the view can be compared."""
 
 
 class ViewMatcher(Protocol):
@@ -131,7 +123,7 @@ class MapViews:
         views, labels = self.graph.appearance.stored(frames)
 
         def gains(begin: int, count: int) -> np.ndarray:
-            earlier = first_keyframes(whole, int(held[: begin - guard].sum()))
+            earlier = whole.first_keyframes(int(held[: begin - guard].sum()))
             view = jnp.asarray(views[begin : begin + count].T.astype(whole.view.dtype))
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
@@ -162,14 +154,14 @@ class MapViews:
             ]  # fmt: skip
             (memory, belief), looks = self._compare(memory, belief, *filled)
             parts.append(jax.tree.map(lambda values, size=size: np.asarray(values)[:size], looks))
-        match = np.concatenate([part.result.match for part in parts])
-        shift = np.concatenate([part.result.shift for part in parts])
+        results, gains, shows = zip(*parts, strict=True)
+        shift = np.concatenate([result.shift for result in results])
         return Comparison(
-            gain=np.concatenate([part.gain[:, :, :count] for part in parts]),
-            shows=np.concatenate([part.shows for part in parts]),
-            match=match,
+            gain=np.concatenate([gain[:, :, :count] for gain in gains]),
+            shows=np.concatenate(shows),
+            match=np.concatenate([result.match for result in results]),
             shift=np.argmax(self.shifts == shift[:, None], axis=1),
-            posterior=np.concatenate([part.result.posterior for part in parts]),
+            posterior=np.concatenate([result.posterior for result in results]),
         )
 
     def no_belief(self, memory: Memory) -> Belief:
@@ -179,19 +171,19 @@ class MapViews:
     def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
         """Recalls one view in its stored form, and compares it with all keyframes."""
         memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
-        motion = corrected_motion(memory)
+        motion = memory.corrected_motion()
         belief, result = filter.recognise(
             self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
         )
         zero = jnp.zeros_like(memory.length)
         memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
         shows = likelihood.certain & likelihood.informative
-        return memory, belief, Look(result, self._gain(memory, likelihood), shows)
+        return memory, belief, (result, self._gain(memory, likelihood), shows)
 
     def no_look(self, memory: Memory) -> Look:
         """The result of a step without a comparison."""
         gain = jnp.zeros((len(self.shifts), memory.label.shape[0]), jnp.float32)
-        return Look(filter.empty_result(memory), gain, jnp.bool_(False))
+        return filter.empty_result(memory), gain, jnp.bool_(False)
 
     def _gain(self, memory: Memory, likelihood: ObservationLikelihood) -> Array:
         tiny = jnp.finfo(likelihood.novelty.dtype).tiny
@@ -233,15 +225,6 @@ FEWEST = 10
 """Least number of keyframes of a piece that is placed on another or has another placed on it."""
 
 
-class PlacedOn(NamedTuple):
-    """A piece as ground: its keyframes [N], their frozen memory, and the log-odds of gains."""
-
-    frames: np.ndarray
-    ground: Ground
-    memory: Memory
-    odds: GainOdds
-
-
 class PieceTies:
     """Finds where the newest piece of a map lies on an older one. What it keeps between two calls are only
     compiled functions.
@@ -268,8 +251,7 @@ class PieceTies:
         for number in np.unique(piece).tolist():
             frames = np.flatnonzero(piece == number)
             if len(frames) >= FEWEST:
-                on = _placed_on(self._views, archive, odds, frames)
-                found += _place(self._views, own, on)
+                found += _place_on(self._views, archive, odds, own, frames)
         if not found:
             return None
         best, *others = sorted(found, key=lambda tie: -tie.log_odds)
@@ -278,7 +260,11 @@ class PieceTies:
         return best if best.log_odds - rival >= margin else best._replace(log_odds=best.log_odds - rival)
 
 
-def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.ndarray) -> PlacedOn:
+def _place_on(
+    views: MapViews, archive: Archive, odds: LearnedOdds, own: np.ndarray, frames: np.ndarray
+) -> list[Tie]:
+    """All placements of the keyframes `own` [n] of the newest piece on those of an older one, `frames`
+    [N]."""
     graph = views.graph
     taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
 
@@ -288,28 +274,23 @@ def _placed_on(views: MapViews, archive: Archive, odds: LearnedOdds, frames: np.
             every, archive.poses(graph.pose.rows)[every], np.isin(every, taken), PIECE_WEIGHTING
         )
 
-    key = (len(frames), int(taken[0]), int(taken[-1]))
-    return PlacedOn(frames, views.ground(poses), views.freeze(taken, poses), odds.of(key, learn))
-
-
-def _place(views: MapViews, own: np.ndarray, on: PlacedOn) -> list[Tie]:
-    """All placements on a ground."""
-    graph = views.graph
+    ground, memory = views.ground(poses), views.freeze(taken, poses)
+    learned = odds.of((len(frames), int(taken[0]), int(taken[-1])), learn)
     # Odometry into each keyframe of the piece without its systematic errors.
     motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
     variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
     variance[:, 2] *= graph.heading_noise.further_factor
     motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
-    compared = views.compare(on.memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
-    places = float(np.log(max(on.ground.places(), 1.0)))
+    compared = views.compare(memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
+    places = float(np.log(max(ground.places(), 1.0)))
     session = Traverse(compared._replace(gain=PIECE_WEIGHTING.weigh(compared.gain)), motions)
     return [
         Tie(
-            float(path.independent_odds(on.ground).sum()) - places,
+            float(path.independent_odds(ground).sum()) - places,
             [
-                Candidate(int(own[k]), int(on.frames[at.frame]), int(views.shifts[at.shift]), 1.0, at.gain)
-                for k, at in closures_along(on.ground, compared, path)
+                Candidate(int(own[k]), int(frames[at.frame]), int(views.shifts[at.shift]), 1.0, at.gain)
+                for k, at in closures_along(ground, compared, path)
             ],
         )
-        for path in find_placements(on.ground, on.odds, session)
+        for path in find_placements(ground, learned, session)
     ]

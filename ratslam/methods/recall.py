@@ -1,10 +1,18 @@
-"""RatSLAM backend whose pose cells hold the belief, with verified loop closures."""
+"""The default method: RatSLAM whose pose cells hold the belief, with verified loop closures.
+
+The loop is that of RatSLAM (Milford & Wyeth 2004; Milford, Wiles & Wyeth 2010): odometry moves the activity
+of the pose cells, views anchor it, and places that are seen again become links of the map. Here the activity
+is a posterior (`ratslam.network.pose_cells`), every keyframe is a view cell (`ratslam.recall`), and a
+candidate for a loop closure is accepted only by the map (`ratslam.mapping`), which weighs sequences of them
+against its odometry. The kernel never reads the map; the map's poses come back to the view cells as
+`MapFeedback`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +42,7 @@ from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
 from ratslam.recall import filter
 from ratslam.recall import memory as recall_memory
-from ratslam.recall.config import RecallConfig, fan_width, sector_shifts
+from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, crop_rows
 from ratslam.recall.observation_model import (
@@ -49,12 +57,8 @@ from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_l
 from tactile.base.se2 import compose, correct_heading
 from tactile.base.types import Array, Observation
 
-T = TypeVar("T")
-
 HEALTH_RATE = 0.1
 """Share of the newest revisit in the running health."""
-
-
 SHOWN = 4
 """Number of competing packets that are shown."""
 
@@ -174,13 +178,15 @@ class RecallBackend(Backend):
         if not len(feedback.poses):
             return state
         memory = state.memory
-        memory, belief = self._follow(memory, state.belief, recall_memory.pack_feedback(memory, feedback))
+        memory, belief = self._follow(memory, state.belief, memory.pack_feedback(feedback))
         return state._replace(memory=memory, belief=belief)
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
         memory = recall_memory.merge_rows(state.memory, merged)
-        return state._replace(memory=memory, belief=pose_cells.merge_rows(state.belief, merged))
+        return state._replace(
+            memory=memory, belief=pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
+        )
 
     def begin_piece(self, state: RecallState) -> RecallState:
         """All is novelty; the health is that of the start."""
@@ -193,7 +199,7 @@ class RecallBackend(Backend):
         memory = crop_rows(state.memory, cropped)
         belief = pose_cells.lose_rows(state.belief, cropped.left)
         # Anchored at once, because the next feedback may be steps away.
-        belief = self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows))
+        belief = self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows.onto, cropped.rows.offset))
         return state._replace(belief=belief, memory=memory)
 
     def state_of(self, map: Map, capacity: int) -> RecallState:
@@ -217,10 +223,10 @@ class RecallBackend(Backend):
         return pose_cells.start(self.network, (len(sector_shifts(self.recall)), capacity))
 
     def follow_map(
-        self, memory: Memory, belief: Belief, feedback: recall_memory.PackedFeedback
+        self, memory: Memory, belief: Belief, feedback: tuple[Array, Array, Array]
     ) -> tuple[Memory, Belief]:
         """Memory and belief of a map that has moved; pure."""
-        memory = recall_memory.take_feedback(memory, feedback)
+        memory = memory.take_feedback(feedback)
         return memory, self._anchored(memory, belief)
 
     def _anchored(self, memory: Memory, belief: Belief) -> Belief:
@@ -230,7 +236,13 @@ class RecallBackend(Backend):
     def kernel(
         self, state: RecallState, observation: Observation
     ) -> tuple[RecallState, Estimate, RecallEvidence]:
-        """Moves by the odometry; a view that becomes a keyframe weighs the belief and is stored."""
+        """Moves by the odometry; a view that becomes a keyframe weighs the belief and is stored.
+
+        Returns:
+            the state; the estimate: pose [3] in the map at the last feedback, moved on by odometry, m, m,
+            rad, with its standard deviations; the evidence: the candidate for a loop closure and how certain
+            it is.
+        """
         odometry, view, visible, clean = finite_values(self.dtype, observation)
         seen, view = self.prepare(observation, view, visible)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
@@ -241,21 +253,24 @@ class RecallBackend(Backend):
         travelled = jnp.hypot(odometry.dx, odometry.dy)
         onwards = compose(state.packet, correct_heading(moved, travelled, memory.bias, memory.turn_error))
         state = state._replace(memory=memory)
-        state, result = _once(
-            is_keyframe,
-            lambda found: self._recall(found[0], features, observation.label),
-            (state, filter.empty_result(memory)),
+        # A loop of at most one round: XLA copies the results of a branch, not what a loop leaves as it is.
+        _, state, result = lax.while_loop(
+            lambda carry: carry[0],
+            lambda carry: (jnp.bool_(False), *self._recall(carry[1], features, observation.label)),
+            (is_keyframe, state, filter.empty_result(memory)),
         )
         memory = state.memory
         packet = jnp.where(result.match >= 0, filter.place_of(memory, result), onwards)
-        health = self._health(state.health, result.view_fits)
+        # The running share of revisits whose view fits, after one more revisit.
+        updated = state.health + HEALTH_RATE * (result.view_fits.astype(self.dtype) - state.health)
+        health = jnp.where(result.view_fits >= 0, updated, state.health)
         has_room = memory.count < memory.label.shape[0]
         outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
         outcome = jnp.where(clean, outcome, RecallOutcome.NOT_FINITE).astype(jnp.int32)
-        sd, sd_heading = recall_memory.pose_spread(self.recall, self.cell, memory)
+        sd, sd_heading = memory.pose_spread(self.recall, self.cell)
         place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
         estimate = Estimate(
-            pose=recall_memory.current_pose(memory),
+            pose=memory.current_pose(),
             spread=jnp.stack([sd, sd, sd_heading]),
             place=place,
             previous=place,
@@ -268,11 +283,6 @@ class RecallBackend(Backend):
         )  # fmt: skip
         return state._replace(memory=memory, packet=packet, health=health), estimate, evidence
 
-    def _health(self, health: Array, view_fits: Array) -> Array:
-        """The running share of revisits whose view fits, after one more revisit."""
-        updated = health + HEALTH_RATE * (view_fits.astype(self.dtype) - health)
-        return jnp.where(view_fits >= 0, updated, health)
-
     def probe(self) -> PoseCellProbe:
         """The cells that the network begins with, read where their preferred poses have moved to."""
         cells = self.config.pose_cells
@@ -280,7 +290,7 @@ class RecallBackend(Backend):
         units = 2 * np.pi / shape[0], cells.cell_size, cells.cell_size
 
         def each(state: RecallState, chosen: Array) -> Array:
-            motion = recall_memory.corrected_motion(state.memory)
+            motion = state.memory.corrected_motion()
             return pose_cells.activity_at(self.network, state.belief, motion, chosen)
 
         def active(held: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -305,26 +315,28 @@ class RecallBackend(Backend):
         return PoseCellActivity(cells.sum(axis=0), cells.sum(axis=(1, 2)), packets)
 
     def new_map(self) -> KeyframeMap:
-        """An empty keyframe map."""
+        """An empty keyframe map, which compares stored views by the kind of sensor."""
+        appearance: Appearance
+        if self.labels:
+            appearance = LabelAppearance()
+        elif self.signed:
+            appearance = SignedAppearance(self.size)
+        elif self.pixels is not None:
+            half_turns = len(sector_shifts(self.recall)) > 1
+            appearance = WhiskerAppearance(self.pixels, self.recall.temper, self._normalise, half_turns)
+        else:
+            # Width of the sectors, rad; 0: to be estimated; None: the views are not ordered sectors.
+            view = self.recall.sector_fov
+            fan = view if not isinstance(view, str) else 0.0 if view == "auto" else None
+            appearance = ViewAppearance(self.size, fan, self._normalise)
+        # By odds for views and given ids; with whiskers, sequences are selected against each other.
+        by_odds = self.pixels is None and self.ablation.verify
+        acceptance: Callable[[KeyframeGraph, Archive], Acceptance]
+        acceptance = AcceptByOdds if by_odds else lambda graph, archive: AcceptByEvidence()
         return KeyframeMap(
-            self.config.keyframes, self.cell, self._appearance(), self._acceptance(), guard=self.recall.guard,
+            self.config.keyframes, self.cell, appearance, acceptance, guard=self.recall.guard,
             closures=self.config.experience.closures, ablation=self.ablation, find_tie=PieceTies(self),
         )  # fmt: skip
-
-    def _acceptance(self) -> Callable[[KeyframeGraph, Archive], Acceptance]:
-        """By odds for views and given ids; with whiskers, sequences are selected against each other."""
-        views = self.pixels is None and self.ablation.verify
-        return AcceptByOdds if views else lambda graph, archive: AcceptByEvidence()
-
-    def _appearance(self) -> Appearance:
-        if self.labels:
-            return LabelAppearance()
-        if self.signed:
-            return SignedAppearance(self.size)
-        if self.pixels is not None:
-            half_turns = len(sector_shifts(self.recall)) > 1
-            return WhiskerAppearance(self.pixels, self.recall.temper, self._normalise, half_turns)
-        return ViewAppearance(self.size, fan_width(self.recall), self._normalise)
 
     def _normalise(self, view: np.ndarray) -> np.ndarray:
         shaped = np.asarray(view.reshape(self.view_shape), self.dtype)
@@ -383,12 +395,12 @@ class RecallBackend(Backend):
     def _recognise(
         self, config: RecallConfig, state: RecallState, view: Array, label: Array
     ) -> tuple[RecallState, RecallResult]:
-        motion = recall_memory.corrected_motion(state.memory)
+        motion = state.memory.corrected_motion()
         memory, likelihood = self.likelihood(config, state.memory, view, label)
         belief, result = filter.recognise(
             config, self.network, memory, state.belief, motion, likelihood, self.recall.local
         )
-        memory = recall_memory.store_keyframe(memory, view, label)
+        memory = memory.store_keyframe(view, label)
         return state._replace(belief=belief, memory=memory), result
 
     def likelihood(
@@ -403,13 +415,3 @@ class RecallBackend(Backend):
         if self.pixels is not None:
             return touch_likelihood(config, memory, view, self.pixels)
         return memory, view_likelihood(config, self.cell, memory, view)
-
-
-def _once(condition: Array, change: Callable[[T], T], value: T) -> T:
-    """The changed value, or the value. A loop of at most one round, because XLA copies the results of a
-    branch, but not what a loop leaves as it is."""
-
-    def once(carry: tuple[Array, T]) -> tuple[Array, T]:
-        return jnp.bool_(False), change(carry[1])
-
-    return lax.while_loop(lambda carry: carry[0], once, (condition, value))[1]

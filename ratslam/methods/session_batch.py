@@ -18,7 +18,7 @@ from jax import lax
 from ratslam.core.arrays import PackedRecords, allocate, layout_of
 from ratslam.core.session import CHUNK, Session, run_chunk
 from ratslam.methods.recall import RecallBackend, RecallState
-from ratslam.recall.memory import MapFeedback, MergedRows, pack_feedback
+from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
 
@@ -105,7 +105,7 @@ class SessionBatch:
                 states = jax.vmap(partial(backend.cover, sides=sides))(states)
             states = self._merge(states, [each.merged for each in chunks])
             if len(chunks[0].feedback.poses):
-                packed = _stack([pack_feedback(empty.memory, each.feedback) for each in chunks])
+                packed = _stack([empty.memory.pack_feedback(each.feedback) for each in chunks])
                 memory, belief = self._follow(states.memory, states.belief, packed)
                 states = states._replace(memory=memory, belief=belief)
             records = _stack([each.records for each in chunks])
@@ -117,17 +117,13 @@ class SessionBatch:
         if all(each is None for each in merged):
             return states
         held = jax.tree.map(np.asarray, states)
-        each_state = [jax.tree.map(partial(_row, k), held) for k in range(len(merged))]
+        each_state = [jax.tree.map(lambda rows, k=k: rows[k], held) for k in range(len(merged))]
         with jax.default_device(jax.devices("cpu")[0]):
             after = [
                 state if each is None else self._backend.merge_rows(state, each)
                 for state, each in zip(each_state, merged, strict=True)
             ]
         return cast(RecallState, jax.tree.map(jnp.asarray, _stack(after)))
-
-
-def _row(k: int, rows: np.ndarray) -> np.ndarray:
-    return rows[k]
 
 
 def _stack(trees: Sequence[Any]) -> Any:

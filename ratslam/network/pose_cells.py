@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from functools import partial, reduce
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,16 +91,6 @@ class Ties(NamedTuple):
     weight: Array
 
 
-class MergedRows(Protocol):
-    """Rows after a merge, see `ratslam.recall.memory.MergedRows`."""
-
-    @property
-    def onto(self) -> np.ndarray: ...
-
-    @property
-    def offset(self) -> np.ndarray: ...
-
-
 def start(network: Network, views: tuple[int, int]) -> Belief:
     """A belief that is all novelty, for S sector shifts and C rows of view cells."""
     cells = network.cells
@@ -115,38 +105,44 @@ def cover(network: Network, belief: Belief, sides: tuple[int, ...]) -> Belief:
 
 
 def predict(network: Network, belief: Belief, cells: ViewCells, motion: Array) -> tuple[Array, Array]:
-    """Path integration and local excitation.
+    """Path integration and local excitation: the prior of the view cells, before the view is compared.
 
     Args:
-        motion: [3] odometry since the last update, m, m, rad.
+        belief: after the last update. cells: the view cells. motion: [3] odometry since then, m, m, rad.
 
     Returns:
         mass [S, C] that reaches the view cells, and mass that finds none; float32.
     """
     activity, moved = belief.activity, integrate_path(cells, motion)
+    # Y = E * [X / (E * K 1 + miss)]: E * K 1 is the density of view cells around each pose cell.
     density = excite(network, drive(network, activity.shape, moved, jnp.ones_like(belief.mass)))
     excited = excite(network, activity / (density + network.miss))
+    # (1 - leak) K'Y
     found = (1 - network.leak) * read(network, moved, excited)
     return found, jnp.maximum(jnp.sum(activity) - jnp.sum(found), 0.0)
 
 
 def inhibit(mass: Array, novel: Array) -> tuple[Array, Array]:
-    """Global inhibition: activity of the view cells [S, C] and of novelty, divided by their sum."""
+    """Global inhibition is divisive: v / Z and nu = n / Z with Z = sum v + n.
+
+    Args:
+        mass: v [S, C] of the view cells. novel: n of novelty.
+    """
     total = jnp.maximum(jnp.sum(mass) + novel, jnp.finfo(novel.dtype).tiny)
     return mass / total, novel / total
 
 
 def anchor(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
-    """The belief after view cells of mass [S, C] drive their pose cells."""
+    """The belief after view cells of mass v [S, C] drive their pose cells: A = K v."""
     mass = mass.astype(jnp.float32)
     return Belief(drive(network, belief.activity.shape, cells, mass), mass)
 
 
 def integrate_path(cells: ViewCells, motion: Array) -> ViewCells:
-    """The view cells as seen by pose cells whose preferred poses have moved: at p m^-1.
+    """The view cells as seen by pose cells whose preferred poses have moved: at p m^-1, for X(p) = A(p m^-1).
 
     Args:
-        motion: [3] m, m, rad.
+        motion: m [3], body-frame odometry since the last update, m, m, rad.
     """
     motion = motion.astype(cells.x.dtype)
     turn_cosine, turn_sine = jnp.cos(motion[2]), jnp.sin(motion[2])
@@ -247,10 +243,20 @@ def _rows(k: Array, rows: Array) -> Array:
 
 
 def excite(network: Network, activity: Array) -> Array:
-    """E *: local excitation, separable and of peak 1."""
+    """E *: local excitation of activity [H, Y, X], a separable convolution of peak 1 along each ring."""
     heading = network.excite_heading * activity.shape[0] / (2 * np.pi)
     for axis, sd in ((0, heading), (1, network.excite), (2, network.excite)):
-        activity = _convolve(activity, axis, excitation(sd, activity.shape[axis]))
+        size = activity.shape[axis]
+        weights = excitation(sd, size)
+        reach = len(weights) // 2
+        end = lax.slice_in_dim(activity, size - reach, size, axis=axis)
+        begin = lax.slice_in_dim(activity, 0, reach, axis=axis)
+        padded = lax.optimization_barrier(jnp.concatenate([end, activity, begin], axis=axis))
+        parts = [
+            np.float32(weight) * lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(weights)
+        ]
+        activity = reduce(jnp.add, parts)
     return activity
 
 
@@ -282,19 +288,6 @@ def packets(network: Network, belief: Belief, poses: np.ndarray, turns: np.ndarr
     return found
 
 
-def _convolve(activity: Array, axis: int, weights: np.ndarray) -> Array:
-    """The activity convolved along a ring."""
-    reach, size = len(weights) // 2, activity.shape[axis]
-    end = lax.slice_in_dim(activity, size - reach, size, axis=axis)
-    begin = lax.slice_in_dim(activity, 0, reach, axis=axis)
-    padded = lax.optimization_barrier(jnp.concatenate([end, activity, begin], axis=axis))
-    parts = [
-        np.float32(weight) * lax.slice_in_dim(padded, k, k + size, axis=axis)
-        for k, weight in enumerate(weights)
-    ]
-    return reduce(jnp.add, parts)
-
-
 def sides_for(network: Network, poses: np.ndarray) -> tuple[int, int]:
     """Cells along x and along y for a map with keyframes at poses [N, 3], N >= 0, by doubling."""
     extent = np.ptp(poses[:, :2], axis=0) if len(poses) else np.zeros(2)
@@ -304,20 +297,24 @@ def sides_for(network: Network, poses: np.ndarray) -> tuple[int, int]:
     return x, y
 
 
-def merge_rows(belief: Belief, merged: MergedRows) -> Belief:
+def merge_rows(belief: Belief, onto: np.ndarray, offset: np.ndarray) -> Belief:
     """The mass of merged keyframes at those they are merged with; at the opposite shift if they face the
-    other way. The pose cells follow when they are anchored again."""
+    other way. The pose cells follow when they are anchored again.
+
+    Args:
+        onto, offset: [N] and [N, 3], see `ratslam.recall.memory.MergedRows`.
+    """
     mass = np.asarray(belief.mass)
     if not mass.size:
         return belief
     moved = np.zeros_like(mass)
-    turned = (np.cos(merged.offset[:, 2]) < 0) & (len(mass) > 1)
+    turned = (np.cos(offset[:, 2]) < 0) & (len(mass) > 1)
     for shift in range(len(mass)):
         for rows, target in (
             (np.flatnonzero(~turned), shift),
             (np.flatnonzero(turned), len(mass) - 1 - shift),
         ):
-            np.add.at(moved[target], merged.onto[rows], mass[shift, rows])
+            np.add.at(moved[target], onto[rows], mass[shift, rows])
     return belief._replace(mass=jnp.array(moved))
 
 

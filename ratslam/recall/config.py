@@ -78,10 +78,3 @@ def sector_shifts(config: RecallConfig) -> np.ndarray:
         return np.arange(2 if config.shifts and config.images == "heights" else 1, dtype=np.int32)
     reach = 0 if config.sector_fov == "none" else config.shifts
     return np.arange(-reach, reach + 1, dtype=np.int32)
-
-
-def fan_width(config: RecallConfig) -> float | None:
-    """Field of view of the sectors, rad; 0: to be estimated; None: the views are not ordered sectors."""
-    if isinstance(config.sector_fov, str):
-        return 0.0 if config.sector_fov == "auto" else None
-    return config.sector_fov

@@ -23,7 +23,7 @@ from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import BASIN, SUPPORT, Belief, ViewCells
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import Memory, allowed_shifts, current_pose, pose_spread, recallable
+from ratslam.recall.memory import Memory
 from ratslam.recall.observation_model import SAMPLES, ObservationLikelihood
 from tactile.base.se2 import wrap
 from tactile.base.types import Array
@@ -67,24 +67,38 @@ def recognise(
 ) -> tuple[Belief, RecallResult]:
     """Updates the belief for a new keyframe, and finds the best candidate.
 
+    One update of a hidden Markov model whose states are the view cells (k, s) and novelty, as the equations
+    of `ratslam.network.pose_cells` have it: the prior moves with the odometry, each view cell is weighed by
+    the likelihood of the view there, and the sum is normalised (Bayesian localisation, Fox et al. 1999).
+
     Args:
-        network: the size of its cells is the unit of all lengths in `config`. motion: [3] odometry since the
-            last update, m, m, rad. local: share of what enters anew that is put around the map's pose.
+        network: the size of its cells is the unit of all lengths in `config`. memory: C keyframes with their
+            poses in the map, m, m, rad.
+        belief: after the last update. motion: [3] odometry since then, m, m, rad.
+        observation: likelihood l_ks [S or 1, C] of the view at each shift and keyframe, and l_new.
+        local: share of what enters anew that is put around the map's pose.
+
+    Returns:
+        the belief after the view, with mass [S, C] of the view cells; the candidate for a loop closure.
     """
     cell, shifts = network.cells.cell_size, sector_shifts(config)
     cells = view_cells(config, memory)
-    known, certain, novelty = recallable(config, memory), observation.certain, observation.novelty
+    known, certain, novelty = memory.recallable(config), observation.certain, observation.novelty
     likelihood = jnp.where(known[None], observation.likelihood, 0.0)
 
+    # Prior: mass that odometry leads to each view cell, and mass e that enters anew from novelty.
     moved, lost = pose_cells.predict(network, belief, cells, motion)
     fresh = jnp.maximum(1 - jnp.sum(belief.activity), 0.0)
     entered = fresh * config.enter * _entry(config, cell, memory, cells, local)
     arrived, dtype = fresh + lost - jnp.sum(entered), memory.x.dtype
+    # v_ks = l_ks [(1 - leak) (K'Y)_ks + e_ks] and n = l_new (novelty that stays + mass that found no view
+    # cell), both divided by their sum; then A = K v.
     mass, novel = pose_cells.inhibit(
         likelihood * (moved + entered).astype(dtype), novelty * arrived.astype(dtype)
     )
     belief = pose_cells.anchor(network, belief, cells, mass)
 
+    # The heaviest packet, and the heaviest apart from it.
     match = _peak(jnp.max(mass, axis=0))
     shift = _peak(mass[:, match])
     basin = _basin(cell, memory, match)
@@ -92,9 +106,13 @@ def recognise(
     others = jnp.where(basin, 0.0, jnp.sum(mass, axis=0))
     second = jnp.sum(jnp.where(_basin(cell, memory, _peak(others)), others, 0.0))
     gain = jnp.log(jnp.where(certain, jnp.broadcast_to(likelihood, mass.shape)[shift, match], 1.0) / novelty)
-    near = known & _is_here(cell, memory, current_pose(memory))
+    # Does the view fit where the map says that the robot is: within a cell, facing alike?
+    here = memory.current_pose()
+    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
+    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
+    near = known & ((apart < cell**2) & facing)
     best = jnp.max(jnp.where(near, jnp.max(likelihood, axis=0), 0.0))
-    told = certain & observation.informative & jnp.any(near)
+    is_informative = certain & observation.informative & jnp.any(near)
     found = certain & (packet > 0)
     return belief, RecallResult(
         keyframe=memory.count,
@@ -104,20 +122,20 @@ def recognise(
         second=jnp.where(certain, second, 0.0),
         log_ratio=jnp.where(found, gain, 0.0),
         novelty=jnp.where(certain, novel, 1.0),
-        view_fits=jnp.where(told, (best >= novelty).astype(jnp.int32), -1),
+        view_fits=jnp.where(is_informative, (best >= novelty).astype(jnp.int32), -1),
         background=observation.background,
     )
 
 
 def view_cells(config: RecallConfig, memory: Memory) -> ViewCells:
-    """The view cells of a memory: one for each keyframe and sector shift; in single precision, as the pose
-    cells are."""
+    """The view cells [S, C] of a memory: one for each keyframe k and sector shift s, at the pose p_ks of a
+    robot that sees the view of k shifted by s sectors; in single precision, as the pose cells are."""
     shifts, single = sector_shifts(config), jnp.float32
     angles = (-shifts.astype(memory.angle.dtype) * memory.angle).astype(single)  # of the robot
     rows = memory.x, memory.y, memory.heading, memory.cosine, memory.sine
     x, y, heading, own_cosine, own_sine = (values.astype(single)[None] for values in rows)
     cosine, sine = jnp.cos(angles)[:, None], jnp.sin(angles)[:, None]
-    used = allowed_shifts(shifts, memory)[:, None] & recallable(config, memory)[None]
+    used = memory.allowed_shifts(shifts)[:, None] & memory.recallable(config)[None]
     return ViewCells(
         x=jnp.broadcast_to(x, used.shape),
         y=jnp.broadcast_to(y, used.shape),
@@ -138,9 +156,9 @@ def place_of(memory: Memory, result: RecallResult) -> Array:
 def _entry(
     config: RecallConfig, cell: float, memory: Memory, cells: ViewCells, local: Array | float
 ) -> Array:
-    """[S, C] shares of what enters anew: spread over all view cells, and around the map's pose."""
-    here = current_pose(memory).astype(cells.x.dtype)
-    sd, sd_heading = (spread.astype(cells.x.dtype) for spread in pose_spread(config, cell, memory))
+    """[S, C] shares of what enters anew, e_ks / sum e: over all view cells, and around the map's pose."""
+    here = memory.current_pose().astype(cells.x.dtype)
+    sd, sd_heading = (spread.astype(cells.x.dtype) for spread in memory.pose_spread(config, cell))
     apart = ((cells.x - here[0]) ** 2 + (cells.y - here[1]) ** 2) / sd**2
     facing = cells.cosine * jnp.cos(here[2]) + cells.sine * jnp.sin(here[2])
     inside = jnp.maximum(1 - (apart + (2 / sd_heading**2) * (1 - facing)) / SUPPORT, 0.0)
@@ -154,13 +172,6 @@ def _entry(
 def _basin(cell: float, memory: Memory, row: Array) -> Array:
     """[C] whether each keyframe is in the packet of one."""
     return (memory.x - memory.x[row]) ** 2 + (memory.y - memory.y[row]) ** 2 < (BASIN * cell) ** 2
-
-
-def _is_here(cell: float, memory: Memory, here: Array) -> Array:
-    """[C] whether each keyframe is within a cell of the pose `here` [3] and faces alike."""
-    apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
-    facing = memory.cosine * jnp.cos(here[2]) + memory.sine * jnp.sin(here[2]) > FACING
-    return (apart < cell**2) & facing
 
 
 def empty_result(memory: Memory) -> RecallResult:

@@ -1,4 +1,11 @@
-"""The memory of recall: all keyframes, and the map's feedback."""
+"""The memory of recall: a view cell for every keyframe, and what it takes over from the map.
+
+Each keyframe keeps the view and the pose in the map at which it was stored, as the view templates of RatSLAM
+keep a view and the packet's pose (Milford & Wyeth 2004; Ball et al. 2013, section 3). Between keyframes the
+odometry adds up; when it is long enough, the next view becomes a keyframe (`is_keyframe_due`). Where
+keyframes are is decided by the map: its poses and what it has learned of the sensors come back as
+`MapFeedback`.
+"""
 
 from __future__ import annotations
 
@@ -94,6 +101,95 @@ class Memory(NamedTuple):
     likeness: Array
     before: Array
 
+    def recallable(self, config: RecallConfig) -> Array:
+        """[C] bool, the keyframes that may be recalled."""
+        return jnp.arange(self.label.shape[0], dtype=jnp.int32) < self.count - config.guard
+
+    def allowed_shifts(self, shifts: np.ndarray) -> Array:
+        """[S] bool, the shifts to compare: all once the sectors are known to be ordered, else 0 alone."""
+        return (shifts == 0) | (self.angle != 0)
+
+    def corrected_motion(self) -> Array:
+        """[3] motion since the newest keyframe without the systematic errors of the odometry."""
+        return correct_heading(self.motion, self.length, self.bias, self.turn_error)
+
+    def current_pose(self) -> Array:
+        """[3] the robot's pose in the map at the last feedback, moved on by odometry."""
+        return compose(self.pose, self.corrected_motion())
+
+    def pose_spread(self, config: RecallConfig, cell: float) -> tuple[Array, Array]:
+        """Standard deviation of the current pose: position, m, and heading, rad."""
+        since = self.since + self.length
+        return (
+            config.local_sd * cell + config.local_rate * since,
+            config.local_heading + config.local_heading_rate / cell * since,
+        )
+
+    def store_keyframe(self, view: Array, label: Array) -> Memory:
+        """Stores the newest view as a keyframe at the robot's current pose.
+
+        Args:
+            view: [D] or more values as they are compared, those beyond D are not stored. label: int32 place
+                id, -1 for none.
+        """
+        row, pose = self.count, self.current_pose()
+        zero = jnp.zeros_like(self.length)
+        known = jnp.any(self.label == label) | (label < 0)
+        return self._replace(
+            view=self.view.at[:, row].set(view[: self.view.shape[0]]),
+            label=self.label.at[row].set(label),
+            x=self.x.at[row].set(pose[0]),
+            y=self.y.at[row].set(pose[1]),
+            heading=self.heading.at[row].set(pose[2]),
+            cosine=self.cosine.at[row].set(jnp.cos(pose[2])),
+            sine=self.sine.at[row].set(jnp.sin(pose[2])),
+            count=self.count + 1,
+            distinct=self.distinct + (~known).astype(jnp.int32),
+            pose=pose,
+            motion=jnp.zeros_like(self.motion),
+            since=self.since + self.length,
+            length=zero,
+            turn=zero,
+        )
+
+    def pack_feedback(self, feedback: MapFeedback) -> tuple[np.ndarray, np.ndarray, Array]:
+        """The feedback of a map of a keyframe or more, in arrays of fixed shapes; copied, because the map
+        changes its arrays in place.
+
+        Returns:
+            rows [5, C]: x, y, heading, its cosine and sine of all keyframes, 0 after the last; values [8]:
+            pose of the newest keyframe, bias, turn error, distance, angle, scale; likeness: see
+            `MapFeedback`.
+        """
+        dtype, count = self.x.dtype, len(feedback.poses)
+        newest = feedback.poses[-1] if feedback.start is None else feedback.start
+        rows = np.zeros((5, self.x.shape[0]), dtype)
+        x, y, heading = feedback.poses.T
+        rows[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
+        rest = feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale
+        likeness = np.array(feedback.likeness, dtype) if feedback.likeness.size else self.likeness
+        return rows, np.array([*newest, *rest], dtype), likeness
+
+    def take_feedback(self, feedback: tuple[Array, Array, Array]) -> Memory:
+        """The memory with the map's current poses and view metric, packed by `pack_feedback`."""
+        (x, y, heading, cosine, sine), values, likeness = feedback
+        bias, turn_error, since, angle, scale = values[3:]
+        return self._replace(
+            x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=values[:3],
+            bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=likeness,
+        )  # fmt: skip
+
+    def first_keyframes(self, count: int) -> Memory:
+        """The memory as if it held only its first `count` keyframes, and had seen no view before."""
+        label = np.array(self.label)
+        label[count:] = -1
+        return self._replace(
+            count=jnp.int32(count),
+            label=jnp.asarray(label),
+            distinct=jnp.int32(len(np.unique(label[label >= 0]))),
+            before=jnp.zeros_like(self.before),
+        )
+
 
 def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
     """A memory without keyframes.
@@ -142,47 +238,12 @@ def begin_piece(memory: Memory) -> Memory:
     )
 
 
-class PackedFeedback(NamedTuple):
-    """`MapFeedback` in arrays of fixed shapes.
-
-    Attributes:
-        rows: [5, C] x, y, heading, its cosine and sine of all keyframes, 0 after the last. values: [8] pose
-            of the newest keyframe, bias, turn error, distance, angle, scale. likeness: see `MapFeedback`.
-    """
-
-    rows: Array
-    values: Array
-    likeness: Array
-
-
-def pack_feedback(memory: Memory, feedback: MapFeedback) -> PackedFeedback:
-    """The feedback of a map of a keyframe or more, for a memory; copied, because the map changes its arrays
-    in place."""
-    dtype, count = memory.x.dtype, len(feedback.poses)
-    newest = feedback.poses[-1] if feedback.start is None else feedback.start
-    rows = np.zeros((5, memory.x.shape[0]), dtype)
-    x, y, heading = feedback.poses.T
-    rows[:, :count] = x, y, heading, np.cos(heading), np.sin(heading)
-    rest = feedback.bias, feedback.turn_error, feedback.since, feedback.angle, feedback.scale
-    likeness = np.array(feedback.likeness, dtype) if feedback.likeness.size else memory.likeness
-    return PackedFeedback(rows, np.array([*newest, *rest], dtype), likeness)
-
-
-def take_feedback(memory: Memory, feedback: PackedFeedback) -> Memory:
-    """The memory with the map's current poses and view metric."""
-    x, y, heading, cosine, sine = feedback.rows
-    bias, turn_error, since, angle, scale = feedback.values[3:]
-    return memory._replace(
-        x=x, y=y, heading=heading, cosine=cosine, sine=sine, pose=feedback.values[:3],
-        bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=feedback.likeness,
-    )  # fmt: skip
-
-
 def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
     """The memory with the feedback of a map, of an empty one as it is."""
     if not len(feedback.poses):
         return memory
-    return take_feedback(memory, PackedFeedback(*map(jnp.asarray, pack_feedback(memory, feedback))))
+    rows, values, likeness = memory.pack_feedback(feedback)
+    return memory.take_feedback((jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
 
 
 def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
@@ -216,7 +277,11 @@ def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
 
 
 def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
-    """Adds body-frame motion [3] (m, m, rad) to the odometry since the newest keyframe."""
+    """Adds body-frame motion to the odometry since the newest keyframe (path integration between views).
+
+    Args:
+        odometry: [3] of one step, m, m, rad.
+    """
     return memory._replace(
         motion=compose(memory.motion, odometry),
         length=memory.length + jnp.hypot(odometry[0], odometry[1]),
@@ -225,7 +290,11 @@ def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
 
 
 def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
-    """bool: the present view becomes a keyframe, because the robot has moved far enough."""
+    """bool: the present view becomes a keyframe, because the robot has moved far enough.
+
+    Args:
+        cell: side of a pose cell, m: the unit of the lengths in `config`.
+    """
     moved = is_motion_due(config, cell, memory)
     return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
 
@@ -233,58 +302,6 @@ def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
 def is_motion_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
     """bool: the robot has moved so far since the newest keyframe that a view is compared again."""
     return (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
-
-
-def current_pose(memory: Memory) -> Array:
-    """[3] the robot's pose in the map at the last feedback, moved on by odometry."""
-    return compose(memory.pose, corrected_motion(memory))
-
-
-def corrected_motion(memory: Memory) -> Array:
-    """[3] motion since the newest keyframe without the systematic errors of the odometry."""
-    return correct_heading(memory.motion, memory.length, memory.bias, memory.turn_error)
-
-
-def pose_spread(config: RecallConfig, cell: float, memory: Memory) -> tuple[Array, Array]:
-    """Standard deviation of the current pose: position, m, and heading, rad."""
-    since = memory.since + memory.length
-    return (
-        config.local_sd * cell + config.local_rate * since,
-        config.local_heading + config.local_heading_rate / cell * since,
-    )
-
-
-def store_keyframe(memory: Memory, view: Array, label: Array) -> Memory:
-    """Stores the newest view as a keyframe at the robot's current pose."""
-    row, pose = memory.count, current_pose(memory)
-    zero = jnp.zeros_like(memory.length)
-    known = jnp.any(memory.label == label) | (label < 0)
-    return memory._replace(
-        view=memory.view.at[:, row].set(view[: memory.view.shape[0]]),
-        label=memory.label.at[row].set(label),
-        x=memory.x.at[row].set(pose[0]),
-        y=memory.y.at[row].set(pose[1]),
-        heading=memory.heading.at[row].set(pose[2]),
-        cosine=memory.cosine.at[row].set(jnp.cos(pose[2])),
-        sine=memory.sine.at[row].set(jnp.sin(pose[2])),
-        count=memory.count + 1,
-        distinct=memory.distinct + (~known).astype(jnp.int32),
-        pose=pose,
-        motion=jnp.zeros_like(memory.motion),
-        since=memory.since + memory.length,
-        length=zero,
-        turn=zero,
-    )
-
-
-def recallable(config: RecallConfig, memory: Memory) -> Array:
-    """[C] bool, the keyframes that may be recalled."""
-    return jnp.arange(memory.label.shape[0], dtype=jnp.int32) < memory.count - config.guard
-
-
-def allowed_shifts(shifts: np.ndarray, memory: Memory) -> Array:
-    """[S] bool, the shifts to compare: all once the sectors are known to be ordered, else 0 alone."""
-    return (shifts == 0) | (memory.angle != 0)
 
 
 class CroppedRows(NamedTuple):
@@ -346,15 +363,3 @@ def frozen_memory(
         distinct=jnp.int32(len(np.unique(labels[labels >= 0]))),
     )
     return apply_map_feedback(filled, feedback)
-
-
-def first_keyframes(memory: Memory, count: int) -> Memory:
-    """The memory as if it held only its first `count` keyframes, and had seen no view before."""
-    label = np.array(memory.label)
-    label[count:] = -1
-    return memory._replace(
-        count=jnp.int32(count),
-        label=jnp.asarray(label),
-        distinct=jnp.int32(len(np.unique(label[label >= 0]))),
-        before=jnp.zeros_like(memory.before),
-    )

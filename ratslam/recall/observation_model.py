@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import Memory, allowed_shifts, current_pose, recallable
+from ratslam.recall.memory import Memory
 from ratslam.recall.signed_likelihood import log_odds, project, unpack
 from ratslam.recall.whisker_likelihood import PixelLayout
 from tactile.base.types import Array
@@ -44,7 +44,7 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
     """Likelihood of a view [D]. Novelty contains the mean over all keyframes, so that a view similar to many
     places is little evidence for any of them."""
     error = _errors(sector_shifts(config), memory, view)
-    frames = recallable(config, memory)
+    frames = memory.recallable(config)
     width = config.sharpness * memory.scale
     known = width > jnp.finfo(width.dtype).tiny
     width = jnp.where(known, width, 1.0)
@@ -54,7 +54,7 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
     floor = jnp.exp(-config.floor * memory.scale / width)
     novelty = config.common * mean + config.fresh * floor
     away = jnp.maximum(3 * cell, 3 * (0.5 * cell + 0.05 * (memory.since + memory.length)))
-    here = current_pose(memory)
+    here = memory.current_pose()
     apart = (memory.x - here[0]) ** 2 + (memory.y - here[1]) ** 2
     return ObservationLikelihood(
         likelihood=jnp.where(known, likelihood, 1.0),
@@ -96,7 +96,7 @@ def _weigh(config: RecallConfig, memory: Memory, odds: Array) -> tuple[Memory, O
     The likelihood at a new place is that at the successors of keyframes similar to the previous image,
     because images in corridors change alike.
     """
-    frames = recallable(config, memory)
+    frames = memory.recallable(config)
     certain = (memory.scale != 0) & jnp.any(frames)
     likelihood = jnp.where(frames[None] & certain, jnp.exp(odds), 0.0)
     expected = jnp.where(frames[None], _successors(memory.before), 0.0)
@@ -143,7 +143,7 @@ def label_likelihood(config: RecallConfig, memory: Memory, label: Array) -> Obse
         likelihood=(likelihood**LABEL_TEMPER)[None],
         novelty=novelty**LABEL_TEMPER,
         background=jnp.full(SAMPLES, jnp.nan, memory.x.dtype),
-        certain=jnp.any(recallable(config, memory)),
+        certain=jnp.any(memory.recallable(config)),
         informative=known,
     )
 
@@ -176,7 +176,7 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
         # An explicit sum makes one pass over the keyframes; a reduction takes twice as long.
         apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
         rows.append(apart / len(stored))
-    return jnp.where(allowed_shifts(shifts, memory)[:, None], jnp.stack(rows), jnp.inf)
+    return jnp.where(memory.allowed_shifts(shifts)[:, None], jnp.stack(rows), jnp.inf)
 
 
 def _background(error: Array, away: Array) -> Array:

@@ -207,7 +207,9 @@ def calibrate(same: np.ndarray, weights: np.ndarray, different: np.ndarray) -> C
         return PRIOR
     from scipy.optimize import minimize  # slow to import, and only signed images need it
 
-    prior, sd, weight = _free(PRIOR), np.array(PRIOR_SD), weights.sum() / len(different)
+    # Numbers without bounds: the logarithm of the temper, the offset, the log-odds of the shares.
+    prior = np.array([np.log(PRIOR.temper), PRIOR.offset, logit(PRIOR.outliers), logit(PRIOR.common)])
+    sd, weight = np.array(PRIOR_SD), weights.sum() / len(different)
 
     def cost(free: np.ndarray) -> float:
         found = _bound(free)
@@ -217,12 +219,6 @@ def calibrate(same: np.ndarray, weights: np.ndarray, different: np.ndarray) -> C
 
     limits = np.column_stack([prior - LIMIT * sd, prior + LIMIT * sd])
     return _bound(minimize(cost, prior, method="L-BFGS-B", bounds=limits).x)
-
-
-def _free(calibration: Calibration) -> np.ndarray:
-    """[4] the calibration as numbers without bounds."""
-    temper, offset, outliers, common = calibration
-    return np.array([np.log(temper), offset, logit(outliers), logit(common)])
 
 
 def _bound(free: np.ndarray) -> Calibration:

@@ -2,7 +2,7 @@
 
 A pixel is silent, dead, or has one of 30 heights. Its log-odds depend on how often whiskers are in contact,
 on which heights are common (both counted over all images), and on the variation between two visits to a place
-(from pairs of images that the map has confirmed, with a prior). No ground truth is used; the model is ours.
+(from pairs of images that the map has confirmed, with a prior). No ground truth is used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compilation import compiled
 from tactile.base.types import Array, Observation
 
 LEVELS = 32
@@ -100,20 +99,12 @@ class Background(NamedTuple):
 
 def estimate_background(images: np.ndarray, group: np.ndarray) -> Background:
     """The distribution in images [N, D] of levels, with pixels in groups [D]."""
-    count = _count_levels(images, group, int(group.max()) + 1)
+    groups = int(group.max()) + 1
+    cell = (group * LEVELS + images).reshape(-1)
+    count = np.bincount(cell, minlength=groups * LEVELS).reshape(groups, LEVELS)
     silent, contact = count[:, 0], count[:, 1:DEAD]
     touching = (contact.sum(axis=1) + 1.0) / (silent + contact.sum(axis=1) + 4.0)
     return Background(touching, (contact + 1.0) / (contact + 1.0).sum(axis=1, keepdims=True))
-
-
-@compiled
-def _count_levels(images: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """[groups, LEVELS] number of pixels of images [N, D] by group [D] and level."""
-    count = np.zeros((groups, LEVELS), np.int64)
-    for n in range(len(images)):
-        for d in range(len(group)):
-            count[group[d], images[n, d]] += 1
-    return count
 
 
 def estimate_variation(now: np.ndarray, then: np.ndarray) -> Variation:

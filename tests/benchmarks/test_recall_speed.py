@@ -19,7 +19,6 @@ from ratslam.recall.memory import (
     MapFeedback,
     accumulate_motion,
     apply_map_feedback,
-    corrected_motion,
     init_memory,
 )
 
@@ -60,7 +59,7 @@ def test_one_recall(benchmark, frames, shifts, dtype):
         def recall(k, carry):
             memory, belief = carry
             memory = accumulate_motion(memory, moved)
-            motion = corrected_motion(memory)
+            motion = memory.corrected_motion()
             weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
             belief, _ = recognise(config, network, memory, belief, motion, weighed, config.local)
             zero = jnp.zeros_like(memory.length)

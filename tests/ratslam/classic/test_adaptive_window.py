@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic import excitation_inhibition as window
 from ratslam.classic import levels, pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
+from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.levels import StepInput, step_at, to_full_torus, window_levels
 from tactile.base.types import Odometry
 
@@ -56,7 +56,7 @@ def compare(n, motion, recall, energy):
         for config in (moving, dense)
     )
     ring = rings(moving, np.dtype(float))
-    assert np.abs(window.ring_difference(np.asarray(pose) - np.asarray(whole_pose), ring)).max() <= 1e-12
+    assert np.abs(ring_difference(np.asarray(pose) - np.asarray(whole_pose), ring)).max() <= 1e-12
     assert np.nanmax(np.abs(np.asarray(spread) - np.asarray(whole_spread))) <= 1e-9
     assert np.array_equal(outcome, whole_outcome)
     assert not np.any(whole_level)
@@ -147,9 +147,7 @@ def test_activity_is_the_same_at_any_level(where):
     whole = levels.to_full_torus(sizes, small)
     assert float(whole.sum()) == pytest.approx(1)
     for k in range(1, len(sizes)):
-        block = levels.block_at(
-            sizes, k, small, window.origin_centred_on(sizes[k].window, jnp.asarray(where))
-        )
+        block = levels.block_at(sizes, k, small, sizes[k].window.origin_centred_on(jnp.asarray(where)))
         held = small._replace(
             blocks=tuple(block if j == k else b for j, b in enumerate(small.blocks)), level=jnp.int32(k)
         )

@@ -47,7 +47,7 @@ def alone(config: NetworkConfig, given: Course, factor: float) -> np.ndarray:
 def test_parameter_sets_are_networks_of_those_parameters(block):
     given, sets = course(1), [(0.9, 2.3, 1e-5, 1.0), (1.2, 1.8, 3e-5, 2.0), (1.0, 2.0, 2e-5, 1.0)]
     columns = Network(*(jnp.asarray(column) for column in zip(*sets, strict=True)))
-    track = networks(CONFIG, columns, given, block)
+    pose, _, level = networks(CONFIG, columns, given, block)
     for k, (excite, inhibit, threshold, factor) in enumerate(sets):
         # The dense engine gives the same steps (test_adaptive_window) and compiles sooner.
         config = CONFIG.model_copy(
@@ -56,12 +56,10 @@ def test_parameter_sets_are_networks_of_those_parameters(block):
                 "engine": "dense",
             }
         )  # fmt: skip
-        gap = ring_difference(
-            np.asarray(track.pose[k]) - alone(config, given, factor), np.array([[21, 21, 36]])
-        )
+        gap = ring_difference(np.asarray(pose[k]) - alone(config, given, factor), np.array([[21, 21, 36]]))
         assert np.abs(gap).max() <= 1e-9
-    assert np.asarray(track.level[:, 30]).min() > 0
-    assert not np.any(track.level[:, :30])
+    assert np.asarray(level[:, 30]).min() > 0
+    assert not np.any(level[:, :30])
 
 
 @pytest.mark.soak

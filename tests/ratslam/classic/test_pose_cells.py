@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic import excitation_inhibition as window
 from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
-from ratslam.classic.excitation_inhibition import ring_difference
-from ratslam.classic.levels import StepInput, from_full_torus, step_at, to_full_torus, window_levels
+from ratslam.classic.excitation_inhibition import make_window, ring_difference
+from ratslam.classic.levels import Activity, Block, StepInput, step_at, to_full_torus, window_levels
 from ratslam.classic.pose_cells import Outcome
 from tactile.base.se2 import integrate
 from tactile.base.types import Odometry
@@ -63,7 +62,9 @@ def go(motion, cells=None, injections=None, config=CONFIG, dtype=float):
 
 def with_activity(cells, activity):
     """The state with the activity [K, N, N] of the whole torus replaced."""
-    return cells._replace(activity=from_full_torus(window_levels(CONFIG, cells.pose.dtype), activity))
+    whole = Block(activity[None], jnp.zeros((1, 3), jnp.int32))
+    below = cells.activity.blocks[:-1]
+    return cells._replace(activity=Activity((*below, whole), jnp.int32(len(below))))
 
 
 @jax.jit
@@ -72,8 +73,8 @@ def whole(cells):
 
 
 def deposited(activity, at, energy):
-    torus = window.make_window(CONFIG, None, np.dtype(float))
-    return window.deposit(torus, activity, jnp.zeros(3, jnp.int32), at, jnp.asarray(energy))
+    torus = make_window(CONFIG, None, np.dtype(float))
+    return torus.deposit(activity, jnp.zeros(3, jnp.int32), at, jnp.asarray(energy))
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +178,7 @@ def test_uniform_activity_dies_out_and_is_reseeded(settled, level):
 def test_a_deposit_between_cells_is_excited_like_one_on_a_cell(share):
     """The peak of a deposit at its own point, read off between cells, does not depend on where it falls."""
     pose = jnp.asarray([10.0, 10.0, 18.0]) + jnp.asarray(share)
-    energy = window.deposit_gain(window.make_window(CONFIG, None, np.dtype(float)), pose)
+    energy = make_window(CONFIG, None, np.dtype(float)).deposit_gain(pose)
     assert 1 - 1e-9 <= float(energy) <= 1.5
     total = float(deposited(jnp.zeros((36, 21, 21)), pose % RINGS, 1.0).sum())
     assert total == pytest.approx(1)
@@ -202,9 +203,9 @@ def test_the_torus_has_no_edge(shift):
 @pytest.mark.parametrize("n", [11, 17, 18, 21, 22, 23, 41])
 def test_excitation_and_inhibition_are_the_same_everywhere(n):
     """Rings are computed in different ways by size, and none may show where it begins."""
-    torus = window.make_window(NetworkConfig(cells_xy=n), None, np.dtype(float))
+    torus = make_window(NetworkConfig(cells_xy=n), None, np.dtype(float))
     activity = np.random.default_rng(n).random((36, n, n)) ** 8
-    compute = jax.jit(partial(window.excite_and_inhibit, torus))
+    compute = jax.jit(torus.excite_and_inhibit)
     here = compute(activity)
     assert np.any(np.asarray(here)[:, :, [0, -1]] > 0)
     for shift in ((0, 0, 1), (0, 0, n // 2), (5, 7, 3)):

@@ -11,7 +11,7 @@ import jax
 import pytest
 
 from ratslam.core import compilation
-from ratslam.core.compilation import FOLDER, cache_settings, keep_kernels, processor_name
+from ratslam.core.compilation import FOLDER, cache_settings, keep_kernels
 
 ROOT = Path(__file__).parents[3]
 
@@ -25,16 +25,20 @@ def settings():
         jax.config.update(name, value)
 
 
+def folder() -> str | int:
+    return cache_settings()[FOLDER]
+
+
 def test_another_processor_has_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = [processor_name()]
+    names = [folder()]
     for text in ("flags : sse avx\n", "flags : sse\n", "Features : neon\n", ""):
         monkeypatch.setattr(compilation, "CPUINFO", tmp_path / f"cpuinfo{len(names)}")
         compilation.CPUINFO.write_text(f"model : one\n{text}processor : 1\n")
-        names.append(processor_name())
-        assert processor_name() == names[-1]
+        names.append(folder())
+        assert folder() == names[-1]
     assert len(set(names)) == len(names)
     monkeypatch.setattr(compilation, "CPUINFO", tmp_path / "none")
-    assert processor_name() == names[-1]  # where the system does not tell
+    assert folder() == names[-1]  # where the system does not tell
 
 
 def test_a_program_keeps_its_own_folder(settings) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from ratslam.core.estimates import Action, Estimate, GridDrawing, Localisation
-from ratslam.grid.localiser import UNEXPLAINED, GridLocaliser, SavedGrid
+from ratslam.grid.localiser import UNEXPLAINED, GridLocaliser
 from tests.helpers.grid_world import report
 
 NEEDED = 10.0
-SAVED = SavedGrid(GridDrawing(np.full((4, 4), 0.5), np.zeros(2), 0.1), np.zeros((3, 3)))
+SAVED = GridDrawing(np.full((4, 4), 0.5), np.zeros(2), 0.1), np.zeros((3, 3))
 BLANK = Estimate(*(np.float32(0) for _ in Estimate._fields))._replace(pose=np.zeros(3))
 SEARCHING, FOUND, LOST, NOT_THIS_MAP = Localisation
 
@@ -30,7 +30,7 @@ SURE, TORN, WEAK, FAILED = Planted(1.0, 11.0), Planted(0.9, 11.0), Planted(1.0, 
 
 
 def states(*planted, known=False):
-    localiser = GridLocaliser(SAVED, NEEDED, known)
+    localiser = GridLocaliser(*SAVED, NEEDED, known)
     for evidence in planted:
         localiser.update(report(0.05), BLANK, evidence)
     return localiser, localiser.states().tolist()
@@ -64,7 +64,7 @@ def test_the_mass_is_a_probability_and_half_where_evidence_just_suffices():
 
 
 def test_the_estimate_is_that_of_the_map():
-    localiser = GridLocaliser(SAVED, NEEDED)
+    localiser = GridLocaliser(*SAVED, NEEDED)
     found = localiser.update(report(0.05), BLANK, SURE)
     assert found.pose.tolist() == SURE.pose.tolist()
     assert found.spread.tolist() == pytest.approx([0.01, 0.02, 0.1])
@@ -73,7 +73,7 @@ def test_the_estimate_is_that_of_the_map():
 
 def test_a_restored_session_is_the_same_and_only_in_its_own_map(tmp_path):
     localiser, _ = states(WEAK, SURE, FAILED)
-    again = GridLocaliser(SAVED, NEEDED)
+    again = GridLocaliser(*SAVED, NEEDED)
     again.restore(localiser.arrays())
     for one in (localiser, again):
         one.update(report(0.05), BLANK, SURE)
@@ -82,4 +82,4 @@ def test_a_restored_session_is_the_same_and_only_in_its_own_map(tmp_path):
     with (tmp_path / "True.csv").open() as file:
         assert [row["state"] for row in csv.DictReader(file)] == ["searching", "found", "lost", "found"]
     with pytest.raises(ValueError, match="another map"):
-        GridLocaliser(SAVED._replace(digest=np.ones((3, 3))), NEEDED).restore(localiser.arrays())
+        GridLocaliser(SAVED[0], np.ones((3, 3)), NEEDED).restore(localiser.arrays())

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.grid.config import GridConfig
-from ratslam.grid.expectation import CROSSINGS, TIPS, UNEXPLORED, Surfaces, draw_surfaces, expect
+from ratslam.grid.expectation import CROSSINGS, TIPS, UNEXPLORED, Expectation, Surfaces, draw_surfaces
 from ratslam.grid.localiser import CONTACT, FREE, counted_agreement
 from ratslam.grid.map import contact_log
 from tactile.base.se2 import compose
@@ -63,7 +63,7 @@ def wall_at(x):
 
 
 def classes(surfaces, pose):
-    return np.asarray(expect(surfaces, FEELERS, CONFIG.body).whisker_classes(jnp.asarray([pose])))[0]
+    return np.asarray(Expectation(surfaces, FEELERS, CONFIG.body).whisker_classes(jnp.asarray([pose])))[0]
 
 
 def test_a_nearer_wall_is_met_earlier_along_the_whisker():
@@ -87,7 +87,7 @@ def test_nothing_is_known_outside_the_map():
 
 def test_contradictions_count_most():
     """A contact in free space speaks against a pose more than any agreement speaks for it."""
-    odds = counted_agreement().odds
+    odds = counted_agreement()["odds"]
     nowhere = (CROSSINGS - 1) * TIPS
     assert odds[CONTACT, nowhere] < -3
     assert odds[:, TIPS:].max() < 3

@@ -115,7 +115,7 @@ def test_mass_goes_to_the_row_and_direction_of_the_merged_keyframe(seed):
     count = int(stream.integers(1, rows + 1))
     merged = merge_of(stream, count)
     mass = np.array(belief.mass) * (np.arange(rows) < count)
-    after = pose_cells.merge_rows(belief._replace(mass=jnp.asarray(mass)), merged)
+    after = pose_cells.merge_rows(belief._replace(mass=jnp.asarray(mass)), merged.onto, merged.offset)
     expected = np.zeros(mass.shape)
     for row in range(count):
         for shift in range(shifts):
@@ -135,7 +135,9 @@ def test_restored_keyframes_come_back_without_mass():
     merged = MergedRows(
         np.repeat(np.arange(20), 2), np.zeros((40, 0)), np.arange(40), 2 * np.arange(20), np.zeros((20, 3))
     )
-    after = np.asarray(pose_cells.merge_rows(belief._replace(mass=jnp.asarray(mass)), merged).mass)
+    after = np.asarray(
+        pose_cells.merge_rows(belief._replace(mass=jnp.asarray(mass)), merged.onto, merged.offset).mass
+    )
     assert np.array_equal(after[:, ::2], mass[:, :20])
     assert not after[:, 1::2].any()
 
@@ -156,4 +158,5 @@ def test_mass_of_rows_that_are_gone_is_novelty(seed):
 def test_a_memory_without_view_cells_has_nothing_to_merge():
     network = network_of(12, 11)
     belief = pose_cells.start(network, (1, 0))
-    assert pose_cells.merge_rows(belief, merge_of(np.random.default_rng(0), 1)) is belief
+    merged = merge_of(np.random.default_rng(0), 1)
+    assert pose_cells.merge_rows(belief, merged.onto, merged.offset) is belief

@@ -17,7 +17,6 @@ from ratslam.recall.memory import (
     MapFeedback,
     accumulate_motion,
     apply_map_feedback,
-    corrected_motion,
     init_memory,
 )
 
@@ -97,7 +96,7 @@ def filter_of(config, cell=CELL, shape=ROW):
 
     def look(memory, belief, view):
         weighed = observation_model.view_likelihood(config, cell, memory, view)
-        return recognise(config, network, memory, belief, corrected_motion(memory), weighed, config.local)
+        return recognise(config, network, memory, belief, memory.corrected_motion(), weighed, config.local)
 
     return jax.jit(look)
 
@@ -109,7 +108,7 @@ def compile_label_filter(config):
     def read(memory, belief, label):
         weighed = observation_model.label_likelihood(config, memory, label)
         return *recognise(
-            config, network, memory, belief, corrected_motion(memory), weighed, config.local
+            config, network, memory, belief, memory.corrected_motion(), weighed, config.local
         ), weighed
 
     return jax.jit(read)

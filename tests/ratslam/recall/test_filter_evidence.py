@@ -11,7 +11,7 @@ from ratslam.core.session import Session
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend
 from ratslam.recall.filter import place_of, recognise
-from ratslam.recall.memory import accumulate_motion, corrected_motion, current_pose, store_keyframe
+from ratslam.recall.memory import accumulate_motion
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
@@ -51,7 +51,7 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     assert observe(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
     memory = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.5]))
-    memory = store_keyframe(memory, jnp.asarray(views[7]), jnp.int32(5))
+    memory = memory.store_keyframe(jnp.asarray(views[7]), jnp.int32(5))
     assert int(memory.count) == 41
     assert np.array_equal(memory.view[:, 40], views[7])
     assert (int(memory.label[40]), int(memory.distinct)) == (5, 1)
@@ -131,7 +131,7 @@ BLANK = ObservationLikelihood(
 
 def blind(memory, belief):
     network = network_of(FLAT)
-    return recognise(FLAT, network, memory, belief, corrected_motion(memory), BLANK, FLAT.local)
+    return recognise(FLAT, network, memory, belief, memory.corrected_motion(), BLANK, FLAT.local)
 
 
 def test_odometry_alone_is_never_evidence():
@@ -148,7 +148,7 @@ def test_odometry_alone_is_never_evidence():
                 limit = limit * (1 - FLAT.leak) + (1 - limit) * FLAT.enter
                 robot = accumulate_motion(robot, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
                 belief, _ = observe(FLAT, robot, same, belief) if seeing else look(robot, belief)
-                robot = robot._replace(pose=current_pose(robot), motion=jnp.zeros(3), length=jnp.zeros(()))
+                robot = robot._replace(pose=robot.current_pose(), motion=jnp.zeros(3), length=jnp.zeros(()))
                 assert float(belief.activity.sum()) <= limit + 1e-5
             # Nor is it evidence against: the mass is still there.
             assert seeing or float(belief.activity.sum()) > 0.5 * limit
@@ -238,7 +238,7 @@ def test_an_id_is_new_once():
     memory = filled(FLAT, np.zeros((2, 0)), spaced(2), labels=[4, 4])
     given_then = [(9, 2), (9, 2), (-1, 2), (4, 2), (0, 3)]
     for label, distinct in given_then:
-        memory = store_keyframe(memory, jnp.zeros(0), jnp.int32(label))
+        memory = memory.store_keyframe(jnp.zeros(0), jnp.int32(label))
         assert int(memory.distinct) == distinct
 
 

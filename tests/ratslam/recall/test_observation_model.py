@@ -18,7 +18,6 @@ from ratslam.recall.memory import (
     accumulate_motion,
     apply_map_feedback,
     init_memory,
-    store_keyframe,
 )
 from ratslam.recall.observation_model import STEPS
 from ratslam.recall.whisker_likelihood import DEAD, HEIGHTS, LEVELS, pixel_levels
@@ -93,9 +92,8 @@ def test_mass_is_conserved_along_a_path(config, dtype):
         }
         assert belief.activity.sum() + found.novelty == pytest.approx(1, abs=1e-5)
         again.append(found.match >= 0 and (k - found.match) % 20 == 0 and found.posterior > 0.1)
-        memory = store_keyframe(
-            jax.tree.map(jnp.asarray, memory), jnp.asarray(level, jnp.int32), jnp.int32(-1)
-        )
+        memory = jax.tree.map(jnp.asarray, memory)
+        memory = memory.store_keyframe(jnp.asarray(level, jnp.int32), jnp.int32(-1))
     assert not any(again[:20])
     assert np.mean(again[20:]) > 0.9  # recognised from the second lap on
 

@@ -14,7 +14,6 @@ from ratslam.recall.memory import (
     MapFeedback,
     accumulate_motion,
     apply_map_feedback,
-    corrected_motion,
     init_memory,
 )
 from ratslam.recall.observation_model import touch_likelihood
@@ -92,7 +91,7 @@ def filter_of(config):
 
     def observe(memory, belief, level):
         memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        motion = corrected_motion(memory)
+        motion = memory.corrected_motion()
         return memory, *recognise(config, network, memory, belief, motion, weighing, config.local)
 
     return jax.jit(observe)
