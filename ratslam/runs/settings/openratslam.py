@@ -87,22 +87,14 @@ IGNORED = ("draw",)
 """Sections about windows."""
 
 
-class Converted(NamedTuple):
-    """A converted parameter file.
-
-    Attributes:
-        settings: nested, as in a configuration file. notes: what has no counterpart or needs the user.
-    """
-
-    settings: dict[str, Any]
-    notes: list[str]
-
-
-def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
+def convert_parameters(path: Path, recording: Path | None = None) -> tuple[dict[str, Any], list[str]]:
     """The configuration that corresponds to a parameter file of OpenRatSLAM.
 
     Args:
         recording: the bag or video to map, as it shall stand in the configuration; None: ROOT.bag.
+
+    Returns:
+        the settings, nested as in a configuration file; notes on what has no counterpart or needs the user.
 
     Raises:
         InputError: the file cannot be read, or values are impossible; with file and line.
@@ -116,19 +108,26 @@ def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
     settings["experience"] = {"solver": {"name": "relaxation"}}
     chosen = RATSLAM | (VISUAL_ODOMETRY if "camera_fov_deg" in values else {})
     for key, parameter in chosen.items():
-        value = _converted(key, values, parameter)
+        value = values.get(key, parameter.default)
+        if key.endswith("_max") and value == -1:
+            value = None  # open: up to the edge of the image
+        elif key == "vtrans_scaling" and isinstance(value, float):
+            value /= _rate(values)  # there a speed, here a distance between frames
         section = "ratslam" if key in RATSLAM else "visual_odometry"
         for setting in parameter.paths:
             keys = tuple(setting.split("."))
             if value is not None:
-                _put(settings, keys, value)
+                part = settings
+                for name in keys[:-1]:
+                    part = part.setdefault(name, {})
+                part[keys[-1]] = value
             if key in values:
                 at = f"{path}:{lines[section, key]}: {key}:"
                 places[keys] = Place(at, at)
     notes += _put_source(settings, file, root, values)
     notes += _notes(values, settings)
     validate(Document(settings, places), RunConfig)
-    return Converted(settings, notes)
+    return settings, notes
 
 
 def _read_values(
@@ -215,26 +214,10 @@ def _value(text: str, default: Value) -> Value:
     return value
 
 
-def _converted(key: str, values: Mapping[str, Value], parameter: Parameter) -> Value:
-    """The value of a parameter in the units used here; None: open."""
-    value = values.get(key, parameter.default)
-    if key.endswith("_max") and value == -1:
-        return None  # up to the edge of the image
-    if key == "vtrans_scaling" and isinstance(value, float):
-        return value / _rate(values)  # there a speed, here a distance between frames
-    return value
-
-
 def _rate(values: Mapping[str, Value]) -> float:
     rate = values.get("camera_hz", VISUAL_ODOMETRY["camera_hz"].default)
     assert isinstance(rate, float)  # as its default
     return rate
-
-
-def _put(settings: dict[str, Any], keys: KeyPath, value: Value) -> None:
-    for key in keys[:-1]:
-        settings = settings.setdefault(str(key), {})
-    settings[str(keys[-1])] = value
 
 
 def _put_source(settings: dict[str, Any], file: Path, root: str, values: Mapping[str, Value]) -> list[str]:

@@ -236,8 +236,5 @@ def test_other_files_are_not_loaded(own: Path, tmp_path: Path) -> None:
     with pytest.raises(ratslam.InputError, match="no such file; expected a map"):
         ratslam.Slam.load(tmp_path / "none")
     np.savez(tmp_path / "map.npz", steps=np.array(3))
-    with pytest.raises(ratslam.InputError, match="does not say how it was made"):
+    with pytest.raises(ratslam.InputError, match="a file without 'format'"):
         ratslam.Slam.load(tmp_path / "map.npz")
-    np.savez(tmp_path / "cut.npz", steps=np.array(3), config=np.array(NO_SOURCE), source=np.array("{}"))
-    with pytest.raises(ratslam.InputError, match="not a description of a source"):
-        ratslam.Slam.load(tmp_path / "cut.npz")
