@@ -1,7 +1,4 @@
-"""Makes the session of a configuration and its source.
-
-Opens the source of a configuration: a recording or a simulation.
-"""
+"""Opens the source of a configuration (a recording or a simulation), and makes the session for the two."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Records the pose cells of a run: rows go to a file while it runs, which becomes cells.npz at the end.
 
-What is recorded of the pose cells of a session: settings completed with the network and the source.
+`plan_recording` says which cells are recorded, and over which bins all of them are summed.
 """
 
 from __future__ import annotations
@@ -101,23 +101,9 @@ def _true_extent(source: Source, least: float) -> tuple[float, float, float, flo
 
 
 ROWS = "cells.rows"
-"""File of the rows of a run that goes on, or was killed: plain records of `row_type`."""
+"""File of the rows of a run that goes on, or was killed: plain records."""
 BUFFERED = 32 * CHUNK
 """Rows kept in memory before they are appended to the file."""
-
-
-def row_type(chosen: int) -> np.dtype:
-    """The record of one step with this number of chosen cells, as the fields of `CellRecording`."""
-    return np.dtype(
-        [
-            ("time", "<f8"),
-            ("truth", "<f8", 3),
-            ("packet", "<f8", 3),
-            ("energy", "<f8"),
-            ("place", "<i4"),
-            ("activity", "<f4", (chosen,)),
-        ]
-    )
 
 
 class CellRecorder:
@@ -131,7 +117,15 @@ class CellRecorder:
 
     def __init__(self, directory: Path, plan: RecordingPlan) -> None:
         self._directory, self._plan = directory, plan
-        self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
+        row = [  # of one step, as the fields of `CellRecording`
+            ("time", "<f8"),
+            ("truth", "<f8", 3),
+            ("packet", "<f8", 3),
+            ("energy", "<f8"),
+            ("place", "<i4"),
+            ("activity", "<f4", (len(plan.cell),)),
+        ]
+        self._rows = np.zeros(BUFFERED, np.dtype(row))
         self._filled = 0
         self._sums: CellSums | None = None
         (directory / ROWS).touch(exist_ok=False)
@@ -149,8 +143,13 @@ class CellRecorder:
         rows["place"] = [step.estimate.place for step in steps]
         rows["activity"] = [step.probed for step in steps]
         self._filled += len(steps)
-        if self._plan.sums is not None:
-            self._add_sums(samples, steps)
+        if self._plan.sums is None:
+            return
+        if self._sums is None:
+            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
+        for sample, step in zip(samples, steps, strict=True):
+            if step.seldom is not None:
+                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
 
     def finish(self) -> None:
         """Writes cells.npz with all rows and the sums, and removes cells.rows.
@@ -169,14 +168,6 @@ class CellRecorder:
         )
         write_recording(self._directory / NAME, recording)
         path.unlink()
-
-    def _add_sums(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
-        assert self._plan.sums is not None
-        if self._sums is None:
-            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
-        for sample, step in zip(samples, steps, strict=True):
-            if step.seldom is not None:
-                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
 
     def _write(self) -> None:
         with (self._directory / ROWS).open("ab") as file:

@@ -114,7 +114,15 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
     Raises:
         InputError: a map cannot be restored.
     """
-    contents = [_content(saved) for saved in (first, second)]
+    contents = []
+    for saved in (first, second):
+        made: Map = saved.open_session().map
+        if isinstance(made, KeyframeMap):
+            contents.append(keyframe_content(made))
+        else:
+            names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
+            path = made.trajectory() if saved.steps else np.zeros((0, 3))
+            contents.append(MapContent(path, names, made.closures()))
     found = difference(*contents)._asdict()
     settings = [flat_settings(saved.config.model_dump(mode="json")) for saved in (first, second)]
     keys = sorted(settings[0].keys() | settings[1].keys())
@@ -234,12 +242,3 @@ def _keyframe_session(saved: SavedMap, what: str) -> tuple[Session, KeyframeMap]
         found = f"a map of `backend: {saved.config.backend}`, which has no keyframes to {what}"
         raise InputError(str(saved.path), found, "a map of `backend: recall`")
     return session, session.map
-
-
-def _content(saved: SavedMap) -> MapContent:
-    made: Map = saved.open_session().map
-    if isinstance(made, KeyframeMap):
-        return keyframe_content(made)
-    names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
-    path = made.trajectory() if saved.steps else np.zeros((0, 3))
-    return MapContent(path, names, made.closures())

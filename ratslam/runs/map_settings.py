@@ -1,6 +1,6 @@
-"""The settings that a map depends on, and which differ between maps or in a session that is to go on.
+"""The settings and the sensor that a map depends on, and how those of another map or session differ.
 
-The sensor of a map: what its views are measured with, and how they are made of the readings.
+The sensor of a map is what its views are measured with, and how they are made of the readings.
 """
 
 from __future__ import annotations

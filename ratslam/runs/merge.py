@@ -1,4 +1,4 @@
-"""Merges saved maps into one."""
+"""Merges saved maps of one sensor into one, and refuses maps that hold the same session."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _stretches(made: KeyframeMap) -> int:
 
 def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
     session = saved.open_session()
-    return session, keyframes_of(saved, session.map)
+    return session, _keyframes_of(saved, session.map)
 
 
 def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
@@ -207,7 +207,7 @@ def check_mergeable(maps: Sequence[SavedMap]) -> None:
     _check_sessions(maps)
 
 
-def keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
+def _keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
     """The map restored from a saved one; raises `InputError` if it has no keyframes."""
     if not isinstance(made, KeyframeMap) or not made.kept_keyframes().count:
         found = f"a map of `backend: {saved.config.backend}` without keyframes"
@@ -234,7 +234,7 @@ def _check_sessions(maps: Sequence[SavedMap]) -> None:
     for (first, one), (second, other) in combinations(zip(maps, contents, strict=True), 2):
         if one == other:
             raise InputError(str(second.path), f"the same map as {first.path}", OTHERS, "give it once")
-    keyframes = [remembered(keyframes_of(saved, saved.open_session().map)) for saved in maps]
+    keyframes = [remembered(_keyframes_of(saved, saved.open_session().map)) for saved in maps]
     for (first, seen), (second, again) in combinations(zip(maps, keyframes, strict=True), 2):
         common = overlap(seen, again)
         if common is not None:

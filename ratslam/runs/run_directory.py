@@ -1,13 +1,8 @@
 """The run directory: files of a run, readable at any moment.
 
 Text files grow by whole lines, one chunk at a time; all other files appear complete, by renaming. So an
-interrupt, a kill or a full disk leaves a readable prefix.
-
-Writes the world, views and the grid map to a run directory, for scores, plots and the report.
-
-Changes between a map and a session localised in it: the file changes.csv.
-
-The error of the online pose while a run proceeds.
+interrupt, a kill or a full disk leaves a readable prefix. Besides `RunDirectory`: the world, the views, the
+grid map and the changes of a localised session in it; the error of the online pose while a run proceeds.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Processes samples with a backend and writes, scores and plots the result in a run directory.
+"""The main loop: processes samples chunk by chunk; writes, scores and plots the result in a run directory.
 
-Reports the progress of a run to observers, as plain data.
-
-Maps are asked at the end of chunks only, and for what takes long less and less often: the cost of all
-questions together stays a small multiple of the last one.
+Observers are told of the progress as plain data. Maps are asked at the end of chunks only, and for what takes
+long less and less often: the cost of all questions together stays a small multiple of the last one.
 """
 
 from __future__ import annotations
@@ -126,24 +124,6 @@ class Observer(Protocol):
         """The run has ended; `path` is the final trajectory."""
 
 
-class MapSchedule:
-    """Decides when the whole map is reported.
-
-    Args:
-        steps: of the session so far.
-    """
-
-    def __init__(self, steps: int) -> None:
-        self._due = steps
-
-    def is_due(self, steps: int) -> bool:
-        """Whether it is due after so many steps; the next one is due later."""
-        if steps < self._due:
-            return False
-        self._due = steps + steps // DRAWN_SHARE
-        return True
-
-
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more,
 but at most twice the steps before the first of the two. A run continued after a kill repeats at most these.
@@ -185,9 +165,15 @@ class Runner:
         self._begun = self._saved = session.steps
         self._estimate, self._readings = estimate, describe_readings(source)
         self._cells = open_cell_recorder(config, source, session.backend, directory.path)
-        self._observers, self._schedule = observers, MapSchedule(session.steps)
+        self._observers, self._drawn_at = observers, session.steps  # when the whole map is due
+        if observers:
+            head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
+            if head is not None and source.whiskers != len(head.length):
+                head = None
+            cells = session.backend.activity(session.state) is not None
+            run = RunDescription(source.name, config.backend, head, config.touch.image.tallest, cells)
         for observer in observers:
-            observer.begin(_describe(config, source, session))
+            observer.begin(run)
 
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
@@ -289,12 +275,28 @@ class Runner:
     ) -> None:
         """Tells the observers of these steps, and at the end of a chunk of the map."""
         count = self.session.steps
+        reports: list[StepReport] = []
         rows = zip(samples, observations, steps, odometry, strict=True)
-        reports = [_step_report(count - len(steps) + k, *row) for k, row in enumerate(rows)]
+        for sample, observation, step, dead_reckoned in rows:
+            estimate = step.estimate
+            reports.append(
+                StepReport(
+                    number=count - len(steps) + len(reports),
+                    time=float(sample.time),
+                    observation=observation,
+                    odometry=dead_reckoned,
+                    pose=np.asarray(step.pose, float),
+                    place=int(estimate.place),
+                    previous=int(estimate.previous),
+                    lost=bool(estimate.lost),
+                    doubt=float(step.doubt),
+                )
+            )
         report = None
         if count % CHUNK == 0:
             report = self._map_report()
-            if self._schedule.is_due(count):
+            if count >= self._drawn_at:
+                self._drawn_at = count + count // DRAWN_SHARE
                 made = self.session.map
                 report = report._replace(path=made.online_trajectory(), grid=made.grid())
         for observer in self._observers:
@@ -348,25 +350,6 @@ def open_runner(
         if begun is not None:
             runner.checkpoint()  # nothing else of this folder holds the map before
         yield runner
-
-
-def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
-    head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
-    if head is not None and source.whiskers != len(head.length):
-        head = None
-    cells = session.backend.activity(session.state) is not None
-    tallest = config.touch.image.tallest
-    return RunDescription(source.name, config.backend, head, tallest, cells)
-
-
-def _step_report(
-    number: int, sample: Sample, observation: Observation, step: Step, odometry: np.ndarray
-) -> StepReport:
-    estimate = step.estimate
-    places = int(estimate.place), int(estimate.previous)
-    pose = np.asarray(step.pose, float)
-    lost, doubt = bool(estimate.lost), float(step.doubt)
-    return StepReport(number, float(sample.time), observation, odometry, pose, *places, lost, doubt)
 
 
 def _lines(

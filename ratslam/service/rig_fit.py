@@ -97,7 +97,11 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     Raises:
         InputError: the truth covers too few windows, or the robot does not move.
     """
-    ends = _window_ends(time, truth)
+    starts: list[int] = []  # rows with a true pose, at least `WINDOW` apart: the ends of the windows
+    for row in np.flatnonzero(np.isfinite(truth).all(axis=1)).tolist():
+        if not starts or time[row] - time[starts[-1]] >= WINDOW:
+            starts.append(row)
+    ends = np.array(starts, int)
     windows = _measure(motion, truth, ends, OdometryCorrection())
     path, turned = float(windows.length.sum()), float(windows.turned.sum())
     if len(ends) - 1 < LEAST_WINDOWS or path == 0:
@@ -108,6 +112,9 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     windows = _measure(motion, truth, ends, OdometryCorrection(turn_scale=start[0], heading_bias=start[1]))
     values, draws = _solve(windows, turns), _bootstrap(windows, turns, seed)
     pairs = [(float(value), float(sd)) for value, sd in zip(values, draws.std(axis=0), strict=True)]
+    heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
+    chord = windows.true_chord - values[0] * windows.chord
+    slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
     return WheelFit(
         length_scale=pairs[0],
         turn_scale=pairs[1] if turns else None,
@@ -117,7 +124,7 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
         length_noise=pairs[5],
         position_noise=pairs[6],
         windows=len(windows.length),
-        slips=int(_slips(windows, values).sum()),
+        slips=int(slips.sum()),
         path=path,
         turned=turned,
     )
@@ -125,16 +132,6 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
 
 def _if_sure(found: tuple[float, float], assumed: float) -> float:
     return found[0] if abs(found[0] - assumed) > KEPT_SDS * found[1] else assumed
-
-
-def _window_ends(time: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Rows with a true pose, at least `WINDOW` apart: the ends of the windows."""
-    known = np.flatnonzero(np.isfinite(truth).all(axis=1))
-    ends: list[int] = []
-    for row in known.tolist():
-        if not ends or time[row] - time[ends[-1]] >= WINDOW:
-            ends.append(row)
-    return np.array(ends, int)
 
 
 def _measure(
@@ -202,13 +199,6 @@ def _bootstrap(windows: _Windows, turns: bool, seed: int) -> np.ndarray:
     for chosen in random.integers(0, len(blocks), (DRAWS, len(blocks))):
         draws.append(_solve(windows.rows(np.concatenate([blocks[k] for k in chosen])), turns))
     return np.array(draws)
-
-
-def _slips(windows: _Windows, values: np.ndarray) -> np.ndarray:
-    """[M] bool, the windows whose turn or distance no noise explains."""
-    heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
-    chord = windows.true_chord - values[0] * windows.chord
-    return np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
 
 
 def _clip_slips(error: np.ndarray) -> np.ndarray:
@@ -286,7 +276,15 @@ def rig_settings(rig: Rig) -> dict[str, Any]:
 
 def render_rig(rig: Rig) -> str:
     """The quantities as a table, with notes and what the record does not tell."""
-    lines = aligned([HEADING, *map(_row, rig.quantities)]) if rig.quantities else []
+    rows: list[Sequence[str]] = [HEADING]
+    for quantity in rig.quantities:
+        assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
+        sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
+        setting = quantity.setting
+        if setting and not quantity.differs:
+            setting = f"unchanged, within {KEPT_SDS:g} sd"
+        rows.append((quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting))
+    lines = aligned(rows) if rig.quantities else []
     return "\n".join([*lines, *rig.notes, *(f"not determined: {reason}" for reason in rig.unknown)])
 
 
@@ -299,15 +297,6 @@ def rig_file(rig: Rig, record: str) -> str:
     if not settings:
         use = "# No setting differs from what was assumed: there is nothing to include."
     return f"{comment}\n{use}\n{dump_data(settings)}"
-
-
-def _row(quantity: Quantity) -> Sequence[str]:
-    assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
-    sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
-    setting = quantity.setting and (
-        quantity.setting if quantity.differs else f"unchanged, within {KEPT_SDS:g} sd"
-    )
-    return quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -14,10 +14,6 @@ There is no refractory period, no burst and no adaptation; two spikes may be as 
 
 A cell draws from a stream that is named after its index. Its spikes do not depend on which other cells were
 chosen, and a longer recording begins with the spikes of a shorter one.
-
-The pose that each cell of the network stands for.
-
-The activity at which a cell fires at its peak rate.
 """
 
 from __future__ import annotations
@@ -120,7 +116,10 @@ def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig 
     for k, cell in enumerate(np.asarray(recording.cell).tolist()):
         integral = np.concatenate([[0.0], np.cumsum(expected_counts[:, k])])
         arrivals = _unit_arrivals(stream(config.seed, f"spikes of cell {cell}"), integral[-1])
-        times.append(_invert(time, integral, arrivals))
+        # The times at which the integral of the rate reaches the arrivals.
+        row = np.searchsorted(integral, arrivals, side="right") - 1
+        share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
+        times.append(np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1]))
     return SpikeTrains(np.asarray(recording.cell, np.int32), times, float(time[0]), float(time[-1]))
 
 
@@ -156,13 +155,6 @@ def _unit_arrivals(random: np.random.Generator, end: float) -> np.ndarray:
         last = float(blocks[-1][-1])
     arrivals = np.concatenate([np.zeros(0), *blocks])
     return arrivals[arrivals < end]
-
-
-def _invert(time: np.ndarray, integral: np.ndarray, arrivals: np.ndarray) -> np.ndarray:
-    """The times at which the integral [T] of the rate over times [T] reaches the arrivals."""
-    row = np.searchsorted(integral, arrivals, side="right") - 1
-    share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
-    return np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1])
 
 
 def write_spikes(path: str | Path, spikes: SpikeTrains) -> None:
