@@ -44,6 +44,12 @@ class RecordingPlan(NamedTuple):
     cell: np.ndarray
     sums: SumsPlan | None
 
+    def probe(self) -> Probe:
+        """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
+        cells are summed what was held of them."""
+        each = lambda state: self.cells.each(state, self.cell)  # noqa: E731
+        return Probe(each) if self.sums is None else Probe(each, self.cells.hold, self.sums.interval)
+
 
 def plan_recording(config: RunConfig, source: Source, backend: Backend) -> RecordingPlan | None:
     """The plan for a completed configuration, its source and its method; None: nothing is recorded.
@@ -61,13 +67,6 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
     sums = config.cells.sums
     plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed), None)
     return plan if sums is None else plan._replace(sums=_plan_sums(sums, cells, source))
-
-
-def probe_of(plan: RecordingPlan) -> Probe:
-    """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
-    cells are summed what was held of them."""
-    each = lambda state: plan.cells.each(state, plan.cell)  # noqa: E731
-    return Probe(each) if plan.sums is None else Probe(each, plan.cells.hold, plan.sums.interval)
 
 
 def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> SumsPlan:
@@ -107,7 +106,7 @@ BUFFERED = 32 * CHUNK
 
 
 class CellRecorder:
-    """Records the steps of a session whose probe is `probe_of(plan)`.
+    """Records the steps of a session whose probe is `plan.probe()`.
 
     Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
 
@@ -173,18 +172,6 @@ class CellRecorder:
         with (self._directory / ROWS).open("ab") as file:
             file.write(self._rows[: self._filled].tobytes())
         self._filled = 0
-
-
-def open_cell_recorder(
-    config: RunConfig, source: Source, backend: Backend, directory: Path
-) -> CellRecorder | None:
-    """The recorder of a completed configuration; None: nothing is recorded.
-
-    Raises:
-        InputError: see `plan_recording`.
-    """
-    plan = plan_recording(config, source, backend)
-    return None if plan is None else CellRecorder(directory, plan)
 
 
 class CellSums:

@@ -9,7 +9,7 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.estimate import START, PoseEstimate
-from ratslam.runs.map_settings import check_same_method, check_same_sensor, sensor_of
+from ratslam.runs.map_settings import Sensor, check_same_method
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Source
@@ -60,7 +60,7 @@ def resume_session(
             or settings; or another recording cannot go on from it, because it is one piece.
     """
     saved = read_map(path, tell)
-    check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+    saved.sensor.check_same(str(saved.path), Sensor.of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)
     if samples is None:  # before settings that follow from the source are compared

@@ -41,9 +41,12 @@ OWN = (*SourceConfig.model_fields, "score", "cells")
 """Sections that a session has of its own in a saved map."""
 
 
-def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
+def localising(config: RunConfig, saved: SavedMap, start: Start | None = None) -> RunConfig:
     """The configuration of a session that is localised in a saved map: source, touch and scores of `config`,
     the rest as the map was made.
+
+    Args:
+        start: where it begins, if not as `config` says.
 
     Raises:
         InputError: the map was made by a method in whose maps nothing can be localised, or with a sensor of
@@ -58,7 +61,8 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
         raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
     check_same_fov(str(saved.path), saved.config, config)
     own = {name: getattr(config, name) for name in OWN}
-    place = config.localise.model_copy(update={"map": saved.path.resolve()})
+    begin = {} if start is None else {"start": start}
+    place = config.localise.model_copy(update={"map": saved.path.resolve(), **begin})
     return saved.config.model_copy(
         update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
     )
@@ -108,17 +112,6 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
     text = dump(saved.config.model_copy(update=sources))
     return validate(override(parse(text, str(saved.path)), assignments), RunConfig)
-
-
-def localising_for_goals(config: RunConfig, saved: SavedMap, start: Start) -> RunConfig:
-    """The same for a session that drives to goals and begins at `start`.
-
-    Raises:
-        InputError: as `localising`.
-    """
-    localised = localising(config, saved)
-    settings = localised.localise.model_copy(update={"start": start})
-    return localised.model_copy(update={"localise": settings})
 
 
 def localise(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.artifacts.run_reader import has_steps, is_merged
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
@@ -19,8 +20,7 @@ from ratslam.methods.recall import RecallBackend
 from ratslam.places.crop import crop_map
 from ratslam.places.difference import MapContent, difference, keyframe_content
 from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
-from ratslam.runs.map_results import holds_results, rewrite_results
-from ratslam.runs.map_settings import disagreement
+from ratslam.runs.map_results import rewrite_results
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
@@ -133,7 +133,7 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
         "steps": [first.steps, second.steps],
         **{key: value if np.isfinite(value) else None for key, value in found.items()},
         "settings": changed,
-        "sensor": disagreement(first.sensor, second.sensor),
+        "sensor": first.sensor.disagreement(second.sensor),
     }
 
 
@@ -166,7 +166,7 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
     if output != saved.path:
         make_new_file(output, write)
         return False
-    if output.name != NAME or not holds_results(folder):
+    if output.name != NAME or not (is_merged(folder) or has_steps(folder)):
         write(output)
         return False
 

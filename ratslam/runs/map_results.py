@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.run_reader import MERGED_MAP_NAME as MERGED
 from evaluation.artifacts.run_reader import NAME as PIECES
-from evaluation.artifacts.run_reader import has_steps, is_merged, read_run, read_session_steps, write_pieces
+from evaluation.artifacts.run_reader import is_merged, read_run, read_session_steps, write_pieces
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -101,11 +101,6 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
     write_map_results(folder, made, np.arange(len(path), dtype=float))
     figure = draw_sessions(name, path, piece, steps)
     write_atomically(folder / "map.png", figure.savefig)
-
-
-def holds_results(folder: Path) -> bool:
-    """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
-    return is_merged(folder) or has_steps(folder)
 
 
 def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:

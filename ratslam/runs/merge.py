@@ -21,7 +21,7 @@ from ratslam.places.joining import Join, Stretches, join_all
 from ratslam.places.union import Overlap, overlap, remembered, renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
-from ratslam.runs.map_settings import assignments, differences, differing_settings, settings_of_map
+from ratslam.runs.map_settings import assignments, differing_settings, settings_of_map
 from ratslam.runs.saved_map import NAME, SavedMap, digest_of, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.errors import InputError
@@ -216,7 +216,7 @@ def _keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
 
 
 def _check_sensors(first: SavedMap, second: SavedMap) -> None:
-    different = differences(first.sensor, second.sensor)
+    different = first.sensor.differences(second.sensor)
     if different:
         clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
         settings, cure = settings_of_map(different), "merge those of each sensor alone"

@@ -29,20 +29,15 @@ from ratslam.core.estimates import Action, GridDrawing, PoseCellActivity
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.runs.build_session import build_session
-from ratslam.runs.cell_recorder import open_cell_recorder
+from ratslam.runs.cell_recorder import CellRecorder, plan_recording
 from ratslam.runs.continuation import checkpoint_of, resume_session
-from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_results import score_and_plot, write_map_results
-from ratslam.runs.map_settings import check_same_sensor, sensor_of
+from ratslam.runs.map_settings import Sensor
 from ratslam.runs.run_directory import (
     OnlineErrorLog,
     RunDirectory,
     WhiskerView,
-    save_changes,
-    save_closure_views,
-    save_grid_map,
-    save_whisker_views,
-    save_world,
 )
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.runs.settings.run_config import RunConfig
@@ -164,7 +159,8 @@ class Runner:
         self._online_error = OnlineErrorLog(session.steps)
         self._begun = self._saved = session.steps
         self._estimate, self._readings = estimate, describe_readings(source)
-        self._cells = open_cell_recorder(config, source, session.backend, directory.path)
+        plan = plan_recording(config, source, session.backend)
+        self._cells = None if plan is None else CellRecorder(directory.path, plan)
         self._observers, self._drawn_at = observers, session.steps  # when the whole map is due
         if observers:
             head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
@@ -192,7 +188,7 @@ class Runner:
             self._truth.append(np.nan if sample.truth is None else sample.truth)
         entry = BACKENDS.get(self._config.backend, "backend")
         self._directory.append(_lines(samples, steps, odometry, entry))
-        self._estimate = pose_estimate(steps[-1], entry.outcome(steps[-1].evidence))
+        self._estimate = PoseEstimate.of_step(steps[-1], entry.outcome(steps[-1].evidence))
         self._directory.append({"timing.csv": f"{self.session.steps},{len(steps)},{took:.6f}\n"})
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
@@ -245,10 +241,10 @@ class Runner:
         write_map_results(directory.path, self.session.map, time)
         if self._cells is not None:
             self._cells.finish()
-        save_whisker_views(self._views, config.touch, directory)
-        save_closure_views(self._images, directory)
-        save_grid_map(directory)
-        save_changes(self.session.map, config.touch, directory)
+        directory.save_whisker_views(self._views, config.touch)
+        directory.save_closure_views(self._images)
+        directory.save_grid_map()
+        directory.save_changes(self.session.map, config.touch)
         self._judge_input()
         return score_and_plot(directory.path, config.score)
 
@@ -345,7 +341,7 @@ def open_runner(
     columns = BACKENDS.get(config.backend, "backend").columns()
     with RunDirectory(directory, columns, _manifest_text(manifest)) as files:
         files.text("config.yaml", text)
-        save_world(source.info, files)
+        files.save_world(source.info)
         runner = Runner(config, source, files, manifest, session, skip, observers, estimate, warnings)
         if begun is not None:
             runner.checkpoint()  # nothing else of this folder holds the map before
@@ -390,7 +386,7 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
     the map is broken or of another sensor."""
     if config.backend in LOCALISING.values() and config.localise.map is not None:
         saved = read_map(config.localise.map)
-        check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+        saved.sensor.check_same(str(saved.path), Sensor.of(config, source))
 
 
 def _manifest_text(content: dict[str, Any]) -> str:

@@ -20,9 +20,9 @@ from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.build_session import build_session
-from ratslam.runs.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.folder_change import unfinished_change
-from ratslam.runs.map_settings import Sensor, check_same_settings, sensor_of
+from ratslam.runs.map_settings import Sensor, check_same_settings
 from ratslam.runs.settings.renamed_keys import with_moved_settings
 from ratslam.runs.settings.run_config import LoopConfig, RunConfig
 from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate
@@ -134,7 +134,7 @@ class SavedMap:
     @property
     def sensor(self) -> Sensor:
         """The sensor that the map was made with."""
-        return sensor_of(self.config, self.source)
+        return Sensor.of(self.config, self.source)
 
     def open_session(self) -> Session:
         """A session that goes on from this map, with the map in it.
@@ -235,7 +235,7 @@ def write_map(
         "source": np.array(source.to_json()),
         "recording": np.array(recording),
     }
-    arrays |= {ESTIMATE + name: value for name, value in estimate_arrays(estimate).items()}
+    arrays |= {ESTIMATE + name: value for name, value in estimate.arrays().items()}
     arrays |= {FRONTEND + name: np.asarray(value) for name, value in (frontend or {}).items()}
     arrays["sha256"] = np.array(digest_of(arrays))
 
@@ -268,7 +268,7 @@ def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, st
         arrays["earlier"] = np.array(UNKNOWN if begun else 0)
     with malformed(file, EXPECTED, found="{}", spoilt=NPZ_SPOILT):
         source = SourceDescription.from_json(texts["source"])
-        estimate = read_estimate(with_prefix(arrays, ESTIMATE))
+        estimate = PoseEstimate.of_arrays(with_prefix(arrays, ESTIMATE))
         steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
     if steps < 0:
         raise InputError(str(file), f"{steps} steps", EXPECTED)

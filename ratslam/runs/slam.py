@@ -14,7 +14,7 @@ from ratslam.core.backend import Map
 from ratslam.core.compilation import keep_kernels
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.runs.build_session import ConfigLike, build_session, open_source, resolve_config
-from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.runs.settings.completion import complete
@@ -119,7 +119,7 @@ class Slam:
         if observed is not None:
             step = self.session.step(_match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
-            self.estimate = pose_estimate(step, entry.outcome(step.evidence), self.warnings)
+            self.estimate = PoseEstimate.of_step(step, entry.outcome(step.evidence), self.warnings)
             self._cells = step.probed
         return self.estimate
 

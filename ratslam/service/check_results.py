@@ -120,11 +120,11 @@ def require_equal(expected: Any, found: Any, pair: str) -> None:
     Args:
         pair: what the two are, for the message.
     """
-    if where := difference(expected, found):
+    if where := _difference(expected, found):
         raise Violation(f"{pair} differ: {where}", "the same bits")
 
 
-def difference(first: Any, second: Any, path: str = "") -> str:
+def _difference(first: Any, second: Any, path: str = "") -> str:
     """Path and values of the first leaf in which two nested records differ; '' if all have the same bits."""
     if isinstance(first, dict) and isinstance(second, dict):
         if list(first) != list(second):
@@ -142,7 +142,7 @@ def difference(first: Any, second: Any, path: str = "") -> str:
         and not isinstance(first, np.ndarray | np.generic | Enum)
         and type(first) is type(second)
     ):
-        return difference(vars(first), vars(second), path)
+        return _difference(vars(first), vars(second), path)
     else:
         by_value = first is None or second is None or isinstance(first, str)
         if not by_value:
@@ -153,7 +153,7 @@ def difference(first: Any, second: Any, path: str = "") -> str:
         else:
             same = a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
         return "" if same else f"{path} {_short(first)} and {_short(second)}".strip()
-    return next((found for name, a, b in parts if (found := difference(a, b, name))), "")
+    return next((found for name, a, b in parts if (found := _difference(a, b, name))), "")
 
 
 def _short(value: Any) -> str:

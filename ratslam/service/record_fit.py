@@ -19,7 +19,7 @@ from ratslam.runs.build_session import build_session, open_observations, open_so
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load
-from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_wheels, join_rigs
+from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_wheels
 from robot.recordings.real_whiskers import (
     WHISKERS,
     ReachConfig,
@@ -154,7 +154,7 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
             settings = {"touch": {"head": {"dead": dead}}} if dead else {}
             parts.append(Rig(settings=settings, unknown=(f"noise, drift, baseline: {error}",)))
         parts.append(_fit_head(completed, samples, info))
-    return join_rigs(parts)
+    return Rig.join(parts)
 
 
 def _without_correction(config: RunConfig) -> RunConfig:

@@ -10,11 +10,9 @@ import numpy as np
 
 from ratslam.runs.build_session import open_source
 from ratslam.runs.map_settings import (
+    Sensor,
     check_same_fov,
-    check_same_sensor,
-    differences,
     differing_settings,
-    sensor_of,
     settings_of_map,
 )
 from ratslam.runs.saved_map import SavedMap
@@ -257,13 +255,12 @@ class Diagnosis(NamedTuple):
     advice: tuple[str, ...] = ()
     config: dict[str, Any] = {}  # noqa: RUF012
 
-
-def render(diagnosis: Diagnosis) -> str:
-    """The diagnosis as lines of text."""
-    lines = [diagnosis.what, *(f"  {line}".rstrip() for line in aligned(diagnosis.table))]
-    for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
-        lines += [f"{mark}{text}" for text in texts]
-    return "\n".join(map(printable, lines))
+    def render(self) -> str:
+        """The diagnosis as lines of text."""
+        lines = [self.what, *(f"  {line}".rstrip() for line in aligned(self.table))]
+        for mark, texts in (("", self.notes), ("fault: ", self.faults), ("next: ", self.advice)):
+            lines += [f"{mark}{text}" for text in texts]
+        return "\n".join(map(printable, lines))
 
 
 CELLS_IN_RANGE = 13
@@ -336,10 +333,10 @@ def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
     check_same_fov(str(like.path), like.config, given)
     with open_source(given) as source:
         config = complete(given, source)
-        found = differences(like.sensor, sensor_of(config, source))
+        found = like.sensor.differences(Sensor.of(config, source))
     settings = settings_of_map(found)
     if settings is None:
-        check_same_sensor(str(like.path), like.sensor, sensor_of(config, source))
+        like.sensor.check_same(str(like.path), Sensor.of(config, source))
     method = differing_settings([like.config, config])
     settings = {key: both[0] for key, both in method.items()} | (settings or {})
     return override(document, [f"{key}={json.dumps(value)}" for key, value in settings.items()]).data

@@ -246,57 +246,54 @@ class Rig(NamedTuple):
     notes: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
 
+    @classmethod
+    def join(cls, rigs: Iterable[Rig]) -> Rig:
+        """All parts as one rig."""
+        parts = list(rigs)
+        settings: dict[str, Any] = {}
+        for part in parts:
+            settings = merge_settings(settings, part.settings)
+        return cls(
+            tuple(quantity for part in parts for quantity in part.quantities),
+            settings,
+            tuple(note for part in parts for note in part.notes),
+            tuple(reason for part in parts for reason in part.unknown),
+        )
 
-def join_rigs(rigs: Iterable[Rig]) -> Rig:
-    """All parts as one rig."""
-    parts = list(rigs)
-    settings: dict[str, Any] = {}
-    for part in parts:
-        settings = merge_settings(settings, part.settings)
-    return Rig(
-        tuple(quantity for part in parts for quantity in part.quantities),
-        settings,
-        tuple(note for part in parts for note in part.notes),
-        tuple(reason for part in parts for reason in part.unknown),
-    )
+    def included(self) -> dict[str, Any]:
+        """All settings, nested, for a configuration to include; quantities within `KEPT_SDS` of what was
+        assumed are left out."""
+        settings = self.settings
+        for quantity in self.quantities:
+            if quantity.setting and quantity.differs:
+                value: Any = float(f"{quantity.value:.6g}")
+                for key in reversed(quantity.setting.split(".")):
+                    value = {key: value}
+                settings = merge_settings(settings, value)
+        return settings
 
+    def render(self) -> str:
+        """The quantities as a table, with notes and what the record does not tell."""
+        rows: list[Sequence[str]] = [HEADING]
+        for quantity in self.quantities:
+            assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
+            sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
+            setting = quantity.setting
+            if setting and not quantity.differs:
+                setting = f"unchanged, within {KEPT_SDS:g} sd"
+            rows.append((quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting))
+        lines = aligned(rows) if self.quantities else []
+        return "\n".join([*lines, *self.notes, *(f"not determined: {reason}" for reason in self.unknown)])
 
-def rig_settings(rig: Rig) -> dict[str, Any]:
-    """The settings of a rig, nested, for a configuration to include; quantities within `KEPT_SDS` of what was
-    assumed are left out."""
-    settings = rig.settings
-    for quantity in rig.quantities:
-        if quantity.setting and quantity.differs:
-            value: Any = float(f"{quantity.value:.6g}")
-            for key in reversed(quantity.setting.split(".")):
-                value = {key: value}
-            settings = merge_settings(settings, value)
-    return settings
-
-
-def render_rig(rig: Rig) -> str:
-    """The quantities as a table, with notes and what the record does not tell."""
-    rows: list[Sequence[str]] = [HEADING]
-    for quantity in rig.quantities:
-        assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
-        sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
-        setting = quantity.setting
-        if setting and not quantity.differs:
-            setting = f"unchanged, within {KEPT_SDS:g} sd"
-        rows.append((quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting))
-    lines = aligned(rows) if rig.quantities else []
-    return "\n".join([*lines, *rig.notes, *(f"not determined: {reason}" for reason in rig.unknown)])
-
-
-def rig_file(rig: Rig, record: str) -> str:
-    """The file that a configuration includes: the settings, below the table as comments."""
-    text = f"The rig from {record}, written by `python -m ratslam fit`.\n{render_rig(rig)}"
-    comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
-    settings = rig_settings(rig)
-    use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."
-    if not settings:
-        use = "# No setting differs from what was assumed: there is nothing to include."
-    return f"{comment}\n{use}\n{dump_data(settings)}"
+    def file_text(self, record: str) -> str:
+        """The file that a configuration includes: the settings, below the table as comments."""
+        text = f"The rig from {record}, written by `python -m ratslam fit`.\n{self.render()}"
+        comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+        settings = self.included()
+        use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."
+        if not settings:
+            use = "# No setting differs from what was assumed: there is nothing to include."
+        return f"{comment}\n{use}\n{dump_data(settings)}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -54,6 +54,23 @@ class Reading(NamedTuple):
     complete: bool
     suppresses: bool
 
+    @classmethod
+    def of(cls, source: Source, most: int) -> Reading:
+        """Reads the first samples of a source, of a recording twice, and closes it."""
+        source.__enter__()
+        try:
+            samples: list[Sample] = []
+            copies: list[Sample] = []
+            iterator = iter(source)
+            for sample in islice(iterator, most):
+                samples.append(sample)
+                copies.append(copy.deepcopy(sample))
+            complete = len(samples) < most or next(iterator, None) is None
+            again = list(islice(source, most)) if source.digest else []  # a live robot has none
+        finally:
+            suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
+        return cls(samples, copies, again, complete, suppresses)
+
 
 class SourceTrial:
     """A source with settings: what its checks share, and the checks.
@@ -75,7 +92,7 @@ class SourceTrial:
     @cached_property
     def reading(self) -> Reading:
         """What was read of the source."""
-        return read(self.source, self.most)
+        return Reading.of(self.source, self.most)
 
     @cached_property
     def observing(self) -> Source:
@@ -230,26 +247,9 @@ class SourceTrial:
             return "a live source, read once"
         first = self.reading.copies
         require_equal(first, self.reading.again, "the samples of two passes")
-        other = read(self.entry.open(self.settings, None), self.most)
+        other = Reading.of(self.entry.open(self.settings, None), self.most)
         require_equal(first, other.samples, "the samples of two openings")
         return ""
-
-
-def read(source: Source, most: int) -> Reading:
-    """Reads the first samples of a source, of a recording twice, and closes it."""
-    source.__enter__()
-    try:
-        samples: list[Sample] = []
-        copies: list[Sample] = []
-        iterator = iter(source)
-        for sample in islice(iterator, most):
-            samples.append(sample)
-            copies.append(copy.deepcopy(sample))
-        complete = len(samples) < most or next(iterator, None) is None
-        again = list(islice(source, most)) if source.digest else []  # a live robot has none
-    finally:
-        suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
-    return Reading(samples, copies, again, complete, suppresses)
 
 
 class _StoredSource(ClosedSource):

@@ -19,7 +19,7 @@ from ratslam.service.check_results import (
     require_settings_class,
     run_checks,
 )
-from ratslam.service.source_checks import Reading, read, require_masked, require_shapes
+from ratslam.service.source_checks import Reading, require_masked, require_shapes
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, Source
 from robot.touch_source import TOUCH, ReadingProcessor, TouchEntry
@@ -79,7 +79,7 @@ class TouchTrial:
 
     @cached_property
     def reading(self) -> Reading:
-        return read(self.source, READINGS)
+        return Reading.of(self.source, READINGS)
 
     @property
     def readings(self) -> list[Any]:

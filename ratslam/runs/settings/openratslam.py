@@ -21,7 +21,7 @@ IMAGE, VISUAL = "recording.image", "recording.visual_odometry"
 TEMPLATES, CELLS, NETWORK, MAP = "templates", "pose_cells", "attractor", "experience.solver"
 
 
-class Parameter(NamedTuple):
+class _Parameter(NamedTuple):
     """A parameter of OpenRatSLAM and its counterpart here.
 
     Attributes:
@@ -33,53 +33,53 @@ class Parameter(NamedTuple):
     paths: tuple[str, ...]
 
 
-RATSLAM: dict[str, Parameter] = {
-    "image_crop_x_min": Parameter(0, (f"{IMAGE}.crop.x_min",)),
-    "image_crop_x_max": Parameter(-1, (f"{IMAGE}.crop.x_max",)),
-    "image_crop_y_min": Parameter(0, (f"{IMAGE}.crop.y_min",)),
-    "image_crop_y_max": Parameter(-1, (f"{IMAGE}.crop.y_max",)),
-    "template_y_size": Parameter(1, (f"{IMAGE}.rows",)),
-    "template_x_size": Parameter(1, (f"{IMAGE}.columns",)),
-    "pc_dim_xy": Parameter(21, (f"{CELLS}.cells_xy",)),
-    "pc_dim_th": Parameter(36, (f"{CELLS}.cells_heading",)),
-    "pc_cell_x_size": Parameter(1.0, (f"{CELLS}.cell_size",)),
-    "pc_w_e_dim": Parameter(7, (f"{NETWORK}.excite_width",)),
-    "pc_w_e_var": Parameter(1.0, (f"{NETWORK}.excite_sigma",)),
-    "pc_w_i_dim": Parameter(5, (f"{NETWORK}.inhibit_width",)),
-    "pc_w_i_var": Parameter(2.0, (f"{NETWORK}.inhibit_sigma",)),
-    "pc_global_inhib": Parameter(2e-5, (f"{NETWORK}.global_inhibition",)),
-    "vt_match_threshold": Parameter(0.03, (f"{TEMPLATES}.threshold",)),
-    "vt_shift_match": Parameter(25, (f"{TEMPLATES}.shift",)),
-    "vt_step_match": Parameter(5, (f"{TEMPLATES}.shift_step",)),
-    "vt_panoramic": Parameter(False, (f"{TEMPLATES}.panoramic",)),
-    "vt_normalisation": Parameter(0.0, (f"{TEMPLATES}.normalise_mean",)),
-    "vt_patch_normalise": Parameter(0, (f"{TEMPLATES}.patch",)),
-    "vt_min_patch_normalisation_std": Parameter(0.0, (f"{TEMPLATES}.patch_sd",)),
-    "pc_vt_inject_energy": Parameter(0.15, (f"{TEMPLATES}.energy",)),
-    "vt_active_decay": Parameter(1.0, (f"{TEMPLATES}.habituation",)),
-    "pc_vt_restore": Parameter(0.05, (f"{TEMPLATES}.recovery",)),
-    "exp_delta_pc_threshold": Parameter(2.0, ("places.radius", "places.radius_heading")),
-    "exp_loops": Parameter(10, (f"{MAP}.loops",)),
-    "exp_correction": Parameter(0.5, (f"{MAP}.correction",)),
-    "exp_initial_em_deg": Parameter(90.0, ()),
+RATSLAM: dict[str, _Parameter] = {
+    "image_crop_x_min": _Parameter(0, (f"{IMAGE}.crop.x_min",)),
+    "image_crop_x_max": _Parameter(-1, (f"{IMAGE}.crop.x_max",)),
+    "image_crop_y_min": _Parameter(0, (f"{IMAGE}.crop.y_min",)),
+    "image_crop_y_max": _Parameter(-1, (f"{IMAGE}.crop.y_max",)),
+    "template_y_size": _Parameter(1, (f"{IMAGE}.rows",)),
+    "template_x_size": _Parameter(1, (f"{IMAGE}.columns",)),
+    "pc_dim_xy": _Parameter(21, (f"{CELLS}.cells_xy",)),
+    "pc_dim_th": _Parameter(36, (f"{CELLS}.cells_heading",)),
+    "pc_cell_x_size": _Parameter(1.0, (f"{CELLS}.cell_size",)),
+    "pc_w_e_dim": _Parameter(7, (f"{NETWORK}.excite_width",)),
+    "pc_w_e_var": _Parameter(1.0, (f"{NETWORK}.excite_sigma",)),
+    "pc_w_i_dim": _Parameter(5, (f"{NETWORK}.inhibit_width",)),
+    "pc_w_i_var": _Parameter(2.0, (f"{NETWORK}.inhibit_sigma",)),
+    "pc_global_inhib": _Parameter(2e-5, (f"{NETWORK}.global_inhibition",)),
+    "vt_match_threshold": _Parameter(0.03, (f"{TEMPLATES}.threshold",)),
+    "vt_shift_match": _Parameter(25, (f"{TEMPLATES}.shift",)),
+    "vt_step_match": _Parameter(5, (f"{TEMPLATES}.shift_step",)),
+    "vt_panoramic": _Parameter(False, (f"{TEMPLATES}.panoramic",)),
+    "vt_normalisation": _Parameter(0.0, (f"{TEMPLATES}.normalise_mean",)),
+    "vt_patch_normalise": _Parameter(0, (f"{TEMPLATES}.patch",)),
+    "vt_min_patch_normalisation_std": _Parameter(0.0, (f"{TEMPLATES}.patch_sd",)),
+    "pc_vt_inject_energy": _Parameter(0.15, (f"{TEMPLATES}.energy",)),
+    "vt_active_decay": _Parameter(1.0, (f"{TEMPLATES}.habituation",)),
+    "pc_vt_restore": _Parameter(0.05, (f"{TEMPLATES}.recovery",)),
+    "exp_delta_pc_threshold": _Parameter(2.0, ("places.radius", "places.radius_heading")),
+    "exp_loops": _Parameter(10, (f"{MAP}.loops",)),
+    "exp_correction": _Parameter(0.5, (f"{MAP}.correction",)),
+    "exp_initial_em_deg": _Parameter(90.0, ()),
 }
 """Parameters of the section [ratslam]."""
 
-VISUAL_ODOMETRY: dict[str, Parameter] = {
-    "camera_fov_deg": Parameter(None, (f"{VISUAL}.fov_deg",)),
-    "camera_hz": Parameter(10.0, ()),
-    "vtrans_scaling": Parameter(None, (f"{VISUAL}.scaling",)),
-    "vtrans_max": Parameter(None, (f"{VISUAL}.max_speed",)),
+VISUAL_ODOMETRY: dict[str, _Parameter] = {
+    "camera_fov_deg": _Parameter(None, (f"{VISUAL}.fov_deg",)),
+    "camera_hz": _Parameter(10.0, ()),
+    "vtrans_scaling": _Parameter(None, (f"{VISUAL}.scaling",)),
+    "vtrans_max": _Parameter(None, (f"{VISUAL}.max_speed",)),
     **{
-        f"{name}_image_{side}": Parameter(default, (f"{VISUAL}.{crop}.{side}",))
+        f"{name}_image_{side}": _Parameter(default, (f"{VISUAL}.{crop}.{side}",))
         for name, crop in (("vrot", "rotation"), ("vtrans", "translation"))
         for side, default in (("x_min", 0), ("x_max", -1), ("y_min", 0), ("y_max", -1))
     },
 }
 """Parameters of the section [visual_odometry]."""
 
-SECTIONS: Mapping[str, Mapping[str, Parameter]] = {
-    "general": {"topic_root": Parameter("", ())},
+SECTIONS: Mapping[str, Mapping[str, _Parameter]] = {
+    "general": {"topic_root": _Parameter("", ())},
     "ratslam": RATSLAM,
     "visual_odometry": VISUAL_ODOMETRY,
 }

@@ -10,7 +10,6 @@ import pytest
 
 import ratslam
 from ratslam.core.session import Session
-from ratslam.runs.map_settings import check_same_sensor
 from ratslam.runs.saved_map import FORMAT, digest_of, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump, dump_data, parse
 from tactile.base.errors import InputError
@@ -150,9 +149,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 )
 def test_other_sensors_are_refused(run: ratslam.Result, changes: dict, message: str) -> None:
     sensor = read_map(run.directory).sensor._replace(geometry={"touch.head.length": 1})
-    check_same_sensor("map.npz", sensor, sensor._replace(transform={}))
+    sensor.check_same("map.npz", sensor._replace(transform={}))
     with pytest.raises(InputError, match=f"map.npz: made with another sensor: {message}"):
-        check_same_sensor("map.npz", sensor, sensor._replace(**changes))
+        sensor.check_same("map.npz", sensor._replace(**changes))
 
 
 def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam.Result) -> None:
@@ -165,7 +164,7 @@ def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam
         transform={f"{views}.max_range": 5.0, f"{views}.columns": 4}, view_shape=(3, 4, 1), cell=0.2
     )
     with pytest.raises(InputError, match="made with other settings of the sensor: ") as caught:
-        check_same_sensor("map.npz", of_map, other)
+        of_map.check_same("map.npz", other)
     cure = f"`--set {views}.max_range=null --set {views}.columns=6 --set pose_cells.cell_size=0.1`"
     assert cure in caught.value.cure
     assert "shape" not in str(caught.value)
