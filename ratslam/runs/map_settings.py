@@ -163,8 +163,8 @@ class Sensor(NamedTuple):
         return f"{', '.join(clauses)} when the map was made" if clauses else ""
 
     def differences(self, other: Sensor) -> list[Difference]:
-        """What differs between this sensor and another one. Settings that only one of them knows do not count;
-        of sensors of two kinds, only the kind is named.
+        """What differs between this sensor and another one. Settings that only one of them knows do not
+        count; of sensors of two kinds, only the kind is named.
         """
         if self.kind != other.kind:
             return [(WORDS["kind"], self.kind, other.kind)]

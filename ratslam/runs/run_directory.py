@@ -158,7 +158,7 @@ class RunDirectory:
 
     def save_grid_map(self) -> None:
         """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in it are
-        known, which they are not of a localised session, also arena.npz (the true grid) and gridscore.json."""
+        known, which they are not of a localised session, arena.npz (the true grid) and gridscore.json too."""
         file = self.path / "grid.npz"
         if not file.exists():
             return

@@ -220,10 +220,10 @@ def export_run(
                 require_new_file(output.with_suffix(name))
             write_nav2(output.parent, grid, output.stem)
         case ".nwb":
-            cells = _read_spikes(directory, config)
+            cells = read_run_cells(directory, config)
             make_new_file(output, lambda path: write_nwb(path, *cells))
         case ".npz":
-            _, drawn, _ = _read_spikes(directory, config)
+            _, drawn, _ = read_run_cells(directory, config)
             make_new_file(output, lambda path: write_spikes(path, drawn))
         case ".csv":
             scores = _score_cells(directory, config.peak_rate)
@@ -258,7 +258,7 @@ def _file(file: Path, what: str) -> Path:
 CURE = "add `cells: {chosen: 64}` to the configuration and run it again"
 
 
-def _read_spikes(directory: Path, config: SpikeConfig) -> tuple[CellRecording, SpikeTrains, str]:
+def read_run_cells(directory: Path, config: SpikeConfig) -> tuple[CellRecording, SpikeTrains, str]:
     """The recorded chosen cells of a run, their spikes, and the sha256 (hex) of all that they were made from.
 
     A cell fires at the peak rate at the peak of a settled packet of the run's network; that is computed in
