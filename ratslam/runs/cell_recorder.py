@@ -13,7 +13,6 @@ import numpy as np
 
 from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
 from ratslam.classic.cell_probe import choose_cells
-from ratslam.classic.config import CellSumsConfig
 from ratslam.core.backend import Backend, PoseCellProbe
 from ratslam.core.session import CHUNK, Probe, Step
 from ratslam.runs.settings.run_config import RunConfig
@@ -66,10 +65,8 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")
     sums = config.cells.sums
     plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed), None)
-    return plan if sums is None else plan._replace(sums=_plan_sums(sums, cells, source))
-
-
-def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> SumsPlan:
+    if sums is None:
+        return plan
     size = 8 * int(np.prod(cells.shape)) * (sums.bins**2 + sums.heading_bins)
     if size > LARGEST_SUMS:
         found = f"sums of {np.prod(cells.shape)} cells, which need {size / 2**30:.1f} GiB"
@@ -82,7 +79,8 @@ def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> Su
         raise InputError("cells.sums.extent", found, "[x0, y0, x1, y1] of the binned rectangle, m")
     x0, y0, x1, y1 = extent
     x_edges, y_edges = np.linspace(x0, x1, sums.bins + 1), np.linspace(y0, y1, sums.bins + 1)
-    return SumsPlan(x_edges, y_edges, sums.heading_bins, max(1, round(source.rate_hz / sums.rate)))
+    interval = max(1, round(source.rate_hz / sums.rate))
+    return plan._replace(sums=SumsPlan(x_edges, y_edges, sums.heading_bins, interval))
 
 
 def _true_extent(source: Source, least: float) -> tuple[float, float, float, float] | None:

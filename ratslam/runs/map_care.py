@@ -71,40 +71,30 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
 def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
     kept, solution = made.kept_keyframes(), made.solution()
     belief = made.keyframes().calibration(*solution)
-    verdicts = _verdicts(made)
-    return {
-        "keyframes": made.keyframes().count,
-        "keyframes_not_merged": kept.count,
-        "sequences": len(verdicts),
-        "accepted_sequences": _accepted(made),
-        "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
-        "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
-        "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
-    }
-
-
-def _verdicts(made: KeyframeMap) -> np.ndarray:
-    """[R] on the sequences of recall: those that may follow them in a final map follow from its poses."""
-    return made.solution().log.verdicts()[: made.log.sequences]
-
-
-def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
-    """The accepted closure sequences: number, first and last step, the steps matched, evidence, and whether
-    it can be undone."""
-    log, step = made.solution().log, made.keyframe_steps()
-    found = []
-    for number in np.flatnonzero(_verdicts(made) == Verdict.ACCEPTED).tolist():
+    # Of the sequences of recall: those that may follow them in a final map follow from its poses.
+    verdicts = solution.log.verdicts()[: made.log.sequences]
+    log, step = solution.log, made.keyframe_steps()
+    accepted = []
+    for number in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
         members = log.members(number)
-        found.append(
+        accepted.append(
             {
                 "sequence": number,
                 "steps": step[members[[0, -1], 0]].tolist(),
                 "match_steps": step[members[[0, -1], 1]].tolist(),
                 "evidence": round(log.score(number), 2),
-                "can_be_undone": made.solution().obstacle(number, made.log) is None,
+                "can_be_undone": solution.obstacle(number, made.log) is None,
             }
         )
-    return found
+    return {
+        "keyframes": made.keyframes().count,
+        "keyframes_not_merged": kept.count,
+        "sequences": len(verdicts),
+        "accepted_sequences": accepted,
+        "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
+        "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
+        "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
+    }
 
 
 def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:

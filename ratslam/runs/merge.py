@@ -203,7 +203,17 @@ def check_mergeable(maps: Sequence[SavedMap]) -> None:
             reason = "has no keyframes whose views could be compared"
             found = f"a map of `backend: {saved.config.backend}`, which {reason}"
             raise InputError(str(saved.path), found, "maps of `backend: recall`")
-        _check_sensors(maps[0], saved)
+        different = maps[0].sensor.differences(saved.sensor)
+        if different:
+            clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
+            settings, cure = settings_of_map(different), "merge those of each sensor alone"
+            other = "another sensor"
+            if settings:
+                config = saved.path.with_name("config.yaml")
+                other = "other settings of the sensor"
+                cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
+            found = f"made with {other} than {maps[0].path}: {clauses}"
+            raise InputError(str(saved.path), found, "maps of one sensor", cure)
     _check_sessions(maps)
 
 
@@ -213,20 +223,6 @@ def _keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
         found = f"a map of `backend: {saved.config.backend}` without keyframes"
         raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
     return made
-
-
-def _check_sensors(first: SavedMap, second: SavedMap) -> None:
-    different = first.sensor.differences(second.sensor)
-    if different:
-        clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
-        settings, cure = settings_of_map(different), "merge those of each sensor alone"
-        other = "another sensor"
-        if settings:
-            config = second.path.with_name("config.yaml")
-            other = "other settings of the sensor"
-            cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
-        found = f"made with {other} than {first.path}: {clauses}"
-        raise InputError(str(second.path), found, "maps of one sensor", cure)
 
 
 def _check_sessions(maps: Sequence[SavedMap]) -> None:

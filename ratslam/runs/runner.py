@@ -350,29 +350,28 @@ def open_runner(
 
 def _lines(
     samples: list[Sample], steps: list[Step], odometry: list[np.ndarray], entry: BackendEntry
-) -> dict[str, Iterator[str]]:
-    rows, columns = list(zip(samples, steps, strict=True)), entry.columns()
+) -> dict[str, list[str]]:
+    """The lines of the text files of a run, by their names."""
+    rows = []
+    for sample, step in zip(samples, steps, strict=True):
+        estimate = step.estimate
+        cells = [
+            repr(float(sample.time)),
+            str(int(estimate.place)),
+            Action(int(estimate.action)).name.lower(),
+            *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
+            str(int(estimate.lost)),
+            _cell(np.asarray(step.doubt)),
+            entry.outcome(step.evidence),
+            *(_cell(getattr(step.evidence, name)) for name in entry.columns()),
+        ]
+        rows.append(",".join(cells) + "\n")
     return {
-        "steps.csv": (_step_line(sample.time, step, entry, columns) for sample, step in rows),
-        "online.tum": (tum_line(sample.time, step.pose) for sample, step in rows),
-        "odometry.tum": (tum_line(s.time, pose) for s, pose in zip(samples, odometry, strict=True)),
-        "truth.tum": (tum_line(s.time, s.truth) for s in samples if s.truth is not None),
+        "steps.csv": rows,
+        "online.tum": [tum_line(s.time, step.pose) for s, step in zip(samples, steps, strict=True)],
+        "odometry.tum": [tum_line(s.time, pose) for s, pose in zip(samples, odometry, strict=True)],
+        "truth.tum": [tum_line(s.time, s.truth) for s in samples if s.truth is not None],
     }
-
-
-def _step_line(time: float, step: Step, entry: BackendEntry, columns: Sequence[str]) -> str:
-    estimate = step.estimate
-    cells = [
-        repr(float(time)),
-        str(int(estimate.place)),
-        Action(int(estimate.action)).name.lower(),
-        *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
-        str(int(estimate.lost)),
-        _cell(np.asarray(step.doubt)),
-        entry.outcome(step.evidence),
-        *(_cell(getattr(step.evidence, name)) for name in columns),
-    ]
-    return ",".join(cells) + "\n"
 
 
 def _cell(value: Any) -> str:

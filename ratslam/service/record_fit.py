@@ -23,7 +23,6 @@ from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_w
 from robot.recordings.real_whiskers import (
     WHISKERS,
     ReachConfig,
-    StageCalibration,
     StageConfig,
     find_touches,
     read_reach,
@@ -40,7 +39,7 @@ from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Observation, Whisk
 from tactile.contact_stream import Touch
 from tactile.frontend import Frontend
-from tactile.rig_signals import HeadFit, SignalFit, SignalRecord, fit_head, fit_signals, head_with
+from tactile.rig_signals import SignalFit, SignalRecord, fit_head, fit_signals, head_with
 from tactile.wall_estimation.signal_map import fit_signal_map, predict_signal
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
@@ -277,18 +276,7 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
         fit = fit_head(assumed, contact, angle, predict)
     except InputError as error:
         return Rig(unknown=(f"rest angle, base radii: {error.found}; {error.expected} are needed",))
-    return _head_rig(assumed, fit)
-
-
-def walls_of(info: SourceInfo) -> Walls:
-    """The walls of the maze of a source."""
-    assert info.maze is not None
-    maze = parse_maze(info.maze.text, Path("maze of the recording"))
-    return wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
-
-
-def _head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
-    """The geometry as a rig; rings whose radius is unknown keep theirs."""
+    # Rings whose radius is unknown keep theirs.
     rest, sd = min(fit.rest_deg[0], STEEPEST_REST), fit.rest_deg[1]
     quantities = [Quantity("rest angle", assumed.rest_deg, rest, sd, "degrees", "touch.head.rest_deg")]
     unknown, radii = [], []
@@ -308,6 +296,13 @@ def _head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
     return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
 
 
+def walls_of(info: SourceInfo) -> Walls:
+    """The walls of the maze of a source."""
+    assert info.maze is not None
+    maze = parse_maze(info.maze.text, Path("maze of the recording"))
+    return wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
+
+
 PLUGIN = "whisker_stage"
 FOLDS, BLOCK = 3, 10
 """Parts of the rows held out in turn, and consecutive rows held out together: neighbours are alike."""
@@ -321,8 +316,17 @@ def _fit_stage(source: PluginConfig) -> Rig:
     """
     settings = read_settings(StageConfig, source.settings, "source.settings")
     record = read_stage_calibration(settings.file)
+    # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.
+    errors = np.zeros((2, len(record.signal)))
     try:
-        errors = _held_out_errors(record)
+        for fold in _folds(len(record.signal)):
+            known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
+            for out, mean in zip(
+                errors,
+                (predict_signal(known, record.position[fold]), record.signal[~fold].mean(axis=0)),
+                strict=True,
+            ):
+                out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))
     except InputError as reason:
         return Rig(unknown=(f"stage-to-signal map: {reason}",))
     size = float(np.sqrt((record.signal**2).mean()))
@@ -338,19 +342,6 @@ def _fit_stage(source: PluginConfig) -> Rig:
     )
     unknown = ("noise, drift: a stage rests between its rows, and the file has no time",)
     return Rig(quantities, notes=(note,), unknown=unknown)
-
-
-def _held_out_errors(record: StageCalibration) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean square errors [N] over the channels, of the map and of the mean signal, each row held out."""
-    error, control = np.zeros(len(record.signal)), np.zeros(len(record.signal))
-    for fold in _folds(len(record.signal)):
-        known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
-        for out, mean in (
-            (error, predict_signal(known, record.position[fold])),
-            (control, record.signal[~fold].mean(axis=0)),
-        ):
-            out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))
-    return error, control
 
 
 def _folds(rows: int) -> list[np.ndarray]:

@@ -273,36 +273,32 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
 def _images(
     directory: Path, time: np.ndarray, warn: Callable[[str], None]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Whisker images of the run directory, or the views of its recording if that is still there."""
+    """Whisker images of the run directory, or the views of its recording if that is still there; none for a
+    simulation, which would have to be repeated."""
     if (directory / "views.npz").exists():
         views = read_whisker_views(directory / "views.npz").view
         yield from enumerate(_pixels(view[..., None]) for view in views[: len(time)])
         return
     try:
-        yield from _recorded_views(directory, time)
+        config = load_config(directory / "config.yaml")
+        if config.recording is None:
+            return
+        digest = read_manifest(directory).digest
+        with open_observations(config) as (_, source):
+            if source.digest != digest:
+                cure = "the views are those of another recording"
+                raise InputError(source.name, "changed since the run", "the recording of the run", cure)
+            step = 0
+            for sample, observation in read_observations(source):
+                if step == len(time):
+                    return
+                if sample.time != time[step]:  # a continued run starts later in its recording
+                    continue
+                if observation.view_seen and observation.view.size:
+                    yield step, _pixels(observation.view)
+                step += 1
     except InputError as error:
         warn(f"the file has no views: {error}")
-
-
-def _recorded_views(directory: Path, time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """The views of the recording of a run; none for a simulation, which would have to be repeated."""
-    config = load_config(directory / "config.yaml")
-    if config.recording is None:
-        return
-    digest = read_manifest(directory).digest
-    with open_observations(config) as (_, source):
-        if source.digest != digest:
-            cure = "the views are those of another recording"
-            raise InputError(source.name, "changed since the run", "the recording of the run", cure)
-        step = 0
-        for sample, observation in read_observations(source):
-            if step == len(time):
-                return
-            if sample.time != time[step]:  # a continued run starts later in its recording
-                continue
-            if observation.view_seen and observation.view.size:
-                yield step, _pixels(observation.view)
-            step += 1
 
 
 def _pixels(view: np.ndarray) -> np.ndarray:

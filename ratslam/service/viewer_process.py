@@ -96,7 +96,15 @@ class Drawing:
         self._start = step.time if self._start is None else self._start
         self._recording.set_time(STEP, sequence=step.number)
         self._recording.set_time(TIME, duration=step.time - self._start)
-        self._note(step)
+        # Path, place and link of the step; steps that were dropped get its pose.
+        self._odometry.append(step.odometry)
+        self._online.append(step.pose)
+        for _ in range(len(self._path.rows), step.number + 1):
+            self._path.append(step.pose)
+        if step.place >= 0:
+            self._place_step.setdefault(step.place, step.number)
+            if step.previous >= 0 and step.previous != step.place:
+                self._links.add((step.previous, step.place))
         turn = self._rr.RotationAxisAngle([0, 0, 1], radians=float(step.pose[2]))
         place = [*step.pose[:2], 0.0]
         self._log("world/robot", self._rr.Transform3D(translation=place, rotation_axis_angle=turn))
@@ -110,17 +118,6 @@ class Drawing:
             self._log("view", self._rr.Image(shown))
         if self._run.head is not None:
             self._draw_whiskers(observation)
-
-    def _note(self, step: StepReport) -> None:
-        """Remembers path, place and link of a step; steps that were dropped get its pose."""
-        self._odometry.append(step.odometry)
-        self._online.append(step.pose)
-        for _ in range(len(self._path.rows), step.number + 1):
-            self._path.append(step.pose)
-        if step.place >= 0:
-            self._place_step.setdefault(step.place, step.number)
-            if step.previous >= 0 and step.previous != step.place:
-                self._links.add((step.previous, step.place))
 
     def _draw_whiskers(self, observation: Any) -> None:
         head = self._run.head
@@ -189,21 +186,16 @@ class Drawing:
         self._log("pose_cells/activity", self._rr.DepthImage(picture, colormap=colours))
         self._log("pose_cells/heading", self._rr.BarChart(activity.heading))
         if activity.packets is not None:
-            self._draw_packets(activity.packets)
+            heading, mass = activity.packets[:, 2:].T
+            arrows = self._rr.Arrows3D(
+                origins=_on_floor(activity.packets),
+                vectors=0.15 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(mass))]),
+                colors=[[*ORANGE, round(255 * min(1.0, share))] for share in mass.tolist()],
+                labels=[f"{share:.0%}" for share in mass],
+            )
+            self._log("world/packets", arrows)
             novelty = max(0.0, 1.0 - float(activity.heading.sum()))
             self._log("health/novelty", self._rr.Scalars(novelty))
-
-    def _draw_packets(self, packets: np.ndarray) -> None:
-        heading, mass = packets[:, 2:].T
-        vectors = 0.15 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(mass))])
-        colours = [[*ORANGE, round(255 * min(1.0, share))] for share in mass.tolist()]
-        arrows = self._rr.Arrows3D(
-            origins=_on_floor(packets),
-            vectors=vectors,
-            colors=colours,
-            labels=[f"{share:.0%}" for share in mass],
-        )
-        self._log("world/packets", arrows)
 
     def _draw_grid(self, grid: GridDrawing) -> None:
         cells = np.rint(100 * grid.probability).astype(np.uint8)[::-1]
