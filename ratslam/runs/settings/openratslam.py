@@ -22,8 +22,8 @@ TEMPLATES, CELLS, NETWORK, MAP = "templates", "pose_cells", "attractor", "experi
 
 
 _Parameter = tuple[Value, tuple[str, ...]]
-"""A parameter of OpenRatSLAM: the value of a missing key there, of the type of the parameter (None: there is no
-default), and the dotted settings here that take it."""
+"""A parameter of OpenRatSLAM: the value of a missing key there, of the type of the parameter (None: there is
+no default), and the dotted settings here that take it."""
 
 RATSLAM: dict[str, _Parameter] = {
     "image_crop_x_min": (0, (f"{IMAGE}.crop.x_min",)),
