@@ -59,7 +59,7 @@ WhiskerView = tuple[np.ndarray, np.ndarray]
 class RunDirectory:
     """A new run directory; a context manager that closes its text files.
 
-    Its process holds a lock on steps.csv, by which a run is told from one that was killed.
+    Its process holds a lock on steps.csv, which distinguishes a run from one that was killed.
 
     Args:
         columns: columns of steps.csv that the backend adds. manifest: the first text of manifest.json, which

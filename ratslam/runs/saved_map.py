@@ -38,7 +38,7 @@ FORMATS = ("ratslam-map-1", "ratslam-map-2", FORMAT)
 cells."""
 EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
 ARCHIVE = b"PK"
-"""Beginning of every map file, by which a damaged one is told from another file."""
+"""Beginning of every map file, which distinguishes a damaged one from another file."""
 
 
 def _read_arrays(file: Path) -> dict[str, np.ndarray]:
@@ -208,7 +208,32 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     if digest_of(arrays) != texts["sha256"]:
         problem = "damaged: the content does not match its sha256"
         raise InputError(str(file), problem, "the file as it was written", "restore it from a copy")
-    return _saved_map(file, arrays, texts)
+    config = validate(with_moved_settings(parse(texts["config"], f"{file}: config")), LoopConfig)
+    BACKENDS.get(config.backend, f"{file}: backend")
+    if texts["format"] == FORMATS[0]:
+        # Unknown if a recording after the first began a piece of the map.
+        names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
+        begun = any(np.any(arrays[name]) for name in names if name in arrays)
+        arrays["earlier"] = np.array(UNKNOWN if begun else 0)
+    with malformed(file, EXPECTED, found="{}", spoilt=NPZ_SPOILT):
+        source = SourceDescription.from_json(texts["source"])
+        estimate = PoseEstimate.of_arrays(with_prefix(arrays, ESTIMATE))
+        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
+    if steps < 0:
+        raise InputError(str(file), f"{steps} steps", EXPECTED)
+    if not UNKNOWN <= earlier <= steps:
+        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
+    own = {name: value for name, value in arrays.items() if name not in TEXTS}
+    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
+    fill_missing(session)
+    if texts["format"] != FORMAT:
+        session["sides"] = np.zeros(0, np.int64)
+        if config.backend in CHANGED:
+            session = {name: value for name, value in session.items() if not name.startswith(STATE)}
+    return SavedMap(
+        file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
+        with_prefix(arrays, FRONTEND),
+    )  # fmt: skip
 
 
 def write_map(
@@ -256,35 +281,6 @@ def describe_readings(source: Source) -> SourceDescription:
     return SourceDescription(
         source.view_shape, source.whiskers, source.rate_hz, describe(readings).info, source.name
     )
-
-
-def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
-    config = validate(with_moved_settings(parse(texts["config"], f"{file}: config")), LoopConfig)
-    BACKENDS.get(config.backend, f"{file}: backend")
-    if texts["format"] == FORMATS[0]:
-        # Unknown if a recording after the first began a piece of the map.
-        names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
-        begun = any(np.any(arrays[name]) for name in names if name in arrays)
-        arrays["earlier"] = np.array(UNKNOWN if begun else 0)
-    with malformed(file, EXPECTED, found="{}", spoilt=NPZ_SPOILT):
-        source = SourceDescription.from_json(texts["source"])
-        estimate = PoseEstimate.of_arrays(with_prefix(arrays, ESTIMATE))
-        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
-    if steps < 0:
-        raise InputError(str(file), f"{steps} steps", EXPECTED)
-    if not UNKNOWN <= earlier <= steps:
-        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
-    own = {name: value for name, value in arrays.items() if name not in TEXTS}
-    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
-    fill_missing(session)
-    if texts["format"] != FORMAT:
-        session["sides"] = np.zeros(0, np.int64)
-        if config.backend in CHANGED:
-            session = {name: value for name, value in session.items() if not name.startswith(STATE)}
-    return SavedMap(
-        file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
-        with_prefix(arrays, FRONTEND),
-    )  # fmt: skip
 
 
 def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:

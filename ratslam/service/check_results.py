@@ -83,7 +83,7 @@ class Result(NamedTuple):
 def run_checks(checks: Iterable[Check], part: Any) -> Iterator[Result]:
     """Runs the checks of one group after another; a group after one with a failed check is not run.
 
-    An exception of the part under test is a failure, told by its type, text and place in one line.
+    An exception of the part under test is a failure, described by its type, text and place in one line.
     """
     sound = True
     for _, group in groupby(checks, lambda check: check.group):

@@ -142,7 +142,7 @@ def _measure(
     sums = np.cumsum(np.column_stack([np.hypot(raw[:, 0], raw[:, 1]), raw[:, 2], np.abs(raw[:, 2])]), axis=0)
     length, turn, turned = np.diff(sums[ends], axis=0).T
     known = np.flatnonzero(np.isfinite(truth).all(axis=1))
-    # A turn of more than half a circle between two true poses is told apart by the odometry.
+    # A turn of more than half a circle between two true poses is resolved by the odometry.
     steps = np.diff(sums[known, 1])
     steps = steps + wrap(np.diff(truth[known, 2]) - steps)
     true_sum = np.concatenate([[0.0], np.cumsum(steps)])[np.searchsorted(known, ends)]

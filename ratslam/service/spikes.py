@@ -1,19 +1,12 @@
-"""Poisson spikes of recorded pose cells.
+"""Poisson spikes of recorded pose cells, by time rescaling (Brown et al. 2002, Neural Computation 14: 325).
 
-The rate of a cell is `peak_rate * activity / reference`, in Hz. It holds from the step at which the activity
-was recorded to the next one (piecewise constant), so the last step has no spikes after it. The reference is
-an activity that the caller gives, as a rule that of a settled packet (`settled_peak`): the largest
-activity of the chosen cells would make the rate of a cell depend on which others were chosen. A packet
-sharper than the reference fires faster than the peak rate.
-
-Spikes are those of an inhomogeneous Poisson process, by time rescaling (Brown et al. 2002, Neural
-Computation 14: 325): arrival times of a process of rate 1 are mapped through the inverse of the integral of
-the rate. That is exact for piecewise constant rates: the count of a step is Poisson with the integral of the
-rate as its mean, and times are uniform within the step.
-There is no refractory period, no burst and no adaptation; two spikes may be as close as they like.
-
-A cell draws from a stream that is named after its index. Its spikes do not depend on which other cells were
-chosen, and a longer recording begins with the spikes of a shorter one.
+The rate of a cell, `peak_rate * activity / reference` in Hz, holds from a step to the next one. The
+reference is an activity that the caller gives, as a rule that of a settled packet (`settled_peak`): the
+largest activity of the chosen cells would make the rate of a cell depend on the others. Arrival times of a
+process of rate 1 are mapped through the inverse of the integral of the rate, which is exact for piecewise
+constant rates. There is no refractory period, no burst and no adaptation. A cell draws from a stream named
+after its index: its spikes do not depend on which other cells were chosen, and a longer recording begins
+with those of a shorter one.
 """
 
 from __future__ import annotations
