@@ -57,7 +57,6 @@ def add_commands(commands: Commands) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from ratslam.service.recording_check import render
 
     if arguments.set and not arguments.live:
         raise InputError("--set", "settings without --live", "the configuration of a live session")
@@ -75,7 +74,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
         diagnosis = diagnose_run(arguments.path)
     else:
         diagnosis = _check_recording(arguments)
-    print(render(diagnosis))
+    print(diagnosis.render())
     return FAULTY if diagnosis.faults else 0
 
 
@@ -107,15 +106,14 @@ def _fit(arguments: argparse.Namespace) -> int:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
     from ratslam.service.record_fit import fit_record
-    from ratslam.service.rig_fit import render_rig, rig_file
 
     rig = fit_record(_config_of(arguments), arguments.seed)
-    print(render_rig(rig))
+    print(rig.render())
     if not rig.quantities and not rig.settings:
         raise InputError(str(arguments.record), "nothing that tells of the rig", "true poses or whiskers")
     output: Path | None = arguments.output
     if output is not None:
-        text = rig_file(rig, str(arguments.record))
+        text = rig.file_text(str(arguments.record))
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
         print(f"{output}: written")
     return 0

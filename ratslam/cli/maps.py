@@ -235,7 +235,7 @@ def _localise(arguments: argparse.Namespace) -> int:
     directory = arguments.output or Path("runs") / f"{arguments.recording.stem}_in_{place}"
     with open_viewer(target) as observers:
         card, summary, interrupted = localise(saved, config, directory, observers)
-    print(summary.describe())
+    print(summary)
     print(f"{directory}/localisation.csv holds the state and the probability of every step,")
     print(f"{directory}/trajectory.tum the poses, in the frame of the map where it was found")
     print(summarise(directory, card, f"localising in {arguments.map}"))

@@ -81,10 +81,10 @@ def _convert(arguments: argparse.Namespace) -> int:
     output, recording = arguments.output, arguments.recording
     if recording is not None and output is not None and not recording.is_absolute():
         recording = Path(os.path.relpath(recording, output.parent))  # paths in a file start at its folder
-    converted = convert_parameters(arguments.parameters, recording)
-    for note in converted.notes:
+    settings, notes = convert_parameters(arguments.parameters, recording)
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(converted.settings)
+    text = f"# From {arguments.parameters.name} of OpenRatSLAM.\n" + dump_data(settings)
     if output:
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     else:

@@ -31,7 +31,7 @@ recording:
 def main() -> None:
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_bag(folder / "robot")
+        _write_bag(folder / "robot")
         (folder / "robot.yaml").write_text(CONFIG, encoding="utf-8")
         result = ratslam.run(folder / "robot.yaml", folder / "a bag")
         error = result.scorecard.quantities["ate_final"]
@@ -39,7 +39,7 @@ def main() -> None:
         result.plot().savefig("a_bag.png")
 
 
-def write_bag(path: Path) -> None:
+def _write_bag(path: Path) -> None:
     """A robot that drives circles in a room; its odometry turns 5 % too far."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -53,7 +53,7 @@ def write_bag(path: Path) -> None:
         packages = {"PoseStamped": "geometry_msgs", "LaserScan": "sensor_msgs"}
         kinds = {topic: f"{packages[name]}/msg/{name}" for topic, name in names.items()}
         links = {topic: bag.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
-        for k, ranges in enumerate(measure(truth)):
+        for k, ranges in enumerate(_measure(truth)):
             time = 10**9 + k * 10**8  # ns
             header = make["Header"](make["Time"](time // 10**9, time % 10**9), "odom")
             limits = (RAYS[0], RAYS[-1], RAYS[1] - RAYS[0], 0.0, 0.1, 0.1, 9.0)  # angles, times, ranges
@@ -65,7 +65,7 @@ def write_bag(path: Path) -> None:
                 bag.write(links[topic], time, store.serialize_cdr(message, kinds[topic]))
 
 
-def measure(poses: np.ndarray) -> np.ndarray:
+def _measure(poses: np.ndarray) -> np.ndarray:
     """[T, 72] ranges to the walls, m, float32."""
     angle = poses[:, 2:] + RAYS
     ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -45,10 +45,10 @@ def main() -> None:
     way = find_way(graph, here, [start])
     off = np.hypot(*(estimate.pose - true)[:2])
     print(f"found after {slam.steps} whisks, {off:.2f} m off; {way.length:.1f} m to the start")
-    draw(path, slam.trajectory(), way.poses).savefig("come_back.png")
+    _draw(path, slam.trajectory(), way.poses).savefig("come_back.png")
 
 
-def draw(path: np.ndarray, session: np.ndarray, way: np.ndarray) -> Figure:
+def _draw(path: np.ndarray, session: np.ndarray, way: np.ndarray) -> Figure:
     """The map, where the robot was found, and the way to the start of the map."""
     line = "a robot set down in a saved map finds itself, and the way to its start"
     figure = new_figure(5.0, "Come back", line)

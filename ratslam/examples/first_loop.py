@@ -29,10 +29,10 @@ def main() -> None:
     paths = {"odometry": integrate(np.array(motion)), "before": before, "after": slam.trajectory()}
     off = {name: np.hypot(*(path[-1] - true[len(path) - 1])[:2]) for name, path in paths.items()}
     print(f"step {slam.steps}: odometry {off['odometry']:.1g} m off, map {off['after']:.1g} m off")
-    draw(true, paths, slam.map.closures()).savefig("first_loop.png")
+    _draw(true, paths, slam.map.closures()).savefig("first_loop.png")
 
 
-def draw(truth: np.ndarray, paths: dict[str, np.ndarray], closures: np.ndarray) -> Figure:
+def _draw(truth: np.ndarray, paths: dict[str, np.ndarray], closures: np.ndarray) -> Figure:
     """The map before and after the first loop closures, over the true path."""
     figure = new_figure(5.0, "The first loop", "loop closures join the robot's place with its first visit")
     for column, name in enumerate(("before", "after")):

@@ -34,10 +34,10 @@ def main() -> None:
     }
     off = {name: np.hypot(*(path - paths["truth"])[:, :2].T).mean() for name, path in paths.items()}
     print(f"after {slam.steps} reports: {off['grid filter']:.1g} m off, odometry {off['odometry']:.1g} m")
-    draw(maps, paths, config.grid.cell).savefig("grid_filter.png")
+    _draw(maps, paths, config.grid.cell).savefig("grid_filter.png")
 
 
-def draw(maps: dict[int, np.ndarray], paths: dict[str, np.ndarray], cell: float) -> Figure:
+def _draw(maps: dict[int, np.ndarray], paths: dict[str, np.ndarray], cell: float) -> Figure:
     """The map as it grows; bright cells are occupied."""
     line = f"probability of an obstacle in each cell of {100 * cell:g} cm; bright: occupied"
     figure = new_figure(4.4, "The grid filter", line)

@@ -33,10 +33,10 @@ def main() -> None:
         cells, info = step(cells)
     active = int((history[-1] > 0).sum())
     print(f"after {SHOWN[-1]} steps: {active} of {history[-1].size} active, sd {info.spread[0]:.2f} cells")
-    draw([history[number] for number in SHOWN]).savefig("one_packet.png")
+    _draw([history[number] for number in SHOWN]).savefig("one_packet.png")
 
 
-def draw(activity: list[np.ndarray]) -> Figure:
+def _draw(activity: list[np.ndarray]) -> Figure:
     """Activity over x and y above, over the heading below, at the steps shown."""
     title = "One activity packet"
     figure = new_figure(

@@ -41,10 +41,10 @@ def main() -> None:
     unwrapped = around + config.cells_xy * np.round((odometry - around) / config.cells_xy)
     off = np.hypot(*(unwrapped - odometry).T)
     print(f"{FORWARD * STEPS:.3g} m driven, the packet {off.mean():.2g} cells from the odometry in the mean")
-    draw(odometry, unwrapped, around, config.cells_xy).savefig("path_integration.png")
+    _draw(odometry, unwrapped, around, config.cells_xy).savefig("path_integration.png")
 
 
-def draw(odometry: np.ndarray, unwrapped: np.ndarray, around: np.ndarray, size: int) -> Figure:
+def _draw(odometry: np.ndarray, unwrapped: np.ndarray, around: np.ndarray, size: int) -> Figure:
     """The path in the plane on the left, the packet on the torus on the right; cells."""
     line = "the square is the torus of 21 x 21 cells: what leaves it on one side returns on the other"
     figure = new_figure(5.0, "Path integration", line)

@@ -51,10 +51,10 @@ def main() -> None:
     }
     line = "classic: {classic:.1g} m off the true path, recall {recall:.1g} m, odometry {odometry:.1g} m"
     print(line.format(**off))
-    draw(aligned).savefig("places_that_look_alike.png")
+    _draw(aligned).savefig("places_that_look_alike.png")
 
 
-def draw(paths: dict[str, np.ndarray]) -> Figure:
+def _draw(paths: dict[str, np.ndarray]) -> Figure:
     """The maps of both methods over the true path."""
     figure = new_figure(5.2, "Places that look alike", "two laps; the yellow stretches have the same views")
     for column, (method, color) in enumerate((("classic", VERMILLION), ("recall", BLUE))):

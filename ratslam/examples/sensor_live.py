@@ -21,7 +21,7 @@ MOTION = np.array([0.05, 0.0, 2 * np.pi / 75])  # per reading: m, m, rad
 Reading = tuple[ratslam.Odometry, np.ndarray]
 
 
-def read_robot(readings: "queue.Queue[Reading | None]") -> None:
+def _read_robot(readings: "queue.Queue[Reading | None]") -> None:
     """Your driver. Here: a robot that drives circles in a room, whose odometry turns 3 % too far."""
     random, rays = np.random.default_rng(2), np.arange(6) * np.pi / 3
     for x, y, heading in integrate(np.tile(MOTION, (READINGS, 1))):
@@ -38,7 +38,7 @@ def main() -> None:
     config = ratslam.load_config("square", ["recording=null", "session.reserve=512"], source_required=False)
     slam = ratslam.Slam(config, ratslam.SourceDescription(view_shape=(1, 6, 1), rate_hz=1 / PERIOD))
     readings: queue.Queue[Reading | None] = queue.Queue()
-    threading.Thread(target=read_robot, args=(readings,), daemon=True).start()
+    threading.Thread(target=_read_robot, args=(readings,), daemon=True).start()
     motion, online, seconds = [], [], []
     while (reading := readings.get()) is not None:
         begin = time.perf_counter()
@@ -51,10 +51,10 @@ def main() -> None:
     off = {name: np.hypot(*(path - truth)[:, :2].T).mean() for name, path in paths.items()}
     errors = f"{off['online']:.1g} m off, odometry {off['odometry']:.1g} m"
     print(f"{slam.steps} readings mapped as they came: {errors}")
-    draw(truth, paths, np.array(seconds)).savefig("sensor_live.png")
+    _draw(truth, paths, np.array(seconds)).savefig("sensor_live.png")
 
 
-def draw(truth: np.ndarray, paths: dict[str, np.ndarray], seconds: np.ndarray) -> Figure:
+def _draw(truth: np.ndarray, paths: dict[str, np.ndarray], seconds: np.ndarray) -> Figure:
     """The poses as they were known during the session, and the time that each step took."""
     figure = new_figure(
         4.9, "Your sensor, live", "four circles in a room, known by six ranges and bad odometry"

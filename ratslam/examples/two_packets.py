@@ -40,10 +40,10 @@ def main() -> None:
     taken = int(np.argmax(x[STRONG] > (PACKET[0] + PLACE[0]) / 2)) + 1
     forgotten = "forgotten" if abs(x[WEAK][-1] - PACKET[0]) < 1 else "not forgotten"
     print(f"{WEAK} a step is {forgotten}, {STRONG} a step takes over after {taken} steps")
-    draw(x, images).savefig("two_packets.png")
+    _draw(x, images).savefig("two_packets.png")
 
 
-def draw(x: dict[float, np.ndarray], images: list[tuple[int, np.ndarray]]) -> Figure:
+def _draw(x: dict[float, np.ndarray], images: list[tuple[int, np.ndarray]]) -> Figure:
     """Activity over x, y at three steps of the strong injection; decoded x of both."""
     figure = new_figure(
         4.9, "Two packets", "energy is injected at x = 18, y = 4; the network keeps one packet"

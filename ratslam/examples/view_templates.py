@@ -49,10 +49,10 @@ def main() -> None:
         f"first walk: {count} templates stored; second walk: {len(stored_at) - count} stored, "
         f"{right.mean():.0%} of the views recognised at the right place"
     )
-    draw(views[:half], np.split(template, 2), where[:half]).savefig("view_templates.png")
+    _draw(views[:half], np.split(template, 2), where[:half]).savefig("view_templates.png")
 
 
-def draw(views: np.ndarray, templates: list[np.ndarray], where: np.ndarray) -> Figure:
+def _draw(views: np.ndarray, templates: list[np.ndarray], where: np.ndarray) -> Figure:
     """The views of the first walk above, the template of each view of both walks below."""
     figure = new_figure(5.2, "View templates", "a corridor walked twice; views are rows of 24 grey values")
     above, below = add_axes(figure, 0.62, 2.9, 7.0, 1.4), add_axes(figure, 0.62, 0.6, 7.0, 1.9)

@@ -28,10 +28,10 @@ def main() -> None:
         )  # [whisk, ring, column]
     touched = (images["contact_angle"] > 0).mean()
     print(f"{WHISKS} whisks of {images['contact_angle'][0].size} whiskers, {touched:.0%} of them in contact")
-    draw(images).savefig("whisker_images.png")
+    _draw(images).savefig("whisker_images.png")
 
 
-def draw(images: dict[str, np.ndarray]) -> Figure:
+def _draw(images: dict[str, np.ndarray]) -> Figure:
     """Some images of both transforms."""
     line = "a pixel a whisker: the height of the wall that it touches, dark for tall; white: no contact"
     figure = new_figure(3.2, "Whisker images", line)

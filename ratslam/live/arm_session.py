@@ -15,7 +15,7 @@ from evaluation.metrics.trajectory import read_tum
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.goal_planner import GoalPlanner, contact_map
-from ratslam.runs.localise import localising_for_goals
+from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
@@ -70,7 +70,7 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
     drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
     contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
     route = GoalRoute(drive, live, drive.off_way, goal.coast, contacts)
-    return localising_for_goals(config, saved, goal.start), route
+    return localising(config, saved, goal.start), route
 
 
 class GoalSteering:

@@ -1,7 +1,4 @@
-"""Makes the session of a configuration and its source.
-
-Opens the source of a configuration: a recording or a simulation.
-"""
+"""Opens the source of a configuration (a recording or a simulation), and makes the session for the two."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from ratslam.core.compilation import prepare_precision
 from ratslam.core.session import Session
 from ratslam.mapping.config import FULL, Ablation
 from ratslam.methods.method_registry import Sensors, build
-from ratslam.runs.cell_recorder import plan_recording, probe_of
+from ratslam.runs.cell_recorder import plan_recording
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.recordings.formats import open_recording
@@ -40,7 +37,7 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
 
     A configuration that reserves no rows reserves those of the source (`RESERVED`): equal sources and
     configurations give equal capacities, and so equal bits. A configuration with `cells` gives steps with
-    the records of `probe_of`.
+    the records of `RecordingPlan.probe`.
 
     Raises:
         InputError: see `ratslam.methods.method_registry.build` and `plan_recording`.
@@ -55,7 +52,7 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
         seed=config.session.seed,
         reserve=config.session.reserve or rows,
         precision=config.session.precision,
-        probe=None if plan is None else probe_of(plan),
+        probe=None if plan is None else plan.probe(),
     )
 
 

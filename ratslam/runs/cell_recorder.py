@@ -1,6 +1,6 @@
 """Records the pose cells of a run: rows go to a file while it runs, which becomes cells.npz at the end.
 
-What is recorded of the pose cells of a session: settings completed with the network and the source.
+`plan_recording` says which cells are recorded, and over which bins all of them are summed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from evaluation.cells.recording import NAME, BinnedSums, CellRecording, write_recording
 from ratslam.classic.cell_probe import choose_cells
-from ratslam.classic.config import CellSumsConfig
 from ratslam.core.backend import Backend, PoseCellProbe
 from ratslam.core.session import CHUNK, Probe, Step
 from ratslam.runs.settings.run_config import RunConfig
@@ -44,6 +43,12 @@ class RecordingPlan(NamedTuple):
     cell: np.ndarray
     sums: SumsPlan | None
 
+    def probe(self) -> Probe:
+        """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
+        cells are summed what was held of them."""
+        each = lambda state: self.cells.each(state, self.cell)  # noqa: E731
+        return Probe(each) if self.sums is None else Probe(each, self.cells.hold, self.sums.interval)
+
 
 def plan_recording(config: RunConfig, source: Source, backend: Backend) -> RecordingPlan | None:
     """The plan for a completed configuration, its source and its method; None: nothing is recorded.
@@ -60,17 +65,8 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")
     sums = config.cells.sums
     plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed), None)
-    return plan if sums is None else plan._replace(sums=_plan_sums(sums, cells, source))
-
-
-def probe_of(plan: RecordingPlan) -> Probe:
-    """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
-    cells are summed what was held of them."""
-    each = lambda state: plan.cells.each(state, plan.cell)  # noqa: E731
-    return Probe(each) if plan.sums is None else Probe(each, plan.cells.hold, plan.sums.interval)
-
-
-def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> SumsPlan:
+    if sums is None:
+        return plan
     size = 8 * int(np.prod(cells.shape)) * (sums.bins**2 + sums.heading_bins)
     if size > LARGEST_SUMS:
         found = f"sums of {np.prod(cells.shape)} cells, which need {size / 2**30:.1f} GiB"
@@ -83,7 +79,8 @@ def _plan_sums(sums: CellSumsConfig, cells: PoseCellProbe, source: Source) -> Su
         raise InputError("cells.sums.extent", found, "[x0, y0, x1, y1] of the binned rectangle, m")
     x0, y0, x1, y1 = extent
     x_edges, y_edges = np.linspace(x0, x1, sums.bins + 1), np.linspace(y0, y1, sums.bins + 1)
-    return SumsPlan(x_edges, y_edges, sums.heading_bins, max(1, round(source.rate_hz / sums.rate)))
+    interval = max(1, round(source.rate_hz / sums.rate))
+    return plan._replace(sums=SumsPlan(x_edges, y_edges, sums.heading_bins, interval))
 
 
 def _true_extent(source: Source, least: float) -> tuple[float, float, float, float] | None:
@@ -101,27 +98,13 @@ def _true_extent(source: Source, least: float) -> tuple[float, float, float, flo
 
 
 ROWS = "cells.rows"
-"""File of the rows of a run that goes on, or was killed: plain records of `row_type`."""
+"""File of the rows of a run that goes on, or was killed: plain records."""
 BUFFERED = 32 * CHUNK
 """Rows kept in memory before they are appended to the file."""
 
 
-def row_type(chosen: int) -> np.dtype:
-    """The record of one step with this number of chosen cells, as the fields of `CellRecording`."""
-    return np.dtype(
-        [
-            ("time", "<f8"),
-            ("truth", "<f8", 3),
-            ("packet", "<f8", 3),
-            ("energy", "<f8"),
-            ("place", "<i4"),
-            ("activity", "<f4", (chosen,)),
-        ]
-    )
-
-
 class CellRecorder:
-    """Records the steps of a session whose probe is `probe_of(plan)`.
+    """Records the steps of a session whose probe is `plan.probe()`.
 
     Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
 
@@ -131,7 +114,15 @@ class CellRecorder:
 
     def __init__(self, directory: Path, plan: RecordingPlan) -> None:
         self._directory, self._plan = directory, plan
-        self._rows = np.zeros(BUFFERED, row_type(len(plan.cell)))
+        row = [  # of one step, as the fields of `CellRecording`
+            ("time", "<f8"),
+            ("truth", "<f8", 3),
+            ("packet", "<f8", 3),
+            ("energy", "<f8"),
+            ("place", "<i4"),
+            ("activity", "<f4", (len(plan.cell),)),
+        ]
+        self._rows = np.zeros(BUFFERED, np.dtype(row))
         self._filled = 0
         self._sums: CellSums | None = None
         (directory / ROWS).touch(exist_ok=False)
@@ -149,8 +140,13 @@ class CellRecorder:
         rows["place"] = [step.estimate.place for step in steps]
         rows["activity"] = [step.probed for step in steps]
         self._filled += len(steps)
-        if self._plan.sums is not None:
-            self._add_sums(samples, steps)
+        if self._plan.sums is None:
+            return
+        if self._sums is None:
+            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
+        for sample, step in zip(samples, steps, strict=True):
+            if step.seldom is not None:
+                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
 
     def finish(self) -> None:
         """Writes cells.npz with all rows and the sums, and removes cells.rows.
@@ -170,30 +166,10 @@ class CellRecorder:
         write_recording(self._directory / NAME, recording)
         path.unlink()
 
-    def _add_sums(self, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
-        assert self._plan.sums is not None
-        if self._sums is None:
-            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
-        for sample, step in zip(samples, steps, strict=True):
-            if step.seldom is not None:
-                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
-
     def _write(self) -> None:
         with (self._directory / ROWS).open("ab") as file:
             file.write(self._rows[: self._filled].tobytes())
         self._filled = 0
-
-
-def open_cell_recorder(
-    config: RunConfig, source: Source, backend: Backend, directory: Path
-) -> CellRecorder | None:
-    """The recorder of a completed configuration; None: nothing is recorded.
-
-    Raises:
-        InputError: see `plan_recording`.
-    """
-    plan = plan_recording(config, source, backend)
-    return None if plan is None else CellRecorder(directory, plan)
 
 
 class CellSums:

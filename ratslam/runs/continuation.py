@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from evaluation.artifacts.manifest import read_manifest
-from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.estimate import START, PoseEstimate
-from ratslam.runs.map_settings import check_same_method, check_same_sensor, sensor_of
-from ratslam.runs.saved_map import NAME, SavedMap, map_file, read_map
+from ratslam.runs.map_settings import Sensor, check_same_method
+from ratslam.runs.saved_map import NAME, map_file, read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError, tell
@@ -60,11 +59,22 @@ def resume_session(
             or settings; or another recording cannot go on from it, because it is one piece.
     """
     saved = read_map(path, tell)
-    check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+    saved.sensor.check_same(str(saved.path), Sensor.of(config, source))
     check_same_method(str(saved.path), saved.config, config)
     samples = saved.samples_of(source.digest)
     if samples is None:  # before settings that follow from the source are compared
-        _require_pieces(session.map, saved, source)
+        try:
+            session.map.begin_piece()
+        except InputError:
+            method = saved.config.backend
+            found = (
+                f"a map of `backend: {method}`, which is one piece; {source.name} is not the recording that "
+                "was mapped last, and the robot may stand anywhere when it begins"
+            )
+            localised = f"find the robot in this map with `ratslam localise {saved.path}`"
+            other = localised if method in LOCALISING else "map both with `backend: recall`"
+            expected = "that recording, which goes on after the last sample mapped"
+            raise InputError(str(saved.path), found, expected, f"map it by itself, or {other}") from None
     saved.restore(session, config)
     if samples is None:
         session.begin_recording()
@@ -77,25 +87,3 @@ def resume_session(
         session.restart(config.session.seed)
         return 0, START
     return samples or 0, saved.estimate
-
-
-def _require_pieces(empty: Map, saved: SavedMap, source: Source) -> None:
-    """Raises `InputError` if another recording cannot go on from a map, because it is one piece.
-
-    Args:
-        empty: a map of that method.
-    """
-    try:
-        empty.begin_piece()
-    except InputError:
-        method = saved.config.backend
-        found = (
-            f"a map of `backend: {method}`, which is one piece; {source.name} is not the recording that was "
-            "mapped last, and the robot may stand anywhere when it begins"
-        )
-        localised = f"find the robot in this map with `ratslam localise {saved.path}`"
-        other = localised if method in LOCALISING else "map both with `backend: recall`"
-        raise InputError(
-            str(saved.path), found, "that recording, which goes on after the last sample mapped",
-            f"map it by itself, or {other}",
-        ) from None  # fmt: skip

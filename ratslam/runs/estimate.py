@@ -56,47 +56,46 @@ class PoseEstimate(NamedTuple):
     health: Health
     lost: bool
 
+    @classmethod
+    def of_step(cls, step: Step, outcome: str, warnings: tuple[str, ...] = ()) -> PoseEstimate:
+        """The estimate of a session's step.
+
+        Args:
+            outcome: name of the outcome in the step's evidence. warnings: about the input.
+        """
+        estimate = step.estimate
+        pose = np.array(step.pose, np.float64)
+        # The spread is along the axes of the backend's own frame, which may be turned against the map's.
+        turn = pose[2] - float(estimate.pose[2])
+        cos, sin = np.cos(turn), np.sin(turn)
+        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        spread = rotation * np.asarray(estimate.spread, np.float64)
+        health = Health(float(step.doubt), warnings=warnings)
+        return cls(pose, spread @ spread.T, int(estimate.place), outcome, health, bool(estimate.lost))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The estimate as arrays of a file."""
+        named = self._asdict()
+        named["doubt"] = named.pop("health").doubt
+        return {name: np.array(value) for name, value in named.items()}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PoseEstimate:
+        """The estimate of `arrays`; that before the first step if there are none.
+
+        Raises:
+            KeyError, ValueError: arrays are missing or of other shapes.
+        """
+        if not arrays:
+            return START
+        for name, like in START.arrays().items():
+            found = arrays[name]
+            if found.shape != like.shape or found.dtype.kind != like.dtype.kind:
+                raise ValueError(f"{name} of the estimate: {found.dtype} of shape {found.shape}")
+        pose, covariance = np.array(arrays["pose"]), np.array(arrays["covariance"])
+        place, outcome, doubt = int(arrays["place"]), str(arrays["outcome"]), float(arrays["doubt"])
+        return cls(pose, covariance, place, outcome, Health(doubt), bool(arrays["lost"]))
+
 
 START = PoseEstimate(np.zeros(3), np.zeros((3, 3)), -1, "", Health(), False)
 """The estimate before the first step."""
-
-
-def pose_estimate(step: Step, outcome: str, warnings: tuple[str, ...] = ()) -> PoseEstimate:
-    """The estimate of a session's step.
-
-    Args:
-        outcome: name of the outcome in the step's evidence. warnings: about the input.
-    """
-    estimate = step.estimate
-    pose = np.array(step.pose, np.float64)
-    # The spread is along the axes of the backend's own frame, which may be turned against the map's.
-    turn = pose[2] - float(estimate.pose[2])
-    cos, sin = np.cos(turn), np.sin(turn)
-    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    spread = rotation * np.asarray(estimate.spread, np.float64)
-    health = Health(float(step.doubt), warnings=warnings)
-    return PoseEstimate(pose, spread @ spread.T, int(estimate.place), outcome, health, bool(estimate.lost))
-
-
-def estimate_arrays(estimate: PoseEstimate) -> dict[str, np.ndarray]:
-    """An estimate as arrays of a file."""
-    named = estimate._asdict()
-    named["doubt"] = named.pop("health").doubt
-    return {name: np.array(value) for name, value in named.items()}
-
-
-def read_estimate(arrays: Mapping[str, np.ndarray]) -> PoseEstimate:
-    """The estimate of `estimate_arrays`; that before the first step if there are none.
-
-    Raises:
-        KeyError, ValueError: arrays are missing or of other shapes.
-    """
-    if not arrays:
-        return START
-    for name, like in estimate_arrays(START).items():
-        found = arrays[name]
-        if found.shape != like.shape or found.dtype.kind != like.dtype.kind:
-            raise ValueError(f"{name} of the estimate: {found.dtype} of shape {found.shape}")
-    pose, covariance = np.array(arrays["pose"]), np.array(arrays["covariance"])
-    place, outcome, doubt = int(arrays["place"]), str(arrays["outcome"]), float(arrays["doubt"])
-    return PoseEstimate(pose, covariance, place, outcome, Health(doubt), bool(arrays["lost"]))

@@ -48,7 +48,11 @@ def change_folder(folder: Path, what: str, last: str, change: Callable[[Path], N
         with _errors_of(folder, shown):
             change(shown)
         removed = [file.name for file in before if not os.path.lexists(shown / file.name)]
-        _keep_new(shown)
+        for file in shown.iterdir():
+            if file.is_symlink():  # was not replaced
+                file.unlink()
+            else:
+                flush_to_disk(file)  # survives a power failure
         record = {"what": what, "removed": removed, "last": last}
         write_text_atomically(making / RECORD, json.dumps(record) + "\n")
         flush_to_disk(making / RECORD)
@@ -116,15 +120,6 @@ def _put_in_place(folder: Path) -> None:
         cure = "repeat the command to complete it"
         raise InputError(str(folder), found, "a folder whose files can be replaced", cure) from error
     shutil.rmtree(done, ignore_errors=True)
-
-
-def _keep_new(shown: Path) -> None:
-    """Removes the files that were not replaced; the others survive a power failure."""
-    for file in shown.iterdir():
-        if file.is_symlink():
-            file.unlink()
-        else:
-            flush_to_disk(file)
 
 
 @contextmanager

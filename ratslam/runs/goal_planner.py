@@ -1,7 +1,4 @@
-"""Plans ways to goals on a saved map for a drive (`robot.live.goal_drive`).
-
-The way between two places of a saved map, and its picture.
-"""
+"""Ways on a saved map: to the goals of a drive (`robot.live.goal_drive`), and between two places, drawn."""
 
 from __future__ import annotations
 
@@ -87,11 +84,6 @@ def contact_map(made: Map, image: ImageConfig, head: Head) -> ContactMap:
     """The contacts of the keyframes of a map; those of none if it has no whisker images of this head."""
     found = _keyframe_contacts(made, image, head)
     return RememberedContacts(*found, RECENT) if len(found[1]) else NoContacts()
-
-
-def felt_walls(made: Map, image: ImageConfig, head: Head) -> np.ndarray:
-    """[n, 2] contact points of the keyframes of a map, m; none if it has no whisker images of this head."""
-    return placed_points(*_keyframe_contacts(made, image, head))
 
 
 def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -192,7 +184,7 @@ def draw_map_way(path: Path, made: Map, saved: SavedMap, way: Way) -> None:
     row = {place: k for k, place in enumerate(graph)}
     nodes = np.array([[data["x"], data["y"]] for _, data in graph.nodes(data=True)])
     links = np.array([[row[a], row[b]] for a, b in graph.edges()]).reshape(-1, 2)
-    felt = felt_walls(made, config.touch.image, ur10_head(config.touch.head))
+    felt = placed_points(*_keyframe_contacts(made, config.touch.image, ur10_head(config.touch.head)))
     title = f"From experience {way.experiences[0]} to {way.experiences[-1]}"
     line = f"{way.length:.2f} m, {way.seconds:.0f} s over {len(way.experiences)} of {len(nodes)} experiences"
     figure = draw_way(title, line, nodes, links, way.poses, felt)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import NAME, ChangeRow, read_changes
+from evaluation.artifacts.closure_table import NAME, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.estimates import Localisation
 from ratslam.grid.localiser import GridLocaliser
@@ -42,43 +41,12 @@ OWN = (*SourceConfig.model_fields, "score", "cells")
 """Sections that a session has of its own in a saved map."""
 
 
-class LocalisationSummary(NamedTuple):
-    """The course of a localisation.
-
-    Attributes:
-        states: [T] a `Localisation` after each step. mass: probability of the last pose. changes: places at
-            which the session does not agree with the map.
-    """
-
-    states: np.ndarray
-    mass: float
-    changes: Sequence[ChangeRow]
-
-    def describe(self) -> str:
-        """The summary in one sentence, and a line for each change."""
-        return "\n".join([self._describe_course(), *(change.describe() for change in self.changes)])
-
-    def _describe_course(self) -> str:
-        found = np.flatnonzero(self.states == Localisation.FOUND)
-        last = Localisation(int(self.states[-1])) if len(self.states) else Localisation.SEARCHING
-        if not len(found):
-            return f"not found in {len(self.states)} steps: {describe_state(last)}"
-        lost = int((np.diff((self.states == Localisation.FOUND).astype(int)) < 0).sum())
-        again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
-        return (
-            f"found after {found[0] + 1} of {len(self.states)} steps, known in {len(found)} of them{again}; "
-            f"at the end: {describe_state(last)}, probability {self.mass:.3f}"
-        )
-
-
-def describe_state(state: Localisation) -> str:
-    """A state in plain words."""
-    return state.name.lower().replace("_", " ")
-
-
-def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
+def localising(config: RunConfig, saved: SavedMap, start: Start | None = None) -> RunConfig:
     """The configuration of a session that is localised in a saved map: source, touch and scores of `config`,
     the rest as the map was made.
+
+    Args:
+        start: where it begins, if not as `config` says.
 
     Raises:
         InputError: the map was made by a method in whose maps nothing can be localised, or with a sensor of
@@ -93,7 +61,8 @@ def localising(config: RunConfig, saved: SavedMap) -> RunConfig:
         raise InputError(str(saved.path), found, "a map made by `backend: recall` or `backend: grid`", cure)
     check_same_fov(str(saved.path), saved.config, config)
     own = {name: getattr(config, name) for name in OWN}
-    place = config.localise.model_copy(update={"map": saved.path.resolve()})
+    begin = {} if start is None else {"start": start}
+    place = config.localise.model_copy(update={"map": saved.path.resolve(), **begin})
     return saved.config.model_copy(
         update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
     )
@@ -145,20 +114,9 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     return validate(override(parse(text, str(saved.path)), assignments), RunConfig)
 
 
-def localising_for_goals(config: RunConfig, saved: SavedMap, start: Start) -> RunConfig:
-    """The same for a session that drives to goals and begins at `start`.
-
-    Raises:
-        InputError: as `localising`.
-    """
-    localised = localising(config, saved)
-    settings = localised.localise.model_copy(update={"start": start})
-    return localised.model_copy(update={"localise": settings})
-
-
 def localise(
     saved: SavedMap, config: RunConfig, directory: Path, observers: Sequence[Observer] = ()
-) -> tuple[Scorecard, LocalisationSummary, bool]:
+) -> tuple[Scorecard, str, bool]:
     """Localises the source of a configuration in a saved map, which stays as it is.
 
     Args:
@@ -166,7 +124,8 @@ def localise(
         directory: the new run directory. observers: are told of the progress.
 
     Returns:
-        the scorecard, the course of the localisation, and whether Ctrl-C ended it early.
+        the scorecard, the course of the localisation in a sentence with a line for each place at which the
+        session does not agree with the map, and whether Ctrl-C ended it early.
 
     Raises:
         InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
@@ -183,5 +142,21 @@ def localise(
         made = runner.session.map
         assert isinstance(made, Localiser | GridLocaliser)
         changes = read_changes(directory / NAME) if isinstance(made, Localiser) else []
-        summary = LocalisationSummary(made.states(), made.localisation().mass, changes)
-    return card, summary, interrupted
+        lines = [_describe_course(made.states(), made.localisation().mass)]
+    return card, "\n".join([*lines, *(change.describe() for change in changes)]), interrupted
+
+
+def _describe_course(states: np.ndarray, mass: float) -> str:
+    """The course in words, of a `Localisation` after each step [T] and the probability of the last pose."""
+    known = states == Localisation.FOUND
+    found = np.flatnonzero(known)
+    last = Localisation(int(states[-1])) if len(states) else Localisation.SEARCHING
+    state = last.name.lower().replace("_", " ")
+    if not len(found):
+        return f"not found in {len(states)} steps: {state}"
+    lost = int((np.diff(known.astype(int)) < 0).sum())
+    again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
+    return (
+        f"found after {found[0] + 1} of {len(states)} steps, known in {len(found)} of them{again}; "
+        f"at the end: {state}, probability {mass:.3f}"
+    )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.artifacts.run_reader import has_steps, is_merged
 from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
@@ -19,8 +20,7 @@ from ratslam.methods.recall import RecallBackend
 from ratslam.places.crop import crop_map
 from ratslam.places.difference import MapContent, difference, keyframe_content
 from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
-from ratslam.runs.map_results import holds_results, rewrite_results
-from ratslam.runs.map_settings import disagreement
+from ratslam.runs.map_results import rewrite_results
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
@@ -71,40 +71,30 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
 def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
     kept, solution = made.kept_keyframes(), made.solution()
     belief = made.keyframes().calibration(*solution)
-    verdicts = _verdicts(made)
-    return {
-        "keyframes": made.keyframes().count,
-        "keyframes_not_merged": kept.count,
-        "sequences": len(verdicts),
-        "accepted_sequences": _accepted(made),
-        "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
-        "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
-        "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
-    }
-
-
-def _verdicts(made: KeyframeMap) -> np.ndarray:
-    """[R] on the sequences of recall: those that may follow them in a final map follow from its poses."""
-    return made.solution().log.verdicts()[: made.log.sequences]
-
-
-def _accepted(made: KeyframeMap) -> list[dict[str, Any]]:
-    """The accepted closure sequences: number, first and last step, the steps matched, evidence, and whether
-    it can be undone."""
-    log, step = made.solution().log, made.keyframe_steps()
-    found = []
-    for number in np.flatnonzero(_verdicts(made) == Verdict.ACCEPTED).tolist():
+    # Of the sequences of recall: those that may follow them in a final map follow from its poses.
+    verdicts = solution.log.verdicts()[: made.log.sequences]
+    log, step = solution.log, made.keyframe_steps()
+    accepted = []
+    for number in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
         members = log.members(number)
-        found.append(
+        accepted.append(
             {
                 "sequence": number,
                 "steps": step[members[[0, -1], 0]].tolist(),
                 "match_steps": step[members[[0, -1], 1]].tolist(),
                 "evidence": round(log.score(number), 2),
-                "can_be_undone": made.solution().obstacle(number, made.log) is None,
+                "can_be_undone": solution.obstacle(number, made.log) is None,
             }
         )
-    return found
+    return {
+        "keyframes": made.keyframes().count,
+        "keyframes_not_merged": kept.count,
+        "sequences": len(verdicts),
+        "accepted_sequences": accepted,
+        "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
+        "heading_bias_rad_per_m": [belief.bias, belief.bias_sd],
+        "turn_error_rad_per_rad": [belief.turn_error, belief.turn_error_sd],
+    }
 
 
 def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
@@ -114,7 +104,15 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
     Raises:
         InputError: a map cannot be restored.
     """
-    contents = [_content(saved) for saved in (first, second)]
+    contents = []
+    for saved in (first, second):
+        made: Map = saved.open_session().map
+        if isinstance(made, KeyframeMap):
+            contents.append(keyframe_content(made))
+        else:
+            names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
+            path = made.trajectory() if saved.steps else np.zeros((0, 3))
+            contents.append(MapContent(path, names, made.closures()))
     found = difference(*contents)._asdict()
     settings = [flat_settings(saved.config.model_dump(mode="json")) for saved in (first, second)]
     keys = sorted(settings[0].keys() | settings[1].keys())
@@ -125,7 +123,7 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
         "steps": [first.steps, second.steps],
         **{key: value if np.isfinite(value) else None for key, value in found.items()},
         "settings": changed,
-        "sensor": disagreement(first.sensor, second.sensor),
+        "sensor": first.sensor.disagreement(second.sensor),
     }
 
 
@@ -158,7 +156,7 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
     if output != saved.path:
         make_new_file(output, write)
         return False
-    if output.name != NAME or not holds_results(folder):
+    if output.name != NAME or not (is_merged(folder) or has_steps(folder)):
         write(output)
         return False
 
@@ -234,12 +232,3 @@ def _keyframe_session(saved: SavedMap, what: str) -> tuple[Session, KeyframeMap]
         found = f"a map of `backend: {saved.config.backend}`, which has no keyframes to {what}"
         raise InputError(str(saved.path), found, "a map of `backend: recall`")
     return session, session.map
-
-
-def _content(saved: SavedMap) -> MapContent:
-    made: Map = saved.open_session().map
-    if isinstance(made, KeyframeMap):
-        return keyframe_content(made)
-    names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
-    path = made.trajectory() if saved.steps else np.zeros((0, 3))
-    return MapContent(path, names, made.closures())

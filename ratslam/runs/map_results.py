@@ -1,6 +1,6 @@
-"""The files of a run directory or a merged folder that follow from its map; scores and plots of these.
+"""Writes what follows from the map of a run directory or merged folder: files, scores, plots and the report.
 
-The report: one page of HTML about runs, made from their directories.
+The report is one page of HTML about runs, made from their directories.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.run_reader import MERGED_MAP_NAME as MERGED
 from evaluation.artifacts.run_reader import NAME as PIECES
-from evaluation.artifacts.run_reader import has_steps, is_merged, read_run, read_session_steps, write_pieces
+from evaluation.artifacts.run_reader import is_merged, read_run, read_session_steps, write_pieces
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -26,7 +26,7 @@ from evaluation.report import PAGE_START
 from evaluation.report.page import PageRun, check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
-from ratslam.runs.settings.changed_settings import ChangedSetting, changed_settings
+from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.packaged import read_citation
 from ratslam.runs.settings.run_config import ScoreConfig
 from tactile.base.errors import InputError
@@ -49,16 +49,14 @@ def write_report(directories: Sequence[Path], path: Path) -> None:
     """
     check_report_libraries("report")
     require_new_file(path, replaces=PAGE_START)
-    runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
+    runs = []
+    for directory in directories:
+        try:
+            settings = changed_settings(directory / "config.yaml")
+        except InputError:
+            settings = None  # of a configuration of another version
+        runs.append(PageRun(read_run_report(directory), settings))
     write_page(path, runs, read_citation())
-
-
-def _settings(directory: Path) -> list[ChangedSetting] | None:
-    """The settings of a run that differ from the defaults; None for a configuration of another version."""
-    try:
-        return changed_settings(directory / "config.yaml")
-    except InputError:
-        return None
 
 
 DERIVED = ("pieces.csv", "health.json", "calibration.yaml", "closures.csv")
@@ -103,11 +101,6 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
     write_map_results(folder, made, np.arange(len(path), dtype=float))
     figure = draw_sessions(name, path, piece, steps)
     write_atomically(folder / "map.png", figure.savefig)
-
-
-def holds_results(folder: Path) -> bool:
-    """Whether a folder is a run directory with steps or a merged folder, whose files follow from its map."""
-    return is_merged(folder) or has_steps(folder)
 
 
 def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:

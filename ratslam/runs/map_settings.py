@@ -1,6 +1,6 @@
-"""The settings that a map depends on, and which differ between maps or in a session that is to go on.
+"""The settings and the sensor that a map depends on, and how those of another map or session differ.
 
-The sensor of a map: what its views are measured with, and how they are made of the readings.
+The sensor of a map is what its views are measured with, and how they are made of the readings.
 """
 
 from __future__ import annotations
@@ -119,62 +119,83 @@ class Sensor(NamedTuple):
         count = f", {self.whiskers} whiskers" if self.whiskers else ""
         return f"{self.kind}{count}; views of {rows} x {columns} x {channels}, {self.unit}"
 
+    @classmethod
+    def of(cls, config: RunConfig, source: Source) -> Sensor:
+        """The sensor of a configuration completed for its source.
 
-def sensor_of(config: RunConfig, source: Source) -> Sensor:
-    """The sensor of a configuration completed for its source.
+        Args:
+            source: its view shape is that of the observations; its info that of the readings or of the
+                observations made of them.
+        """
+        info, touch = source.info, config.touch
+        templates = {name: getattr(config.templates, name) for name in NORMALISATION}
+        geometry: dict[str, Any] = {}
+        if touch.frontend is not None:
+            kind, made = OTHER_TOUCH, {"touch.frontend": touch.frontend.model_dump(mode="json")}
+        elif info.labels_only:
+            kind, made = LABELS, {}
+        elif info.planar_whiskers is not None:
+            reports = touch.reports.model_dump(mode="json")
+            geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
+            kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
+        elif source.whiskers:
+            head = touch.head.model_dump(mode="json")
+            geometry = {
+                f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")
+            }
+            kind, made = WHISKER_HEAD, _sensor_settings("touch.image", touch.image)
+        else:
+            kind, made = VIEWS, _view_settings(config)
+        transform = made | {f"templates.{name}": value for name, value in templates.items()}
+        transform = {
+            name: value
+            for name, value in transform.items()
+            if value is not None or name.startswith("recording.")
+        }
+        plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
+        unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
+        return cls(kind, source.view_shape, source.whiskers, unit, cell, *plain)
 
-    Args:
-        source: its view shape is that of the observations; its info that of the readings or of the
-            observations made of them.
-    """
-    info, touch = source.info, config.touch
-    templates = {name: getattr(config.templates, name) for name in NORMALISATION}
-    geometry: dict[str, Any] = {}
-    if touch.frontend is not None:
-        kind, made = OTHER_TOUCH, {"touch.frontend": touch.frontend.model_dump(mode="json")}
-    elif info.labels_only:
-        kind, made = LABELS, {}
-    elif info.planar_whiskers is not None:
-        reports = touch.reports.model_dump(mode="json")
-        geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
-        kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
-    elif source.whiskers:
-        head = touch.head.model_dump(mode="json")
-        geometry = {f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")}
-        kind, made = WHISKER_HEAD, _sensor_settings("touch.image", touch.image)
-    else:
-        kind, made = VIEWS, _view_settings(config)
-    transform = made | {f"templates.{name}": value for name, value in templates.items()}
-    transform = {
-        name: value for name, value in transform.items() if value is not None or name.startswith("recording.")
-    }
-    plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
-    unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
-    return Sensor(kind, source.view_shape, source.whiskers, unit, cell, *plain)
+    def disagreement(self, other: Sensor) -> str:
+        """How another sensor differs from this one of a map, as a clause; '' if they agree."""
+        found = [[("null" if each is None else each) for each in found] for found in self.differences(other)]
+        clauses = [f"{what} is {others} and was {ours}" for what, ours, others in found]
+        return f"{', '.join(clauses)} when the map was made" if clauses else ""
 
+    def differences(self, other: Sensor) -> list[Difference]:
+        """What differs between this sensor and another one. Settings that only one of them knows do not
+        count; of sensors of two kinds, only the kind is named.
+        """
+        if self.kind != other.kind:
+            return [(WORDS["kind"], self.kind, other.kind)]
+        known = flat_settings(self.geometry | self.transform | {CELL: self.cell})
+        others = flat_settings(other.geometry | other.transform | {CELL: other.cell})
+        found = [(key, known[key], value) for key, value in others.items() if known.get(key, value) != value]
+        shaped = any(what.endswith((".rows", ".columns")) for what, _, _ in found)
+        for name in ("view_shape", "whiskers", "unit"):
+            ours, theirs = getattr(self, name), getattr(other, name)
+            if ours != theirs and not (shaped and name == "view_shape"):
+                found.insert(0, (WORDS[name], ours, theirs))
+        return found
 
-def disagreement(of_map: Sensor, other: Sensor) -> str:
-    """How another sensor differs from that of a map, as a clause; '' if they agree."""
-    found = [[("null" if each is None else each) for each in found] for found in differences(of_map, other)]
-    clauses = [f"{what} is {others} and was {ours}" for what, ours, others in found]
-    return f"{', '.join(clauses)} when the map was made" if clauses else ""
+    def check_same(self, where: str, other: Sensor) -> None:
+        """Raises `InputError` with the reason if a map of this sensor cannot be used with another one, or
+        with other settings of it.
 
-
-def differences(one: Sensor, other: Sensor) -> list[Difference]:
-    """What differs between two sensors. Settings that only one of them knows do not count; of sensors of two
-    kinds, only the kind is named.
-    """
-    if one.kind != other.kind:
-        return [(WORDS["kind"], one.kind, other.kind)]
-    known = flat_settings(one.geometry | one.transform | {CELL: one.cell})
-    others = flat_settings(other.geometry | other.transform | {CELL: other.cell})
-    found = [(key, known[key], value) for key, value in others.items() if known.get(key, value) != value]
-    shaped = any(what.endswith((".rows", ".columns")) for what, _, _ in found)
-    for name in ("view_shape", "whiskers", "unit"):
-        ours, theirs = getattr(one, name), getattr(other, name)
-        if ours != theirs and not (shaped and name == "view_shape"):
-            found.insert(0, (WORDS[name], ours, theirs))
-    return found
+        Args:
+            where: the map, for the error.
+        """
+        reason = self.disagreement(other)
+        if settings := settings_of_map(self.differences(other)):
+            found = f"made with other settings of the sensor: {reason}"
+            cure = (
+                f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
+            )
+            raise InputError(where, found, "a map of these settings", cure)
+        if reason:
+            raise InputError(
+                where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})"
+            )
 
 
 def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:
@@ -182,22 +203,6 @@ def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:
     if any(what in WORDS.values() or what.startswith(GEOMETRY) for what, _, _ in found):
         return None
     return {key: ours for key, ours, _ in found}
-
-
-def check_same_sensor(where: str, of_map: Sensor, other: Sensor) -> None:
-    """Raises `InputError` with the reason if a map cannot be used with another sensor, or other settings of
-    it.
-
-    Args:
-        where: the map, for the error.
-    """
-    reason = disagreement(of_map, other)
-    if settings := settings_of_map(differences(of_map, other)):
-        found = f"made with other settings of the sensor: {reason}"
-        cure = f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
-        raise InputError(where, found, "a map of these settings", cure)
-    if reason:
-        raise InputError(where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})")
 
 
 def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:

@@ -1,4 +1,4 @@
-"""Merges saved maps into one."""
+"""Merges saved maps of one sensor into one, and refuses maps that hold the same session."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ratslam.places.joining import Join, Stretches, join_all
 from ratslam.places.union import Overlap, overlap, remembered, renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
-from ratslam.runs.map_settings import assignments, differences, differing_settings, settings_of_map
+from ratslam.runs.map_settings import assignments, differing_settings, settings_of_map
 from ratslam.runs.saved_map import NAME, SavedMap, digest_of, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.errors import InputError
@@ -162,7 +162,7 @@ def _stretches(made: KeyframeMap) -> int:
 
 def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
     session = saved.open_session()
-    return session, keyframes_of(saved, session.map)
+    return session, _keyframes_of(saved, session.map)
 
 
 def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
@@ -203,11 +203,21 @@ def check_mergeable(maps: Sequence[SavedMap]) -> None:
             reason = "has no keyframes whose views could be compared"
             found = f"a map of `backend: {saved.config.backend}`, which {reason}"
             raise InputError(str(saved.path), found, "maps of `backend: recall`")
-        _check_sensors(maps[0], saved)
+        different = maps[0].sensor.differences(saved.sensor)
+        if different:
+            clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
+            settings, cure = settings_of_map(different), "merge those of each sensor alone"
+            other = "another sensor"
+            if settings:
+                config = saved.path.with_name("config.yaml")
+                other = "other settings of the sensor"
+                cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
+            found = f"made with {other} than {maps[0].path}: {clauses}"
+            raise InputError(str(saved.path), found, "maps of one sensor", cure)
     _check_sessions(maps)
 
 
-def keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
+def _keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
     """The map restored from a saved one; raises `InputError` if it has no keyframes."""
     if not isinstance(made, KeyframeMap) or not made.kept_keyframes().count:
         found = f"a map of `backend: {saved.config.backend}` without keyframes"
@@ -215,26 +225,12 @@ def keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
     return made
 
 
-def _check_sensors(first: SavedMap, second: SavedMap) -> None:
-    different = differences(first.sensor, second.sensor)
-    if different:
-        clauses = ", ".join(f"{what} is {other} here and {one} there" for what, one, other in different)
-        settings, cure = settings_of_map(different), "merge those of each sensor alone"
-        other = "another sensor"
-        if settings:
-            config = second.path.with_name("config.yaml")
-            other = "other settings of the sensor"
-            cure = f"make it again: `python -m ratslam run {config} {assignments(settings)} -o NEW`"
-        found = f"made with {other} than {first.path}: {clauses}"
-        raise InputError(str(second.path), found, "maps of one sensor", cure)
-
-
 def _check_sessions(maps: Sequence[SavedMap]) -> None:
     contents = [digest_of(saved.arrays) for saved in maps]
     for (first, one), (second, other) in combinations(zip(maps, contents, strict=True), 2):
         if one == other:
             raise InputError(str(second.path), f"the same map as {first.path}", OTHERS, "give it once")
-    keyframes = [remembered(keyframes_of(saved, saved.open_session().map)) for saved in maps]
+    keyframes = [remembered(_keyframes_of(saved, saved.open_session().map)) for saved in maps]
     for (first, seen), (second, again) in combinations(zip(maps, keyframes, strict=True), 2):
         common = overlap(seen, again)
         if common is not None:

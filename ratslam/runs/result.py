@@ -57,15 +57,13 @@ def run(
     """
     keep_kernels()
     name = "run" if isinstance(config, RunConfig) else Path(config).stem
-    path = new_directory(name) if directory is None else Path(directory)
+    if directory is None:
+        paths = (RUNS / (name if number == 1 else f"{name}-{number}") for number in count(1))
+        path = next(path for path in paths if not path.exists())
+    else:
+        path = Path(directory)
     write_run(resolve_config(config), path, resume)
     return Result(path)
-
-
-def new_directory(name: str) -> Path:
-    """The first of runs/NAME, runs/NAME-2, runs/NAME-3 ... that does not exist."""
-    paths = (RUNS / (name if number == 1 else f"{name}-{number}") for number in count(1))
-    return next(path for path in paths if not path.exists())
 
 
 class Result:

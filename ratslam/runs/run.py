@@ -144,7 +144,11 @@ class _Interrupts:
         return self._count > 0
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        if self._count == 1 and _is_collecting(frame):  # Python would print the exception and go on
+        # In a callback of the garbage collector (JAX has one), Python would print the exception and go on.
+        codes = [getattr(callback, "__code__", None) for callback in gc.callbacks]
+        while frame is not None and frame.f_code not in codes:
+            frame = frame.f_back
+        if self._count == 1 and frame is not None:
             threading.Timer(RETRY, os.kill, (os.getpid(), signal.SIGINT)).start()
             return
         self._count += 1
@@ -176,11 +180,3 @@ def catch_interrupt(last_task: str) -> Iterator[Callable[[], bool]]:
         yield handler.pressed
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _is_collecting(frame: FrameType | None) -> bool:
-    """Whether a frame is that of a callback of the garbage collector (JAX has one), or is called by it."""
-    codes = [getattr(callback, "__code__", None) for callback in gc.callbacks]
-    while frame is not None and frame.f_code not in codes:
-        frame = frame.f_back
-    return frame is not None

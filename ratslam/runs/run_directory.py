@@ -1,13 +1,8 @@
 """The run directory: files of a run, readable at any moment.
 
 Text files grow by whole lines, one chunk at a time; all other files appear complete, by renaming. So an
-interrupt, a kill or a full disk leaves a readable prefix.
-
-Writes the world, views and the grid map to a run directory, for scores, plots and the report.
-
-Changes between a map and a session localised in it: the file changes.csv.
-
-The error of the online pose while a run proceeds.
+interrupt, a kill or a full disk leaves a readable prefix. Besides `RunDirectory`: the world, the views, the
+grid map and the changes of a localised session in it; the error of the online pose while a run proceeds.
 """
 
 from __future__ import annotations
@@ -57,10 +52,14 @@ STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error
 """Files that grow by whole lines."""
 
 
+WhiskerView = tuple[np.ndarray, np.ndarray]
+"""A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
+
+
 class RunDirectory:
     """A new run directory; a context manager that closes its text files.
 
-    Its process holds a lock on steps.csv, by which a run is told from one that was killed.
+    Its process holds a lock on steps.csv, which distinguishes a run from one that was killed.
 
     Args:
         columns: columns of steps.csv that the backend adds. manifest: the first text of manifest.json, which
@@ -122,66 +121,62 @@ class RunDirectory:
             named.add_note("the files written before are complete")
             raise named from error
 
+    def save_world(self, info: SourceInfo) -> None:
+        """Writes maze.txt and walls.csv of a source in a maze, arena.txt of one in an arena."""
+        if info.arena is not None:
+            self.text("arena.txt", info.arena)
+        maze = info.maze
+        if maze is None:
+            return
+        self.text("maze.txt", maze.text)
+        boxes = wall_boxes(read_maze(self.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights)
+        self.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
 
-WhiskerView = tuple[np.ndarray, np.ndarray]
-"""A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
+    def save_whisker_views(self, views: list[WhiskerView], config: TouchConfig) -> None:
+        """Writes views.npz, if the views are images of the whiskers of a head."""
+        head = ur10_head(config.head)
+        if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
+            return
+        columns = head.shape[1]
+        images = WhiskerViews(
+            view=np.array([view[..., 0] for view, _ in views]),
+            alive=np.array([alive.reshape(head.shape) for _, alive in views]),
+            azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
+            length=head.length[::columns],
+            tallest=config.image.tallest,
+        )
+        self.file("views.npz", lambda path: write_whisker_views(path, images))
 
+    def save_closure_views(self, images: Sequence[np.ndarray | None]) -> None:
+        """Writes recorded_views.npz: the images [R, C] of the steps that closures join; None: no view."""
+        joined = np.unique(read_closure_table(self.path).steps).tolist()
+        seen = {step: image for step, image in enumerate(images) if image is not None}
+        steps = [step for step in joined if step in seen]
+        if steps:
+            views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+            self.file(recorded_views.NAME, lambda path: write_closure_views(path, views))
 
-def save_world(info: SourceInfo, directory: RunDirectory) -> None:
-    """Writes maze.txt and walls.csv of a source in a maze, arena.txt of one in an arena."""
-    if info.arena is not None:
-        directory.text("arena.txt", info.arena)
-    maze = info.maze
-    if maze is None:
-        return
-    directory.text("maze.txt", maze.text)
-    boxes = wall_boxes(
-        read_maze(directory.path / "maze.txt"), stream(maze.seed, "maze.heights"), maze.heights
-    )
-    directory.file("walls.csv", lambda path: write_walls(path, np.column_stack(boxes)))
+    def save_grid_map(self) -> None:
+        """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in it are
+        known, which they are not of a localised session, arena.npz (the true grid) and gridscore.json too."""
+        file = self.path / "grid.npz"
+        if not file.exists():
+            return
+        grid = read_grid(file)
+        write_nav2(self.path, grid)
+        if not (self.path / "arena.txt").exists() or (self.path / "localisation.csv").exists():
+            return
+        arena = read_arena(self.path / "arena.txt")
+        truth = true_grid(arena, grid)
+        self.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
+        score = score_grid(grid, truth, self.path.name)
+        self.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
 
-
-def save_whisker_views(views: list[WhiskerView], config: TouchConfig, directory: RunDirectory) -> None:
-    """Writes views.npz, if the views are images of the whiskers of a head."""
-    head = ur10_head(config.head)
-    if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
-        return
-    columns = head.shape[1]
-    images = WhiskerViews(
-        view=np.array([view[..., 0] for view, _ in views]),
-        alive=np.array([alive.reshape(head.shape) for _, alive in views]),
-        azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
-        length=head.length[::columns],
-        tallest=config.image.tallest,
-    )
-    directory.file("views.npz", lambda path: write_whisker_views(path, images))
-
-
-def save_closure_views(images: Sequence[np.ndarray | None], directory: RunDirectory) -> None:
-    """Writes recorded_views.npz: the images [R, C] of this run's steps that closures join; None: no view."""
-    joined = np.unique(read_closure_table(directory.path).steps).tolist()
-    seen = {step: image for step, image in enumerate(images) if image is not None}
-    steps = [step for step in joined if step in seen]
-    if steps:
-        views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
-        directory.file(recorded_views.NAME, lambda path: write_closure_views(path, views))
-
-
-def save_grid_map(directory: RunDirectory) -> None:
-    """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in the grid are
-    known, which they are not of a localised session, also arena.npz (the true grid) and gridscore.json."""
-    file = directory.path / "grid.npz"
-    if not file.exists():
-        return
-    grid = read_grid(file)
-    write_nav2(directory.path, grid)
-    if not (directory.path / "arena.txt").exists() or (directory.path / "localisation.csv").exists():
-        return
-    arena = read_arena(directory.path / "arena.txt")
-    truth = true_grid(arena, grid)
-    directory.file("arena.npz", lambda path: write_grid_truth(path, truth, arena.start))
-    score = score_grid(grid, truth, directory.path.name)
-    directory.text("gridscore.json", score.model_dump_json(indent=2) + "\n")
+    def save_changes(self, map: Map, config: TouchConfig) -> None:
+        """Writes changes.csv of a session that was localised in a map."""
+        if isinstance(map, Localiser):
+            rows = change_rows(map, changes_of(map, config))
+            self.file(NAME, lambda path: write_changes(path, rows))
 
 
 def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
@@ -191,13 +186,6 @@ def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     ends = wall_segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
     return GridTruth(is_occupied(arena, there), is_enclosed(arena, there), seen.reshape(-1, 4))
-
-
-def save_changes(map: Map, config: TouchConfig, directory: RunDirectory) -> None:
-    """Writes changes.csv of a session that was localised in a map."""
-    if isinstance(map, Localiser):
-        rows = change_rows(map, changes_of(map, config))
-        directory.file(NAME, lambda path: write_changes(path, rows))
 
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:

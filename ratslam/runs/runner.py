@@ -1,9 +1,7 @@
-"""Processes samples with a backend and writes, scores and plots the result in a run directory.
+"""The main loop: processes samples chunk by chunk; writes, scores and plots the result in a run directory.
 
-Reports the progress of a run to observers, as plain data.
-
-Maps are asked at the end of chunks only, and for what takes long less and less often: the cost of all
-questions together stays a small multiple of the last one.
+Observers are told of the progress as plain data. Maps are asked at the end of chunks only, and for what takes
+long less and less often: the cost of all questions together stays a small multiple of the last one.
 """
 
 from __future__ import annotations
@@ -31,20 +29,15 @@ from ratslam.core.estimates import Action, GridDrawing, PoseCellActivity
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.runs.build_session import build_session
-from ratslam.runs.cell_recorder import open_cell_recorder
+from ratslam.runs.cell_recorder import CellRecorder, plan_recording
 from ratslam.runs.continuation import checkpoint_of, resume_session
-from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_results import score_and_plot, write_map_results
-from ratslam.runs.map_settings import check_same_sensor, sensor_of
+from ratslam.runs.map_settings import Sensor
 from ratslam.runs.run_directory import (
     OnlineErrorLog,
     RunDirectory,
     WhiskerView,
-    save_changes,
-    save_closure_views,
-    save_grid_map,
-    save_whisker_views,
-    save_world,
 )
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.runs.settings.run_config import RunConfig
@@ -126,24 +119,6 @@ class Observer(Protocol):
         """The run has ended; `path` is the final trajectory."""
 
 
-class MapSchedule:
-    """Decides when the whole map is reported.
-
-    Args:
-        steps: of the session so far.
-    """
-
-    def __init__(self, steps: int) -> None:
-        self._due = steps
-
-    def is_due(self, steps: int) -> bool:
-        """Whether it is due after so many steps; the next one is due later."""
-        if steps < self._due:
-            return False
-        self._due = steps + steps // DRAWN_SHARE
-        return True
-
-
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
 """Steps between two checkpoints: the first number, or the steps so far divided by the second if that is more,
 but at most twice the steps before the first of the two. A run continued after a kill repeats at most these.
@@ -184,10 +159,17 @@ class Runner:
         self._online_error = OnlineErrorLog(session.steps)
         self._begun = self._saved = session.steps
         self._estimate, self._readings = estimate, describe_readings(source)
-        self._cells = open_cell_recorder(config, source, session.backend, directory.path)
-        self._observers, self._schedule = observers, MapSchedule(session.steps)
+        plan = plan_recording(config, source, session.backend)
+        self._cells = None if plan is None else CellRecorder(directory.path, plan)
+        self._observers, self._drawn_at = observers, session.steps  # when the whole map is due
+        if observers:
+            head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
+            if head is not None and source.whiskers != len(head.length):
+                head = None
+            cells = session.backend.activity(session.state) is not None
+            run = RunDescription(source.name, config.backend, head, config.touch.image.tallest, cells)
         for observer in observers:
-            observer.begin(_describe(config, source, session))
+            observer.begin(run)
 
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
@@ -206,7 +188,7 @@ class Runner:
             self._truth.append(np.nan if sample.truth is None else sample.truth)
         entry = BACKENDS.get(self._config.backend, "backend")
         self._directory.append(_lines(samples, steps, odometry, entry))
-        self._estimate = pose_estimate(steps[-1], entry.outcome(steps[-1].evidence))
+        self._estimate = PoseEstimate.of_step(steps[-1], entry.outcome(steps[-1].evidence))
         self._directory.append({"timing.csv": f"{self.session.steps},{len(steps)},{took:.6f}\n"})
         error = self._online_error.update(self.session, self._truth.rows)
         if error is not None:
@@ -259,10 +241,10 @@ class Runner:
         write_map_results(directory.path, self.session.map, time)
         if self._cells is not None:
             self._cells.finish()
-        save_whisker_views(self._views, config.touch, directory)
-        save_closure_views(self._images, directory)
-        save_grid_map(directory)
-        save_changes(self.session.map, config.touch, directory)
+        directory.save_whisker_views(self._views, config.touch)
+        directory.save_closure_views(self._images)
+        directory.save_grid_map()
+        directory.save_changes(self.session.map, config.touch)
         self._judge_input()
         return score_and_plot(directory.path, config.score)
 
@@ -289,12 +271,28 @@ class Runner:
     ) -> None:
         """Tells the observers of these steps, and at the end of a chunk of the map."""
         count = self.session.steps
+        reports: list[StepReport] = []
         rows = zip(samples, observations, steps, odometry, strict=True)
-        reports = [_step_report(count - len(steps) + k, *row) for k, row in enumerate(rows)]
+        for sample, observation, step, dead_reckoned in rows:
+            estimate = step.estimate
+            reports.append(
+                StepReport(
+                    number=count - len(steps) + len(reports),
+                    time=float(sample.time),
+                    observation=observation,
+                    odometry=dead_reckoned,
+                    pose=np.asarray(step.pose, float),
+                    place=int(estimate.place),
+                    previous=int(estimate.previous),
+                    lost=bool(estimate.lost),
+                    doubt=float(step.doubt),
+                )
+            )
         report = None
         if count % CHUNK == 0:
             report = self._map_report()
-            if self._schedule.is_due(count):
+            if count >= self._drawn_at:
+                self._drawn_at = count + count // DRAWN_SHARE
                 made = self.session.map
                 report = report._replace(path=made.online_trajectory(), grid=made.grid())
         for observer in self._observers:
@@ -343,57 +341,37 @@ def open_runner(
     columns = BACKENDS.get(config.backend, "backend").columns()
     with RunDirectory(directory, columns, _manifest_text(manifest)) as files:
         files.text("config.yaml", text)
-        save_world(source.info, files)
+        files.save_world(source.info)
         runner = Runner(config, source, files, manifest, session, skip, observers, estimate, warnings)
         if begun is not None:
             runner.checkpoint()  # nothing else of this folder holds the map before
         yield runner
 
 
-def _describe(config: RunConfig, source: Source, session: Session) -> RunDescription:
-    head = ur10_head(config.touch.head) if source.info.planar_whiskers is None else None
-    if head is not None and source.whiskers != len(head.length):
-        head = None
-    cells = session.backend.activity(session.state) is not None
-    tallest = config.touch.image.tallest
-    return RunDescription(source.name, config.backend, head, tallest, cells)
-
-
-def _step_report(
-    number: int, sample: Sample, observation: Observation, step: Step, odometry: np.ndarray
-) -> StepReport:
-    estimate = step.estimate
-    places = int(estimate.place), int(estimate.previous)
-    pose = np.asarray(step.pose, float)
-    lost, doubt = bool(estimate.lost), float(step.doubt)
-    return StepReport(number, float(sample.time), observation, odometry, pose, *places, lost, doubt)
-
-
 def _lines(
     samples: list[Sample], steps: list[Step], odometry: list[np.ndarray], entry: BackendEntry
-) -> dict[str, Iterator[str]]:
-    rows, columns = list(zip(samples, steps, strict=True)), entry.columns()
+) -> dict[str, list[str]]:
+    """The lines of the text files of a run, by their names."""
+    rows = []
+    for sample, step in zip(samples, steps, strict=True):
+        estimate = step.estimate
+        cells = [
+            repr(float(sample.time)),
+            str(int(estimate.place)),
+            Action(int(estimate.action)).name.lower(),
+            *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
+            str(int(estimate.lost)),
+            _cell(np.asarray(step.doubt)),
+            entry.outcome(step.evidence),
+            *(_cell(getattr(step.evidence, name)) for name in entry.columns()),
+        ]
+        rows.append(",".join(cells) + "\n")
     return {
-        "steps.csv": (_step_line(sample.time, step, entry, columns) for sample, step in rows),
-        "online.tum": (tum_line(sample.time, step.pose) for sample, step in rows),
-        "odometry.tum": (tum_line(s.time, pose) for s, pose in zip(samples, odometry, strict=True)),
-        "truth.tum": (tum_line(s.time, s.truth) for s in samples if s.truth is not None),
+        "steps.csv": rows,
+        "online.tum": [tum_line(s.time, step.pose) for s, step in zip(samples, steps, strict=True)],
+        "odometry.tum": [tum_line(s.time, pose) for s, pose in zip(samples, odometry, strict=True)],
+        "truth.tum": [tum_line(s.time, s.truth) for s in samples if s.truth is not None],
     }
-
-
-def _step_line(time: float, step: Step, entry: BackendEntry, columns: Sequence[str]) -> str:
-    estimate = step.estimate
-    cells = [
-        repr(float(time)),
-        str(int(estimate.place)),
-        Action(int(estimate.action)).name.lower(),
-        *(repr(float(value)) for value in (*step.pose, *estimate.spread)),
-        str(int(estimate.lost)),
-        _cell(np.asarray(step.doubt)),
-        entry.outcome(step.evidence),
-        *(_cell(getattr(step.evidence, name)) for name in columns),
-    ]
-    return ",".join(cells) + "\n"
 
 
 def _cell(value: Any) -> str:
@@ -407,7 +385,7 @@ def check_finished_map(config: RunConfig, source: Source) -> None:
     the map is broken or of another sensor."""
     if config.backend in LOCALISING.values() and config.localise.map is not None:
         saved = read_map(config.localise.map)
-        check_same_sensor(str(saved.path), saved.sensor, sensor_of(config, source))
+        saved.sensor.check_same(str(saved.path), Sensor.of(config, source))
 
 
 def _manifest_text(content: dict[str, Any]) -> str:

@@ -2,8 +2,6 @@
 
 A map file (NumPy's .npz; `map.npz` of a run directory) holds the arrays of a session, the completed
 configuration, the description of the readings, and a sha256 over all of it.
-
-The arrays of a map file, a NumPy archive (.npz) whose damage is told from other files.
 """
 
 from __future__ import annotations
@@ -21,18 +19,17 @@ import numpy as np
 from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
-from ratslam.runs.build_session import build_session, open_observations
-from ratslam.runs.estimate import START, PoseEstimate, estimate_arrays, read_estimate
+from ratslam.runs.build_session import build_session
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.folder_change import unfinished_change
-from ratslam.runs.map_settings import Sensor, check_same_settings, sensor_of
+from ratslam.runs.map_settings import Sensor, check_same_settings
 from ratslam.runs.settings.renamed_keys import with_moved_settings
-from ratslam.runs.settings.run_config import LoopConfig, RunConfig, load_config
+from ratslam.runs.settings.run_config import LoopConfig, RunConfig
 from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate
 from robot.sources.source import Source, SourceDescription, describe
-from robot.touch_source import TouchSource, open_touch_source
-from tactile.base import files
+from robot.touch_source import TouchSource
 from tactile.base.errors import InputError
-from tactile.base.files import NPZ_SPOILT, flush_to_disk, malformed, reason, write_atomically
+from tactile.base.files import NPZ_SPOILT, flush_to_disk, malformed, read_arrays, reason, write_atomically
 
 FORMAT = "ratslam-map-3"
 """Name and version of the format; a later version reads it."""
@@ -41,16 +38,20 @@ FORMATS = ("ratslam-map-1", "ratslam-map-2", FORMAT)
 cells."""
 EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
 ARCHIVE = b"PK"
-"""Beginning of every map file, by which a damaged one is told from another file."""
+"""Beginning of every map file, which distinguishes a damaged one from another file."""
 
 
-def read_arrays(file: Path) -> dict[str, np.ndarray]:
+def _read_arrays(file: Path) -> dict[str, np.ndarray]:
     """All arrays of a file that is a map by the names in it and by its size.
 
     Raises:
         InputError: it is no such file, damaged, of an unknown format, or cannot be read.
     """
-    begin = _begin(file)
+    with malformed(file, EXPECTED, "check the path and its permissions"):
+        if not stat.S_ISREG(file.stat().st_mode):
+            raise InputError(str(file), "neither a file nor a folder", EXPECTED)
+        with file.open("rb") as opened:
+            begin = opened.read(len(ARCHIVE))
     found = "damaged, or not a map ({})" if begin == ARCHIVE else "not a map"
     found, cure = found if begin else "empty, so not a map", "restore it from a copy if it was one"
     with malformed(file, EXPECTED, cure, found, NPZ_SPOILT), zipfile.ZipFile(file) as archive:
@@ -58,42 +59,13 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
         if "steps" not in members:
             raise InputError(str(file), "an archive of other arrays", EXPECTED)
         if "format" in members:
-            _check_format(file, *files.read_arrays(archive, ["format.npy"], str(file)))
-        arrays = files.read_arrays(archive, archive.namelist(), str(file))
+            (array,) = read_arrays(archive, ["format.npy"], str(file))
+            if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
+                found = repr(str(array)[:40]) if not array.shape else "numbers"
+                cure = "update ratslam if a newer version wrote it"
+                raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
+        arrays = read_arrays(archive, archive.namelist(), str(file))
         return dict(zip(members, arrays, strict=True))
-
-
-def _begin(file: Path) -> bytes:
-    """The first bytes of a file.
-
-    Raises:
-        InputError: there is none, it is not a plain file, or it cannot be read.
-    """
-    with malformed(file, EXPECTED, "check the path and its permissions"):
-        if not stat.S_ISREG(file.stat().st_mode):
-            raise InputError(str(file), "neither a file nor a folder", EXPECTED)
-        with file.open("rb") as opened:
-            return opened.read(len(ARCHIVE))
-
-
-def _check_format(file: Path, array: np.ndarray) -> None:
-    if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
-        found = repr(str(array)[:40]) if not array.shape else "numbers"
-        cure = "update ratslam if a newer version wrote it"
-        raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
-
-
-def text_of(file: Path, arrays: Mapping[str, np.ndarray], name: str) -> str:
-    """A text among the arrays of a file.
-
-    Raises:
-        InputError: there is no such text.
-    """
-    found = arrays.get(name)
-    if found is None or found.shape or found.dtype.kind != "U":
-        problem = f"a file without {name!r}" if found is None else f"{name!r} is not a text"
-        raise InputError(str(file), problem, EXPECTED)
-    return str(found)
 
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
@@ -104,13 +76,6 @@ def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
         digest.update(f"{name}\0{array.dtype.str}\0{arrays[name].shape}\0".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
-
-
-def write_arrays(path: Path, arrays: dict[str, Any], compressed: bool = True) -> None:
-    """Writes the arrays to a file that may be moved to its place afterwards."""
-    with path.open("wb") as file:  # with a path, NumPy would add a suffix
-        (np.savez_compressed if compressed else np.savez)(file, **arrays)
-    flush_to_disk(path)
 
 
 NAME = "map.npz"
@@ -169,7 +134,7 @@ class SavedMap:
     @property
     def sensor(self) -> Sensor:
         """The sensor that the map was made with."""
-        return sensor_of(self.config, self.source)
+        return Sensor.of(self.config, self.source)
 
     def open_session(self) -> Session:
         """A session that goes on from this map, with the map in it.
@@ -221,8 +186,7 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     """The map in a run directory or a map file.
 
     Args:
-        report: called with one sentence if the file is of an earlier format and was converted, or if a change
-            of its folder was cut off.
+        report: called with one sentence if a change of its folder was cut off.
 
     Raises:
         InputError: there is none; it is broken, incomplete, of an unknown format, or made by a backend that
@@ -233,16 +197,43 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     if undone is not None and report is not None:
         cure = f"repeat `ratslam map undo {file.parent} {undone}` to complete it"
         report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
-    arrays = read_arrays(file)
-    if "format" not in arrays:
-        return _convert(file, arrays, report)
-    texts = {name: text_of(file, arrays, name) for name in TEXTS}
+    arrays = _read_arrays(file)
+    texts = {}
+    for name in TEXTS:
+        found = arrays.get(name)
+        if found is None or found.shape or found.dtype.kind != "U":
+            problem = f"a file without {name!r}" if found is None else f"{name!r} is not a text"
+            raise InputError(str(file), problem, EXPECTED)
+        texts[name] = str(found)
     if digest_of(arrays) != texts["sha256"]:
-        found = "damaged: the content does not match its sha256"
-        raise InputError(str(file), found, "the file as it was written", "restore it from a copy")
+        problem = "damaged: the content does not match its sha256"
+        raise InputError(str(file), problem, "the file as it was written", "restore it from a copy")
+    config = validate(with_moved_settings(parse(texts["config"], f"{file}: config")), LoopConfig)
+    BACKENDS.get(config.backend, f"{file}: backend")
     if texts["format"] == FORMATS[0]:
-        arrays["earlier"] = _earlier_steps(arrays)
-    return _saved_map(file, arrays, texts)
+        # Unknown if a recording after the first began a piece of the map.
+        names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
+        begun = any(np.any(arrays[name]) for name in names if name in arrays)
+        arrays["earlier"] = np.array(UNKNOWN if begun else 0)
+    with malformed(file, EXPECTED, found="{}", spoilt=NPZ_SPOILT):
+        source = SourceDescription.from_json(texts["source"])
+        estimate = PoseEstimate.of_arrays(with_prefix(arrays, ESTIMATE))
+        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
+    if steps < 0:
+        raise InputError(str(file), f"{steps} steps", EXPECTED)
+    if not UNKNOWN <= earlier <= steps:
+        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
+    own = {name: value for name, value in arrays.items() if name not in TEXTS}
+    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
+    fill_missing(session)
+    if texts["format"] != FORMAT:
+        session["sides"] = np.zeros(0, np.int64)
+        if config.backend in CHANGED:
+            session = {name: value for name, value in session.items() if not name.startswith(STATE)}
+    return SavedMap(
+        file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
+        with_prefix(arrays, FRONTEND),
+    )  # fmt: skip
 
 
 def write_map(
@@ -269,10 +260,16 @@ def write_map(
         "source": np.array(source.to_json()),
         "recording": np.array(recording),
     }
-    arrays |= {ESTIMATE + name: value for name, value in estimate_arrays(estimate).items()}
+    arrays |= {ESTIMATE + name: value for name, value in estimate.arrays().items()}
     arrays |= {FRONTEND + name: np.asarray(value) for name, value in (frontend or {}).items()}
     arrays["sha256"] = np.array(digest_of(arrays))
-    write_atomically(path, lambda temporary: write_arrays(temporary, arrays, compressed))
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # with a path, NumPy would add a suffix
+            (np.savez_compressed if compressed else np.savez)(file, **arrays)
+        flush_to_disk(temporary)
+
+    write_atomically(path, write)
 
 
 def describe_readings(source: Source) -> SourceDescription:
@@ -284,76 +281,6 @@ def describe_readings(source: Source) -> SourceDescription:
     return SourceDescription(
         source.view_shape, source.whiskers, source.rate_hz, describe(readings).info, source.name
     )
-
-
-def _saved_map(file: Path, arrays: dict[str, np.ndarray], texts: Mapping[str, str]) -> SavedMap:
-    config = _config_of(file, texts["config"])
-    BACKENDS.get(config.backend, f"{file}: backend")
-    with malformed(file, EXPECTED, found="{}", spoilt=NPZ_SPOILT):
-        source = SourceDescription.from_json(texts["source"])
-        estimate = read_estimate(with_prefix(arrays, ESTIMATE))
-        steps, earlier = (int(arrays[name]) for name in ("steps", "earlier"))
-    if steps < 0:
-        raise InputError(str(file), f"{steps} steps", EXPECTED)
-    if not UNKNOWN <= earlier <= steps:
-        raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
-    own = {name: value for name, value in arrays.items() if name not in TEXTS}
-    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
-    fill_missing(session)
-    if texts["format"] != FORMAT:
-        _drop_former_state(session, config.backend)
-    return SavedMap(
-        file, texts["format"], texts["sha256"], config, source, texts["recording"], session, estimate,
-        with_prefix(arrays, FRONTEND),
-    )  # fmt: skip
-
-
-def _config_of(file: Path, text: str) -> RunConfig:
-    """The configuration in a map file, of this or an earlier version."""
-    return validate(with_moved_settings(parse(text, f"{file}: config")), LoopConfig)
-
-
-def _convert(file: Path, arrays: dict[str, np.ndarray], report: Callable[[str], None] | None) -> SavedMap:
-    """The map in a file written before there was a format: by `Slam.save`, which kept its configuration, or
-    in a run directory, where it stands beside it."""
-    if "source" in arrays:
-        config = _config_of(file, text_of(file, arrays, "config"))
-        with malformed(file, EXPECTED, found="{}"):
-            readings = SourceDescription.from_json(text_of(file, arrays, "source"))
-        source = describe_readings(open_touch_source(readings, config.touch))
-    else:
-        beside = file.with_name("config.yaml")
-        if not beside.is_file():
-            found = "a map file of an earlier version, which does not say how it was made"
-            cure = "put the config.yaml of its run beside it, or map the recording again"
-            raise InputError(str(file), found, f"a file of the format {FORMAT}", cure)
-        with open_observations(load_config(beside)) as (config, observed):
-            source = describe_readings(observed)
-    recording = str(arrays.pop("digest", ""))
-    texts = {"format": FORMATS[1], "config": dump(config), "source": source.to_json(), "recording": recording}
-    arrays["earlier"] = _earlier_steps(arrays)
-    arrays |= {name: np.array(value) for name, value in texts.items()}
-    digest = digest_of(arrays)
-    if report is not None:
-        report(f"{file}: of an earlier version; read as {FORMATS[1]}")
-    return _saved_map(file, arrays, texts | {"sha256": digest})
-
-
-def _earlier_steps(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """`Session.earlier` of a file that does not hold it: 0, or unknown if a recording began a further piece
-    of the map."""
-    names = ("map/graph/begins", "map/archive/graph/begins", "map/begins/0")
-    begun = any(np.any(arrays[name]) for name in names if name in arrays)
-    return np.array(UNKNOWN if begun else 0)
-
-
-def _drop_former_state(arrays: dict[str, np.ndarray], backend: str) -> None:
-    """Fits the arrays of an earlier version: they have no sides, and the state of a method that has another
-    one now goes."""
-    arrays["sides"] = np.zeros(0, np.int64)
-    if backend in CHANGED:
-        for name in [name for name in arrays if name.startswith(STATE)]:
-            del arrays[name]
 
 
 def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:

@@ -14,7 +14,7 @@ from ratslam.core.backend import Map
 from ratslam.core.compilation import keep_kernels
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.runs.build_session import ConfigLike, build_session, open_source, resolve_config
-from ratslam.runs.estimate import START, PoseEstimate, pose_estimate
+from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.runs.settings.completion import complete
@@ -58,7 +58,7 @@ class Slam:
             with open_source(config, warnings=found) as source:
                 self._build(complete(config, source), source, found)
         else:
-            source = describe_whiskers(info, config.touch) if isinstance(info, SourceInfo) else info
+            source = _describe_whiskers(info, config.touch) if isinstance(info, SourceInfo) else info
             self._build(complete(config, source), source)
         self.session.warm(self._blank)
 
@@ -107,11 +107,19 @@ class Slam:
             InputError: the reading has other shapes or types than described, or numbers that are not finite;
                 the session is then as before.
         """
-        observed = self._observe(reading.reading if isinstance(reading, Sample) else reading)
+        given = reading.reading if isinstance(reading, Sample) else reading
+        observed: Observation | None
+        if isinstance(given, Observation) and self.config.touch.frontend is None:
+            observed = given  # a registered front end may take observations
+        elif self._frontend is None:
+            cure = "describe the whiskers in SourceInfo, with raw_whiskers=True"
+            raise InputError("reading", f"a {type(given).__name__}", "an Observation", cure)
+        else:
+            observed = self._frontend.observe(given)
         if observed is not None:
-            step = self.session.step(match_observation(observed, self._blank))
+            step = self.session.step(_match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
-            self.estimate = pose_estimate(step, entry.outcome(step.evidence), self.warnings)
+            self.estimate = PoseEstimate.of_step(step, entry.outcome(step.evidence), self.warnings)
             self._cells = step.probed
         return self.estimate
 
@@ -166,16 +174,8 @@ class Slam:
                 slam._frontend.restore(dict(saved.frontend))
         return slam
 
-    def _observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation | None:
-        if isinstance(reading, Observation) and self.config.touch.frontend is None:
-            return reading  # a registered front end may take observations
-        if self._frontend is None:
-            cure = "describe the whiskers in SourceInfo, with raw_whiskers=True"
-            raise InputError("reading", f"a {type(reading).__name__}", "an Observation", cure)
-        return self._frontend.observe(reading)
 
-
-def match_observation(given: Observation, like: Observation) -> Observation:
+def _match_observation(given: Observation, like: Observation) -> Observation:
     """The observation with the dtypes of another one.
 
     Raises:
@@ -198,7 +198,7 @@ def _match_array(name: str, value: Any, like: np.ndarray) -> np.ndarray:
     return found.astype(like.dtype)
 
 
-def describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:
+def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:
     """The description of whiskers, whose view shape follows from their number.
 
     Raises:

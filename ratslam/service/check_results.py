@@ -1,10 +1,16 @@
-"""Checks, their results, and the comparison of nested records."""
+"""Conformance checks: a requirement with its reason, its result, the runner, and what checks share.
+
+A part under test (a backend, source, touch front end or metric with settings) is a class whose methods marked
+by `check` are its checks. `require`, `require_equal` (the same bits of nested records) and `read_assignments`
+serve them all.
+"""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,12 +42,24 @@ class Check(NamedTuple):
 
     Attributes:
         name: the requirement in a few words. reason: what goes wrong in a run otherwise.
-        run: takes the part under test; raises `Violation`, or returns a remark ('' for none).
+        group: its checks assume those of the groups with smaller numbers.
+        run: takes the part under test; raises `Violation`, or returns a remark (or nothing).
     """
 
     name: str
     reason: str
-    run: Callable[[Any], str]
+    group: int
+    run: Callable[[Any], str | None]
+
+
+def check(group: int, name: str, reason: str) -> Callable[[Callable[[Any], str | None]], Check]:
+    """Decorator that makes a check of a method of a class of parts under test; see `checks_of`."""
+    return lambda run: Check(name, reason, group, run)
+
+
+def checks_of(trial: type) -> tuple[Check, ...]:
+    """The checks in a class, in the order of its text, which is that of their groups."""
+    return tuple(member for member in vars(trial).values() if isinstance(member, Check))
 
 
 class Result(NamedTuple):
@@ -62,38 +80,32 @@ class Result(NamedTuple):
         return f"{self.status:<5} {self.check.name}{self.text and ': '}{self.text}{reason}"
 
 
-def run_checks(groups: Iterable[Sequence[Check]], part: Any) -> Iterator[Result]:
-    """Runs the checks of one group after another; a group after one with a failed check is not run."""
+def run_checks(checks: Iterable[Check], part: Any) -> Iterator[Result]:
+    """Runs the checks of one group after another; a group after one with a failed check is not run.
+
+    An exception of the part under test is a failure, described by its type, text and place in one line.
+    """
     sound = True
-    for group in groups:
+    for _, group in groupby(checks, lambda check: check.group):
         results = []
         for check in group:
-            result = (
-                run_check(check, part) if sound else Result(check, "-", "not run after the failures above")
-            )
+            result = Result(check, "-", "not run after the failures above")
+            if sound:
+                try:
+                    result = Result(check, "ok", check.run(part) or "")
+                except Violation as violation:
+                    result = Result(check, "FAIL", str(violation))
+                except Exception as error:  # whatever foreign code raises
+                    text = " ".join(str(error).split())
+                    text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
+                    frames = traceback.extract_tb(error.__traceback__)
+                    own = [frame for frame in frames if "jax" not in Path(frame.filename).parts] or frames
+                    at = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+                    text = f"{type(error).__name__}: {text}{at}; expected no exception"
+                    result = Result(check, "FAIL", text)
             results.append(result)
             yield result
         sound = all(result.status == "ok" for result in results)
-
-
-def run_check(check: Check, part: Any) -> Result:
-    """Runs one check; an exception of the part under test is a failure."""
-    try:
-        return Result(check, "ok", check.run(part))
-    except Violation as violation:
-        return Result(check, "FAIL", str(violation))
-    except Exception as error:  # whatever foreign code raises
-        return Result(check, "FAIL", f"{describe_error(error)}; expected no exception")
-
-
-def describe_error(error: Exception) -> str:
-    """Type, text and place of an exception in one line."""
-    text = " ".join(str(error).split())
-    text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if "jax" not in Path(frame.filename).parts] or list(frames)
-    place = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
-    return f"{type(error).__name__}: {text}{place}"
 
 
 def require(condition: bool, found: str, expected: str) -> None:
@@ -108,11 +120,11 @@ def require_equal(expected: Any, found: Any, pair: str) -> None:
     Args:
         pair: what the two are, for the message.
     """
-    if where := difference(expected, found):
+    if where := _difference(expected, found):
         raise Violation(f"{pair} differ: {where}", "the same bits")
 
 
-def difference(first: Any, second: Any, path: str = "") -> str:
+def _difference(first: Any, second: Any, path: str = "") -> str:
     """Path and values of the first leaf in which two nested records differ; '' if all have the same bits."""
     if isinstance(first, dict) and isinstance(second, dict):
         if list(first) != list(second):
@@ -125,27 +137,23 @@ def difference(first: Any, second: Any, path: str = "") -> str:
             )
         names = [f".{n}" for n in getattr(first, "_fields", ())] or [f"[{k}]" for k in range(len(first))]
         parts = [(path + name, a, b) for name, a, b in zip(names, first, second, strict=True)]
-    elif _is_object(first) and type(first) is type(second):
-        return difference(vars(first), vars(second), path)
-    elif _same(first, second):
-        return ""
+    elif (
+        hasattr(first, "__dict__")  # compared by its attributes, for example a dataclass
+        and not isinstance(first, np.ndarray | np.generic | Enum)
+        and type(first) is type(second)
+    ):
+        return _difference(vars(first), vars(second), path)
     else:
-        return f"{path} {_short(first)} and {_short(second)}".strip()
-    return next((found for name, a, b in parts if (found := difference(a, b, name))), "")
-
-
-def _is_object(value: Any) -> bool:
-    """Whether a value is compared by its attributes, for example a dataclass."""
-    return hasattr(value, "__dict__") and not isinstance(value, np.ndarray | np.generic | Enum)
-
-
-def _same(first: Any, second: Any) -> bool:
-    if first is None or second is None or isinstance(first, str):
-        return bool(first == second)
-    a, b = np.asarray(first), np.asarray(second)
-    if a.dtype == object or b.dtype == object:
-        return bool(first == second)
-    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+        by_value = first is None or second is None or isinstance(first, str)
+        if not by_value:
+            a, b = np.asarray(first), np.asarray(second)
+            by_value = object in (a.dtype, b.dtype)
+        if by_value:
+            same = bool(first == second)
+        else:
+            same = a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+        return "" if same else f"{path} {_short(first)} and {_short(second)}".strip()
+    return next((found for name, a, b in parts if (found := _difference(a, b, name))), "")
 
 
 def _short(value: Any) -> str:

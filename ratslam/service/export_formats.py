@@ -1,9 +1,7 @@
-"""Exports a run; the suffix of the new file chooses the format.
+"""Exports a run as a standard file; the suffix of the new file chooses the format.
 
-Spikes and behaviour as a Neurodata Without Borders (NWB) file.
-
-Rübel et al. 2022, eLife 11: e78362; written by pynwb, of the extra [nwb]. The spikes are simulated from the
-activity of pose cells; the file says so.
+Spikes and behaviour become a Neurodata Without Borders file (Rübel et al. 2022, eLife 11: e78362), written by
+pynwb of the extra [nwb]. The spikes are simulated from the activity of pose cells; the file says so.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
@@ -30,7 +28,7 @@ from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision
 from ratslam.mapping.pose_graph import read_json
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.ros_bag import ExportedRun, RosMessages, read_exported_run, write_bag, write_mcap
+from ratslam.service.ros_bag import RosMessages, read_exported_run, write_bag, write_mcap
 from ratslam.service.spikes import (
     SpikeConfig,
     SpikeTrains,
@@ -72,7 +70,12 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
     Raises:
         InputError: pynwb is not installed, or the spikes are not of the cells of the recording.
     """
-    pynwb = _import_pynwb()
+    try:
+        import pynwb
+        import pynwb.behavior
+    except ImportError:
+        cure = "pip install 'ratslam[nwb]'"
+        raise InputError("export", "pynwb is not installed", "the extra 'nwb'", cure) from None
     if not np.array_equal(recording.cell, spikes.cell):
         raise InputError("spikes", "other cells than those of the recording", "the spikes of the recording")
     file = pynwb.NWBFile(
@@ -87,16 +90,6 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
     with pynwb.NWBHDF5IO(path, "w") as output:
         output.write(file)
     _fix_ids(path, digest)
-
-
-def _import_pynwb() -> Any:
-    try:
-        import pynwb
-        import pynwb.behavior
-    except ImportError:
-        cure = "pip install 'ratslam[nwb]'"
-        raise InputError("export", "pynwb is not installed", "the extra 'nwb'", cure) from None
-    return pynwb
 
 
 def _add_behaviour(pynwb: Any, file: Any, recording: CellRecording) -> None:
@@ -170,6 +163,7 @@ def _fix_ids(path: Path, digest: str) -> None:
 
 Warn = Callable[[str], None]
 PARTED = "the map is in several pieces, whose poses cannot be compared"
+SUFFIXES = ("", ".mcap", ".tum", ".g2o", ".json", ".graphml", ".yaml", ".nwb", ".npz", ".csv")
 FORMATS = (
     ".mcap, .tum, .g2o, .json, .graphml, .yaml, .nwb, .npz or .csv, "
     "or a folder without a suffix for a ROS 2 bag"
@@ -191,35 +185,49 @@ def export_run(
             folder does not, or the format is unknown.
     """
     suffix = output.suffix.lower()
-    if suffix not in WRITERS and suffix not in CELL_WRITERS:
+    if suffix not in SUFFIXES:
         raise InputError(str(output), f"an unknown suffix {output.suffix!r}", FORMATS)
     if not directory.is_dir():
         raise InputError(str(directory), "no such folder", "a run directory")
     require_new_file(output)
-    if suffix in CELL_WRITERS:
-        CELL_WRITERS[suffix](directory, output, spikes or SpikeConfig())
-    else:
-        WRITERS[suffix](directory, output, warn)
+    config = spikes or SpikeConfig()
+    match suffix:
+        case "" | ".mcap":
+            ros = RosMessages()
+            exported = read_exported_run(directory, warn)
+            if exported.run.has_pieces:
+                beside = "the file shows them beside each other, or each where it is true if that is known"
+                warn(f"{PARTED}; {beside}")
+            if suffix:
+                make_new_file(output, lambda path: write_mcap(path, exported, ros))
+                return
+            with new_folder(output) as folder:
+                write_bag(folder, output.name, exported, ros)
+        case ".tum":
+            _write_tum(directory, output, warn)
+        case ".g2o" | ".json":
+            what = "a pose graph" if suffix == ".g2o" else "a map of experiences"
+            file = _file(directory / f"map{suffix}", what)
+            make_new_file(output, lambda path: shutil.copyfile(file, path))
+        case ".graphml":
+            import networkx  # slow to import
 
-
-def _read_run(directory: Path, warn: Warn) -> ExportedRun:
-    exported = read_exported_run(directory, warn)
-    if exported.run.has_pieces:
-        warn(f"{PARTED}; the file shows them beside each other, or each where it is true if that is known")
-    return exported
-
-
-def _write_mcap(directory: Path, output: Path, warn: Warn) -> None:
-    ros = RosMessages()
-    exported = _read_run(directory, warn)
-    make_new_file(output, lambda path: write_mcap(path, exported, ros))
-
-
-def _write_bag(directory: Path, output: Path, warn: Warn) -> None:
-    ros = RosMessages()
-    exported = _read_run(directory, warn)
-    with new_folder(output) as folder:
-        write_bag(folder, output.name, exported, ros)
+            graph = read_json(_file(directory / "map.json", "a map of experiences"))
+            make_new_file(output, lambda path: networkx.write_graphml_xml(graph, path))
+        case ".yaml":  # of nav2's map_server; beside it the image of the same name
+            grid = read_grid(_file(directory / "grid.npz", "an occupancy grid"))
+            for name in (".pgm", ".yaml"):  # whatever the case of the one given
+                require_new_file(output.with_suffix(name))
+            write_nav2(output.parent, grid, output.stem)
+        case ".nwb":
+            cells = read_run_cells(directory, config)
+            make_new_file(output, lambda path: write_nwb(path, *cells))
+        case ".npz":
+            _, drawn, _ = read_run_cells(directory, config)
+            make_new_file(output, lambda path: write_spikes(path, drawn))
+        case ".csv":
+            scores = _score_cells(directory, config.peak_rate)
+            make_new_file(output, lambda path: write_scores(path, scores))
 
 
 def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
@@ -231,65 +239,7 @@ def _write_tum(directory: Path, output: Path, warn: Warn) -> None:
         require_new_file(beside)
         warn(f"{PARTED}; {beside} says which of them each pose is in")
         make_new_file(beside, lambda path: shutil.copyfile(pieces, path))
-    _copy(final if final.exists() else directory / "online.tum", output, "a trajectory")
-
-
-def _write_g2o(directory: Path, output: Path, warn: Warn) -> None:
-    _copy(directory / "map.g2o", output, "a pose graph")
-
-
-def _write_json(directory: Path, output: Path, warn: Warn) -> None:
-    _copy(directory / "map.json", output, "a map of experiences")
-
-
-def _write_graphml(directory: Path, output: Path, warn: Warn) -> None:
-    import networkx  # slow to import
-
-    graph = read_json(_file(directory / "map.json", "a map of experiences"))
-    make_new_file(output, lambda path: networkx.write_graphml_xml(graph, path))
-
-
-def _write_nav2(directory: Path, output: Path, warn: Warn) -> None:
-    """map_server's YAML file, and beside it the image of the same name."""
-    grid = read_grid(_file(directory / "grid.npz", "an occupancy grid"))
-    for suffix in (".pgm", ".yaml"):  # whatever the case of the one given
-        require_new_file(output.with_suffix(suffix))
-    write_nav2(output.parent, grid, output.stem)
-
-
-def _write_nwb(directory: Path, output: Path, config: SpikeConfig) -> None:
-    cells = read_run_cells(directory, config)
-    make_new_file(output, lambda path: write_nwb(path, *cells))
-
-
-def _write_spikes(directory: Path, output: Path, config: SpikeConfig) -> None:
-    cells = read_run_cells(directory, config)
-    make_new_file(output, lambda path: write_spikes(path, cells.spikes))
-
-
-def _write_scores(directory: Path, output: Path, config: SpikeConfig) -> None:
-    scores = score_run_cells(directory, config.peak_rate)
-    make_new_file(output, lambda path: write_scores(path, scores))
-
-
-WRITERS: dict[str, Callable[[Path, Path, Warn], None]] = {
-    "": _write_bag,
-    ".mcap": _write_mcap,
-    ".tum": _write_tum,
-    ".g2o": _write_g2o,
-    ".json": _write_json,
-    ".graphml": _write_graphml,
-    ".yaml": _write_nav2,
-}
-CELL_WRITERS: dict[str, Callable[[Path, Path, SpikeConfig], None]] = {
-    ".nwb": _write_nwb,
-    ".npz": _write_spikes,
-    ".csv": _write_scores,
-}
-
-
-def _copy(file: Path, output: Path, what: str) -> None:
-    _file(file, what)
+    file = _file(final if final.exists() else directory / "online.tum", "a trajectory")
     make_new_file(output, lambda path: shutil.copyfile(file, path))
 
 
@@ -308,17 +258,11 @@ def _file(file: Path, what: str) -> Path:
 CURE = "add `cells: {chosen: 64}` to the configuration and run it again"
 
 
-class RunCells(NamedTuple):
-    """Recorded cells of a run, their spikes, and the sha256 (hex) of all that they were made from."""
+def read_run_cells(directory: Path, config: SpikeConfig) -> tuple[CellRecording, SpikeTrains, str]:
+    """The recorded chosen cells of a run, their spikes, and the sha256 (hex) of all that they were made from.
 
-    recording: CellRecording
-    spikes: SpikeTrains
-    digest: str
-
-
-def read_run_cells(directory: Path, config: SpikeConfig) -> RunCells:
-    """Reads the chosen cells of a run and draws their spikes. A cell fires at the peak rate at the peak of a
-    settled packet of the run's network; that is computed in float64, also for a run in float32.
+    A cell fires at the peak rate at the peak of a settled packet of the run's network; that is computed in
+    float64, also for a run in float32.
 
     Raises:
         InputError: the run has no recorded cells, no chosen ones among them, or a file is malformed.
@@ -329,10 +273,10 @@ def read_run_cells(directory: Path, config: SpikeConfig) -> RunCells:
         raise InputError(str(file), "no chosen cells", "cells recorded at every step", CURE)
     spikes = draw_spikes(recording, settled_peak(network), config)
     documents = [network.model_dump_json().encode(), config.model_dump_json().encode()]
-    return RunCells(recording, spikes, digest_of([file.read_bytes(), *documents]))
+    return recording, spikes, digest_of([file.read_bytes(), *documents])
 
 
-def score_run_cells(directory: Path, peak_rate: float) -> CellScores:
+def _score_cells(directory: Path, peak_rate: float) -> CellScores:
     """Scores of the chosen cells of a run; if only sums were recorded, of all cells.
 
     Args:

@@ -1,4 +1,4 @@
-"""Checks of a metric on synthetic runs."""
+"""Conformance checks of a metric on synthetic runs: with truth, with half of it, without, and rare runs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import RUN_METRICS, RunData, run_data
 from ratslam.service.check_results import (
-    Check,
     Result,
     Violation,
+    check,
+    checks_of,
     read_assignments,
     require,
     require_equal,
@@ -30,6 +31,8 @@ from tactile.base.se2 import integrate
 LAPS, PLACES = 3, 36
 GAP = 10
 """Distance of the pairs of `energy_gap`, steps."""
+ENTRY, VALUES = range(2)
+"""Groups of checks, in their order."""
 
 
 def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
@@ -43,11 +46,11 @@ def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]
     """
     entry = METRICS.get(name, "check metric")
     settings = read_assignments({"settings": entry.config_class}, assignments)["settings"]
-    return run_checks(GROUPS, MetricTrial(entry, settings))
+    return run_checks(CHECKS, MetricTrial(entry, settings))
 
 
 class MetricTrial:
-    """A metric with settings, and the runs that its checks share.
+    """A metric with settings: the runs that its checks share, and the checks.
 
     Args:
         settings: an instance of the entry's `config_class`.
@@ -62,18 +65,93 @@ class MetricTrial:
 
     @cached_property
     def with_truth(self) -> RunData:
-        return _data(synthetic_run())
+        return _data(_synthetic_run())
 
     @cached_property
     def without_truth(self) -> RunData:
-        return _data(synthetic_run()._replace(truth=None))
+        return _data(_synthetic_run()._replace(truth=None))
+
+    @check(ENTRY, "the entry is complete", "a configuration names it with its settings")
+    def entry_is_complete(self) -> None:
+        require_settings_class(self.entry.config_class)
+
+    @check(ENTRY, "name, label and unit are well-formed", "scorecard.json and tables show them")
+    def is_named(self) -> str:
+        metric = self.metric
+        require(isinstance(metric, Metric), f"build gave a {type(metric).__name__}", "Metric")
+        named = isinstance(metric.name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", metric.name)
+        require(bool(named), f"name {metric.name!r}", "small letters, digits and _")
+        taken = any(one.name == metric.name and one is not metric for one in RUN_METRICS)
+        require(not taken, f"name {metric.name!r} of one of our metrics", "another name")
+        for name in ("label", "section"):
+            value = getattr(metric, name)
+            one_line = isinstance(value, str) and value.strip() != "" and "\n" not in value
+            require(one_line, f"{name} {value!r}", "a few words in one line")
+        unit = metric.unit
+        require(isinstance(unit, str) and not re.search(r"\s", unit), f"unit {unit!r}", "SI, 'deg', or ''")
+        found = f"direction {metric.direction!r}"
+        require(metric.direction in ("low", "high", None), found, "'low', 'high' or None")
+        require(callable(metric.compute), f"compute {metric.compute!r}", "a function of a RunData")
+        return f"{metric.name}, {metric.label}{unit and f', {unit}'}"
+
+    @check(VALUES, "it computes with truth", "a scorecard holds numbers")
+    def computes_with_truth(self) -> str:
+        what = "a run with truth"
+        result = self.metric.compute(self.with_truth)
+        require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
+        found = _require_finding(result, what)
+        self.metric.quantity(found)
+        return f"{found.value:.4g}{self.metric.unit and f' {self.metric.unit}'}"
+
+    @check(VALUES, "it does without truth", "most recordings have none")
+    def computes_without_truth(self) -> str:
+        result = self.metric.compute(self.without_truth)
+        if result is None:
+            return "no ground truth"
+        found = _require_finding(result, "a run without truth")
+        known = np.isfinite(found.value) or found.note != ""
+        require(bool(known), f"{found.value} without a note", "None, or the reason in `note`")
+        return f"{found.value:.4g} {found.note}".rstrip()
+
+    @check(VALUES, "it computes on rare runs", "a run would end without its scorecard")
+    def computes_on_rare_runs(self) -> None:
+        run = _synthetic_run()
+        half = run.truth[: len(run.time) // 2] if run.truth is not None else np.zeros((0, 3))
+        unknown = np.full((len(run.time) - len(half), 3), np.nan)
+        none, no_links = np.zeros(0, int), np.zeros((0, 2), int)
+        names = ("time", "truth", "online", "final", "odometry", "experience")
+        first: dict[str, Any] = {name: getattr(run, name)[:1] for name in names}
+        first |= {"created": np.zeros(1, int), "nodes": run.nodes[:1], "links": no_links}
+        empty: dict[str, Any] = {"created": none, "nodes": np.zeros((0, 3)), "links": no_links}
+        rare = {
+            "a run whose second half has no truth": run._replace(truth=np.concatenate([half, unknown])),
+            "a run without experiences": run._replace(experience=np.full(len(run.time), -1), **empty),
+            "a run of one step": run._replace(**first),
+        }
+        for what, one in rare.items():
+            result = self.metric.compute(_data(one))
+            if result is not None:
+                _require_finding(result, what)
+
+    @check(VALUES, "it does not change the run", "later metrics would see other arrays")
+    def changes_no_run(self) -> None:
+        data = _data(_synthetic_run())
+        before = copy.deepcopy(data)
+        self.metric.compute(data)
+        require_equal(before, data, "the run before and after `compute`")
+
+    @check(VALUES, "it is deterministic", "a score could not be reproduced")
+    def is_deterministic(self) -> None:
+        first = self.metric.compute(_data(_synthetic_run()))
+        second = self.entry.build(self.settings).compute(_data(_synthetic_run()))
+        require_equal(first, second, "the findings of one run computed twice")
 
 
 def _data(run: RunArrays) -> RunData:
     return run_data(run, DEFAULT_EXM, None, GAP)
 
 
-def synthetic_run() -> RunArrays:
+def _synthetic_run() -> RunArrays:
     """Laps of a circle with a map that is a little wrong, and odometry that drifts."""
     count = LAPS * PLACES
     stream = np.random.default_rng(0)
@@ -94,30 +172,6 @@ def synthetic_run() -> RunArrays:
     )
 
 
-def _entry(trial: MetricTrial) -> str:
-    require_settings_class(trial.entry.config_class)
-    return ""
-
-
-def _names(trial: MetricTrial) -> str:
-    metric = trial.metric
-    require(isinstance(metric, Metric), f"build gave a {type(metric).__name__}", "Metric")
-    named = isinstance(metric.name, str) and re.fullmatch(r"[a-z][a-z0-9_]*", metric.name)
-    require(bool(named), f"name {metric.name!r}", "small letters, digits and _")
-    taken = any(one.name == metric.name and one is not metric for one in RUN_METRICS)
-    require(not taken, f"name {metric.name!r} of one of our metrics", "another name")
-    for name in ("label", "section"):
-        value = getattr(metric, name)
-        one_line = isinstance(value, str) and value.strip() != "" and "\n" not in value
-        require(one_line, f"{name} {value!r}", "a few words in one line")
-    unit = metric.unit
-    require(isinstance(unit, str) and not re.search(r"\s", unit), f"unit {unit!r}", "SI, 'deg', or ''")
-    found = f"direction {metric.direction!r}"
-    require(metric.direction in ("low", "high", None), found, "'low', 'high' or None")
-    require(callable(metric.compute), f"compute {metric.compute!r}", "a function of a RunData")
-    return f"{metric.name}, {metric.label}{unit and f', {unit}'}"
-
-
 def _require_finding(found: Any, what: str) -> Finding:
     if not isinstance(found, Finding):
         raise Violation(f"{what} gave a {type(found).__name__}", "Finding(value)")
@@ -129,72 +183,5 @@ def _require_finding(found: Any, what: str) -> Finding:
     return found
 
 
-def _computes(trial: MetricTrial) -> str:
-    what = "a run with truth"
-    result = trial.metric.compute(trial.with_truth)
-    require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
-    found = _require_finding(result, what)
-    trial.metric.quantity(found)
-    return f"{found.value:.4g}{trial.metric.unit and f' {trial.metric.unit}'}"
-
-
-def _without_truth(trial: MetricTrial) -> str:
-    result = trial.metric.compute(trial.without_truth)
-    if result is None:
-        return "no ground truth"
-    found = _require_finding(result, "a run without truth")
-    known = np.isfinite(found.value) or found.note != ""
-    require(bool(known), f"{found.value} without a note", "None, or the reason in `note`")
-    return f"{found.value:.4g} {found.note}".rstrip()
-
-
-def _rare_runs(trial: MetricTrial) -> str:
-    run = synthetic_run()
-    half = run.truth[: len(run.time) // 2] if run.truth is not None else np.zeros((0, 3))
-    unknown = np.full((len(run.time) - len(half), 3), np.nan)
-    none, no_links = np.zeros(0, int), np.zeros((0, 2), int)
-    names = ("time", "truth", "online", "final", "odometry", "experience")
-    first: dict[str, Any] = {name: getattr(run, name)[:1] for name in names}
-    first |= {"created": np.zeros(1, int), "nodes": run.nodes[:1], "links": no_links}
-    empty: dict[str, Any] = {"created": none, "nodes": np.zeros((0, 3)), "links": no_links}
-    rare = {
-        "a run whose second half has no truth": run._replace(truth=np.concatenate([half, unknown])),
-        "a run without experiences": run._replace(experience=np.full(len(run.time), -1), **empty),
-        "a run of one step": run._replace(**first),
-    }
-    for what, one in rare.items():
-        result = trial.metric.compute(_data(one))
-        if result is not None:
-            _require_finding(result, what)
-    return ""
-
-
-def _unchanged(trial: MetricTrial) -> str:
-    data = _data(synthetic_run())
-    before = copy.deepcopy(data)
-    trial.metric.compute(data)
-    require_equal(before, data, "the run before and after `compute`")
-    return ""
-
-
-def _deterministic(trial: MetricTrial) -> str:
-    first = trial.metric.compute(_data(synthetic_run()))
-    second = trial.entry.build(trial.settings).compute(_data(synthetic_run()))
-    require_equal(first, second, "the findings of one run computed twice")
-    return ""
-
-
-ENTRY_CHECKS = (
-    Check("the entry is complete", "a configuration names it with its settings", _entry),
-    Check("name, label and unit are well-formed", "scorecard.json and tables show them", _names),
-)
-VALUE_CHECKS = (
-    Check("it computes with truth", "a scorecard holds numbers", _computes),
-    Check("it does without truth", "most recordings have none", _without_truth),
-    Check("it computes on rare runs", "a run would end without its scorecard", _rare_runs),
-    Check("it does not change the run", "later metrics would see other arrays", _unchanged),
-    Check("it is deterministic", "a score could not be reproduced", _deterministic),
-)
-GROUPS = (ENTRY_CHECKS, VALUE_CHECKS)
-CHECKS = tuple(check for group in GROUPS for check in group)
-"""All checks of a metric; the checks of a group assume those of the groups before it."""
+CHECKS = checks_of(MetricTrial)
+"""All checks of a metric."""

@@ -1,10 +1,7 @@
-"""The path of a RatInABox agent as a source: with odometry alone, or with the views of a box with cues.
+"""RatSLAM's pose cells and RatInABox, both ways (George et al. 2024, eLife 13: e85274; extra [ratinabox]).
 
-A network of pose cells that a loop of one's own drives with motions.
-
-Pose cells as neurons of a RatInABox agent.
-
-RatInABox: George et al. 2024, eLife 13: e85274; package `ratinabox`, of the extra [ratinabox].
+The path of an agent becomes a source, with odometry alone or with the views of a box with cues. Pose cells
+become neurons of an agent, by `DrivenNetwork`, a network that a loop of one's own drives with motions.
 """
 
 from __future__ import annotations

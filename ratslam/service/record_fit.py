@@ -1,12 +1,9 @@
 """The rig from the record of a configuration: wheels, head and whiskers, as far as they are in it.
 
-Systematic errors of wheel odometry from a record without true poses: the calibration that its map finds.
-
-The keyframe map solves for a heading bias and an error of turns with its poses (`ratslam.mapping`), because
-loops do not close without them. A scale of all distances changes the size of the map and closes every loop as
-well: revisits do not tell it.
-
-The signals of whiskers from the record of a configuration: raw whisks, or a registered source.
+Without true poses, the errors of the wheels are the calibration that the map of the record finds: the
+keyframe map solves for a heading bias and an error of turns with its poses (`ratslam.mapping`), because loops
+do not close without them. A scale of all distances changes the size of the map and closes every loop as well:
+revisits do not tell it. The signals of whiskers come from raw whisks, or from a registered source.
 """
 
 from __future__ import annotations
@@ -22,11 +19,10 @@ from ratslam.runs.build_session import build_session, open_observations, open_so
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load
-from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_wheels, join_rigs
+from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_wheels
 from robot.recordings.real_whiskers import (
     WHISKERS,
     ReachConfig,
-    StageCalibration,
     StageConfig,
     find_touches,
     read_reach,
@@ -43,7 +39,7 @@ from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Observation, Whisk
 from tactile.contact_stream import Touch
 from tactile.frontend import Frontend
-from tactile.rig_signals import HeadFit, SignalFit, SignalRecord, fit_head, fit_signals, head_with
+from tactile.rig_signals import SignalFit, SignalRecord, fit_head, fit_signals, head_with
 from tactile.wall_estimation.signal_map import fit_signal_map, predict_signal
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
@@ -70,31 +66,7 @@ SIGNALS: dict[str, Callable[[PluginConfig], SignalRecord]] = {"whisker_reach": r
 """Registered sources whose files hold the signals of whiskers; as sources they give contacts only."""
 
 
-def has_signals_only(config: RunConfig) -> bool:
-    """Whether the record of a configuration is one of signals, without wheels or a head."""
-    return config.source is not None and config.source.plugin in SIGNALS
-
-
-def fit_signals_of(config: RunConfig, samples: list[Sample]) -> Rig:
-    """Noise, drift and faults of the whiskers.
-
-    Raises:
-        InputError: the file of a registered source cannot be read.
-    """
-    if has_signals_only(config):
-        assert config.source is not None
-        record = SIGNALS[config.source.plugin](config.source)
-        return signal_rig(record, fit_signals(record), registered=True)
-    try:
-        record = signals_of_cycles(samples)
-        return signal_rig(record, fit_signals(record), registered=False)
-    except InputError as error:
-        dead = dead_of_whisks(samples)
-        settings = {"touch": {"head": {"dead": dead}}} if dead else {}
-        return Rig(settings=settings, unknown=(f"noise, drift, baseline: {error}",))
-
-
-def signals_of_cycles(samples: list[Sample]) -> SignalRecord:
+def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
     """The deflections of a whisker head at rest, at the start of each cycle.
 
     Raises:
@@ -112,13 +84,7 @@ def signals_of_cycles(samples: list[Sample]) -> SignalRecord:
     return SignalRecord(record, record, rest, apart, np.zeros(whiskers), names, "rad")
 
 
-def dead_of_whisks(samples: list[Sample]) -> list[int]:
-    """Whiskers that are alive in none of the whisks."""
-    alive = [sample.reading.alive for sample in samples if isinstance(sample.reading, Whisk)]
-    return np.flatnonzero(~np.any(alive, axis=0)).tolist() if alive else []
-
-
-def signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
+def _signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
     """The signals as a rig: medians over the channels of live whiskers, and a line for each whisker."""
     live = ~fit.dead
     quantities = []
@@ -141,26 +107,20 @@ def signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
             for k in np.flatnonzero(np.isnan(fit.drift).any(axis=1))
         ),
     )
-    return Rig(tuple(quantities), settings, signal_lines(record, fit), unknown)
-
-
-def signal_lines(record: SignalRecord, fit: SignalFit) -> tuple[str, ...]:
-    """A line for each whisker: baseline, noise, correlation, drift of each channel, and its faults."""
     reasons = {one.whisker: f"dirty: {one.reason}" for one in fit.dirty}
     reasons |= {int(k): "dead: no signal" for k in np.flatnonzero(fit.dead)}
     lines = [f"each channel: baseline; noise; correlation; drift ({record.unit}, {record.unit}/sqrt(s))"]
     for k, name in enumerate(record.names):
         columns = (fit.baseline, fit.noise, fit.correlation, fit.drift)
-        parts = (" ".join(map(_shown, column[k])) for column in columns)
+        # '-' where the record does not tell the number
+        parts = (
+            " ".join(f"{value:.3g}" if np.isfinite(value) else "-" for value in column[k])
+            for column in columns
+        )
         lines.append(f"  {name}: " + (reasons[k] if fit.dead[k] else "; ".join(parts)))
         if k in reasons and not fit.dead[k]:
             lines.append(f"    {reasons[k]}")
-    return tuple(lines)
-
-
-def _shown(value: float) -> str:
-    """A number, or '-' where the record does not tell it."""
-    return f"{value:.3g}" if np.isfinite(value) else "-"
+    return Rig(tuple(quantities), settings, tuple(lines), unknown)
 
 
 def fit_record(config: RunConfig, seed: int = 0) -> Rig:
@@ -172,22 +132,31 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
     Raises:
         InputError: the record cannot be read.
     """
-    if is_stage(config):
-        return fit_stage_of(config)
-    if has_signals_only(config):
-        return fit_signals_of(config, [])
-    plain = without_correction(config)
+    if config.source is not None and config.source.plugin == PLUGIN:
+        return _fit_stage(config.source)
+    if config.source is not None and config.source.plugin in SIGNALS:
+        record = SIGNALS[config.source.plugin](config.source)
+        return _signal_rig(record, fit_signals(record), registered=True)
+    plain = _without_correction(config)
     with open_source(plain) as source:
         completed = complete(plain, source)
         samples = list(source)
         info = source.info
     parts = [fit_wheels_of(config, completed, samples, seed)]
     if info.raw_whiskers and info.planar_whiskers is None:
-        parts += [fit_signals_of(config, samples), fit_head_of(completed, samples, info)]
-    return join_rigs(parts)
+        try:
+            record = _signals_of_cycles(samples)
+            parts.append(_signal_rig(record, fit_signals(record), registered=False))
+        except InputError as error:
+            alive = [sample.reading.alive for sample in samples if isinstance(sample.reading, Whisk)]
+            dead = np.flatnonzero(~np.any(alive, axis=0)).tolist() if alive else []
+            settings = {"touch": {"head": {"dead": dead}}} if dead else {}
+            parts.append(Rig(settings=settings, unknown=(f"noise, drift, baseline: {error}",)))
+        parts.append(_fit_head(completed, samples, info))
+    return Rig.join(parts)
 
 
-def without_correction(config: RunConfig) -> RunConfig:
+def _without_correction(config: RunConfig) -> RunConfig:
     """The configuration with the odometry as recorded."""
     if config.recording is None:
         return config
@@ -203,13 +172,16 @@ def fit_wheels_of(config: RunConfig, completed: RunConfig, samples: list[Sample]
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     if not np.isfinite(truth).any():
-        return _from_revisits(without_correction(config), samples, assumed)
+        return _from_revisits(_without_correction(config), samples, assumed)
     try:
         fit = fit_wheels(time, motion, truth, seed)
     except InputError as error:
         return Rig(unknown=(f"wheels: {error.found}; {error.expected} are needed",))
     rig = _from_truth(fit, assumed, completed)
-    return rig if config.recording is not None else _without_settings(rig)
+    if config.recording is not None:
+        return rig
+    # No setting corrects the odometry of another source.
+    return rig._replace(quantities=tuple(quantity._replace(setting="") for quantity in rig.quantities))
 
 
 def _from_truth(fit: WheelFit, assumed: OdometryCorrection, completed: RunConfig) -> Rig:
@@ -271,12 +243,6 @@ def _bias(assumed: float, found: tuple[float, float]) -> Quantity:
     return Quantity("heading bias", assumed, *found, "rad/m", "recording.odometry.heading_bias")
 
 
-def _without_settings(rig: Rig) -> Rig:
-    """The rig of a source whose odometry no setting corrects."""
-    plain = tuple(quantity._replace(setting="") for quantity in rig.quantities)
-    return rig._replace(quantities=plain)
-
-
 DELAY = (
     "head: the rest angle holds the delay of contact detection, which no contact tells apart from it "
     "(0.9 degrees for 15 mrad)"
@@ -286,7 +252,7 @@ STEEPEST_REST = 90.0
 """Largest rest angle of a head, degrees."""
 
 
-def fit_head_of(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig:
+def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig:
     """Rest angle and base radii of the head.
 
     Args:
@@ -310,18 +276,7 @@ def fit_head_of(config: RunConfig, samples: list[Sample], info: SourceInfo) -> R
         fit = fit_head(assumed, contact, angle, predict)
     except InputError as error:
         return Rig(unknown=(f"rest angle, base radii: {error.found}; {error.expected} are needed",))
-    return head_rig(assumed, fit)
-
-
-def walls_of(info: SourceInfo) -> Walls:
-    """The walls of the maze of a source."""
-    assert info.maze is not None
-    maze = parse_maze(info.maze.text, Path("maze of the recording"))
-    return wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
-
-
-def head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
-    """The geometry as a rig; rings whose radius is unknown keep theirs."""
+    # Rings whose radius is unknown keep theirs.
     rest, sd = min(fit.rest_deg[0], STEEPEST_REST), fit.rest_deg[1]
     quantities = [Quantity("rest angle", assumed.rest_deg, rest, sd, "degrees", "touch.head.rest_deg")]
     unknown, radii = [], []
@@ -341,27 +296,37 @@ def head_rig(assumed: HeadConfig, fit: HeadFit) -> Rig:
     return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
 
 
+def walls_of(info: SourceInfo) -> Walls:
+    """The walls of the maze of a source."""
+    assert info.maze is not None
+    maze = parse_maze(info.maze.text, Path("maze of the recording"))
+    return wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
+
+
 PLUGIN = "whisker_stage"
 FOLDS, BLOCK = 3, 10
 """Parts of the rows held out in turn, and consecutive rows held out together: neighbours are alike."""
 
 
-def is_stage(config: RunConfig) -> bool:
-    """Whether the record of a configuration is of a whisker on a stage."""
-    return config.source is not None and config.source.plugin == PLUGIN
-
-
-def fit_stage_of(config: RunConfig) -> Rig:
-    """How well signals follow from the place of the touch, on rows held out.
+def _fit_stage(source: PluginConfig) -> Rig:
+    """How well signals of a whisker on a stage follow from the place of the touch, on rows held out.
 
     Raises:
         InputError: the record cannot be read.
     """
-    assert config.source is not None
-    settings = read_settings(StageConfig, config.source.settings, "source.settings")
+    settings = read_settings(StageConfig, source.settings, "source.settings")
     record = read_stage_calibration(settings.file)
+    # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.
+    errors = np.zeros((2, len(record.signal)))
     try:
-        errors = held_out_errors(record)
+        for fold in _folds(len(record.signal)):
+            known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
+            for out, mean in zip(
+                errors,
+                (predict_signal(known, record.position[fold]), record.signal[~fold].mean(axis=0)),
+                strict=True,
+            ):
+                out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))
     except InputError as reason:
         return Rig(unknown=(f"stage-to-signal map: {reason}",))
     size = float(np.sqrt((record.signal**2).mean()))
@@ -377,19 +342,6 @@ def fit_stage_of(config: RunConfig) -> Rig:
     )
     unknown = ("noise, drift: a stage rests between its rows, and the file has no time",)
     return Rig(quantities, notes=(note,), unknown=unknown)
-
-
-def held_out_errors(record: StageCalibration) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean square errors [N] over the channels, of the map and of the mean signal, each row held out."""
-    error, control = np.zeros(len(record.signal)), np.zeros(len(record.signal))
-    for fold in _folds(len(record.signal)):
-        known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
-        for out, mean in (
-            (error, predict_signal(known, record.position[fold])),
-            (control, record.signal[~fold].mean(axis=0)),
-        ):
-            out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))
-    return error, control
 
 
 def _folds(rows: int) -> list[np.ndarray]:

@@ -1,14 +1,8 @@
-"""What a recording holds, whether it can be read, and the configuration that reads it.
-
-The kinds of recordings, and what a file of each kind holds.
-
-A diagnosis: what something is, what it holds, what is wrong with it, and what to do next; as text.
-"""
+"""What a recording holds, whether it can be read, and the configuration that reads it, as a `Diagnosis`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +10,9 @@ import numpy as np
 
 from ratslam.runs.build_session import open_source
 from ratslam.runs.map_settings import (
+    Sensor,
     check_same_fov,
-    check_same_sensor,
-    differences,
     differing_settings,
-    sensor_of,
     settings_of_map,
 )
 from ratslam.runs.saved_map import SavedMap
@@ -40,7 +32,6 @@ from ratslam.service.record_fit import shows_place
 from ratslam.service.rig_fit import aligned
 from robot.recordings.bags.bag import METADATA
 from robot.recordings.bags.bag_description import (
-    BagDescription,
     CloudShape,
     ImageShape,
     MotionShape,
@@ -50,7 +41,7 @@ from robot.recordings.bags.bag_description import (
     ValueShape,
 )
 from robot.recordings.bags.views import CLOUD, IMAGES, LONGEST, SCAN
-from robot.recordings.input_judge import MotionTrack, TypicalMotion, typical_motion
+from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.recordings.video import SUFFIXES as VIDEOS
 from robot.recordings.video import ImageViewConfig
 from robot.sources.source import SOURCES, Source
@@ -68,10 +59,12 @@ VIEWS = (SCAN, CLOUD, *IMAGES)
 """Types of messages that are views."""
 SMALL = ImageViewConfig()
 """Smaller images are views of their own size."""
+SUFFIXES = (".csv", ".npz", ".mcap", *VIDEOS)
+"""Of files that are read; besides them a folder, `.bag` and `.db3` are bags."""
 Rows = tuple[tuple[str, ...], ...]
 
 
-class FileContents(NamedTuple):
+class _FileContents(NamedTuple):
     """What a file holds.
 
     Attributes:
@@ -89,26 +82,37 @@ class FileContents(NamedTuple):
     field_of_view: float | None = None
 
 
-def describe_file(path: Path) -> FileContents:
+def _describe_file(path: Path) -> _FileContents:
     """What a recording holds.
 
     Raises:
         InputError: it is missing, damaged, or of no known format.
     """
+    from robot.recordings.mcap_scanner import is_foreign
+    from robot.recordings.npz_trace import array_shapes
+
     if not path.exists():
         raise InputError(str(path), "no such file or folder", "a recording or a run directory")
-    if path.is_dir() or path.suffix.lower() in (".bag", ".db3"):
-        return _bag(path)
-    describe = KINDS.get(path.suffix.lower())
-    if describe is None:
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in (".bag", ".db3") or (suffix == ".mcap" and is_foreign(path)):
+        return _describe_bag(path)
+    if suffix not in SUFFIXES:
         found = f"no reader for {path.suffix!r} files" if path.suffix else "a file without a suffix"
         raise InputError(
-            str(path), found, f"one of {', '.join([*KINDS, '.bag', '.db3'])}, or the folder of a bag"
+            str(path), found, f"one of {', '.join([*SUFFIXES, '.bag', '.db3'])}, or the folder of a bag"
         )
-    return describe(path)
+    if suffix == ".csv":
+        return _describe_csv(path)
+    if suffix == ".npz":
+        shapes = array_shapes(path).items()
+        rows = (("array", "shape"), *((name, " x ".join(map(str, shape))) for name, shape in shapes if shape))
+        return _FileContents(f"{path}: arrays of a reference trace", {}, rows)
+    if suffix == ".mcap":
+        return _FileContents(f"{path}: a recording of ratslam", {})
+    return _describe_video(path)
 
 
-def _csv(path: Path) -> FileContents:
+def _describe_csv(path: Path) -> _FileContents:
     from robot.recordings.csv_description import describe_csv
 
     found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
@@ -126,25 +130,10 @@ def _csv(path: Path) -> FileContents:
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
     table = {"table": found.table} if found.table else None
-    return FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
+    return _FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
 
 
-def _npz(path: Path) -> FileContents:
-    from robot.recordings.npz_trace import array_shapes
-
-    shapes = [(name, " x ".join(map(str, shape))) for name, shape in array_shapes(path).items() if shape]
-    return FileContents(f"{path}: arrays of a reference trace", {}, (("array", "shape"), *shapes))
-
-
-def _mcap(path: Path) -> FileContents:
-    from robot.recordings.mcap_scanner import is_foreign
-
-    if is_foreign(path):
-        return _bag(path)
-    return FileContents(f"{path}: a recording of ratslam", {})
-
-
-def _bag(path: Path) -> FileContents:
+def _describe_bag(path: Path) -> _FileContents:
     from robot.recordings.bags.bag_description import describe_bag
     from robot.recordings.bags.topic_suggestion import robots_of, suggested_topics
 
@@ -155,10 +144,10 @@ def _bag(path: Path) -> FileContents:
         clock = topic.stamped or topic.received
         roles = ", ".join(topic.roles) or "-"
         rows.append(
-            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", in_words(topic.shape), roles)
+            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", _in_words(topic.shape), roles)
         )
         if topic.roles:
-            notes += clock_notes(topic.name, clock)
+            notes += _clock_notes(topic.name, clock)
     moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
     if found.links:
         fixed = len(found.links) - len(moving)
@@ -171,7 +160,7 @@ def _bag(path: Path) -> FileContents:
         if topic.fault:
             (notes if sees or topic.kind not in VIEWS else faults).append(topic.fault)
     if faults:
-        return FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
+        return _FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
     notes += [
         f"missing: {name}"
         for name in ("views", "truth")
@@ -187,17 +176,22 @@ def _bag(path: Path) -> FileContents:
     if "odometry" not in topics:
         recording["visual_odometry"] = {"fov_deg": USUAL_FOV}
         notes.append(NO_WHEELS)
-    shape = _shape_of_views(found, topics)
-    fov = None
+    views = topics.get("views")
+    seen = views if isinstance(views, str) or views is None else views["topic"]
+    shape = next((topic.shape for topic in found.topics if topic.name == seen), None)
+    fov, reach = None, np.nan  # the range that becomes 1 in the views, m; of images there is none
     if isinstance(shape, ScanShape):
         fov = 2 * np.pi if shape.extent.ring else shape.extent.width
+        reach = min(shape.high, LONGEST)
+    elif isinstance(shape, CloudShape):
+        reach = LONGEST
     if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
         size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
         recording["image"] = size
-    return FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), _reach(shape), fov)
+    return _FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), reach, fov)
 
 
-def clock_notes(name: str, clock: Times) -> list[str]:
+def _clock_notes(name: str, clock: Times) -> list[str]:
     """What is remarkable about the stamps of a topic."""
     counts = {
         "a stamp of 0": clock.zero,
@@ -213,7 +207,7 @@ def clock_notes(name: str, clock: Times) -> list[str]:
     return notes
 
 
-def in_words(shape: Shape | None) -> str:
+def _in_words(shape: Shape | None) -> str:
     """What the messages of a topic hold."""
     match shape:
         case ScanShape():
@@ -233,39 +227,16 @@ def in_words(shape: Shape | None) -> str:
     return ""
 
 
-def _shape_of_views(bag: BagDescription, topics: dict[str, Any]) -> Shape | None:
-    """What the topic of the views holds."""
-    views = topics.get("views")
-    name = views if isinstance(views, str) or views is None else views["topic"]
-    return next((topic.shape for topic in bag.topics if topic.name == name), None)
-
-
-def _reach(shape: Shape | None) -> float:
-    """The range that becomes 1 in the views, m; NaN for images."""
-    if isinstance(shape, ScanShape):
-        return min(shape.high, LONGEST)
-    return LONGEST if isinstance(shape, CloudShape) else np.nan
-
-
-def _video(path: Path) -> FileContents:
+def _describe_video(path: Path) -> _FileContents:
     from robot.recordings.video import describe_video
 
     frames, rate, width, height = describe_video(path)
     what = f"{path}: a video of {frames} frames, {width} x {height}, {rate:g} a second"
     if not rate > 0:
         fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
-        return FileContents(what, None, faults=(fault,))
+        return _FileContents(what, None, faults=(fault,))
     recording = {"video": {"rate": rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
-    return FileContents(what, recording, notes=(NO_WHEELS,))
-
-
-KINDS: dict[str, Callable[[Path], FileContents]] = {
-    ".csv": _csv,
-    ".npz": _npz,
-    ".mcap": _mcap,
-    **dict.fromkeys(VIDEOS, _video),
-}
-"""By suffix; a folder, `.bag` and `.db3` are bags."""
+    return _FileContents(what, recording, notes=(NO_WHEELS,))
 
 
 class Diagnosis(NamedTuple):
@@ -284,13 +255,12 @@ class Diagnosis(NamedTuple):
     advice: tuple[str, ...] = ()
     config: dict[str, Any] = {}  # noqa: RUF012
 
-
-def render(diagnosis: Diagnosis) -> str:
-    """The diagnosis as lines of text."""
-    lines = [diagnosis.what, *(f"  {line}".rstrip() for line in aligned(diagnosis.table))]
-    for mark, texts in (("", diagnosis.notes), ("fault: ", diagnosis.faults), ("next: ", diagnosis.advice)):
-        lines += [f"{mark}{text}" for text in texts]
-    return "\n".join(map(printable, lines))
+    def render(self) -> str:
+        """The diagnosis as lines of text."""
+        lines = [self.what, *(f"  {line}".rstrip() for line in aligned(self.table))]
+        for mark, texts in (("", self.notes), ("fault: ", self.faults), ("next: ", self.advice)):
+            lines += [f"{mark}{text}" for text in texts]
+        return "\n".join(map(printable, lines))
 
 
 CELLS_IN_RANGE = 13
@@ -300,25 +270,6 @@ DEFAULT_CELL = 0.1
 TORUS = 61
 """Cells along x and y: buildings overlap less on a larger torus, and a step costs no more."""
 UNREADABLE = "no configuration reads it: see what is missing"
-
-
-class Contents(NamedTuple):
-    """What a source holds.
-
-    Attributes:
-        samples, views: numbers of samples, and of those with a view or label. motion: typical; None for
-            a single sample. path: m. step: median motion between two views, m. truth: share of the samples
-            with a true pose. view_shape: of the views. whiskers: number.
-    """
-
-    samples: int
-    views: int
-    motion: TypicalMotion | None
-    path: float
-    step: float
-    truth: float
-    view_shape: tuple[int, int, int]
-    whiskers: int
 
 
 def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
@@ -336,36 +287,38 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
         raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
     try:
-        found = describe_file(path)
+        found = _describe_file(path)
     except InputError:
-        if path.is_file() and (diagnosis := diagnose_registered(path)):
+        if path.is_file() and (diagnosis := _diagnose_registered(path)):
             return diagnosis
         raise
     if found.recording is None:
-        if diagnosis := diagnose_registered(path):
+        if diagnosis := _diagnose_registered(path):
             return diagnosis
         return Diagnosis(found.what, found.table, found.notes, found.faults or (UNREADABLE,))
     sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
     if "visual_odometry" in found.recording:
         sections["presets"] = ["visual_odometry"]
-    told, faults, contents = list[str](), found.faults, None
+    told, faults, step, whiskers = list[str](), found.faults, 0.0, 0
+    facts: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
     try:
         if like is not None:
             fov = found.field_of_view
             sections = _alike(sections if fov is None else sections | {"recall": {"sector_fov": fov}}, like)
         with open_source(validate(parse(dump_data(sections), path.name), RunConfig), told.append) as source:
-            contents = summarise(source)
+            facts, advice, step = _summarise(source)
+            whiskers = source.whiskers
     except InputError as error:
         faults = (*faults, *str(error).splitlines())
-    if like is None and not (contents and contents.whiskers):
-        cell = cell_size(contents.step if contents else 0.0, found.max_range)
-        sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": cell}
+    if like is None and not whiskers:
+        # A share of the sensor's range, else the motion between views.
+        known = np.isfinite(found.max_range)
+        size = found.max_range / CELLS_IN_RANGE if known else step or DEFAULT_CELL
+        sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": float(f"{size:.2g}")}
         if found.field_of_view is not None:
             sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
-    notes = (*found.notes, *told, *(facts(contents) if contents else ()))
-    return Diagnosis(
-        found.what, found.table, notes, faults, shortcomings(contents) if contents else (), sections
-    )
+    return Diagnosis(found.what, found.table, (*found.notes, *told, *facts), faults, advice, sections)
 
 
 def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
@@ -380,16 +333,16 @@ def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
     check_same_fov(str(like.path), like.config, given)
     with open_source(given) as source:
         config = complete(given, source)
-        found = differences(like.sensor, sensor_of(config, source))
+        found = like.sensor.differences(Sensor.of(config, source))
     settings = settings_of_map(found)
     if settings is None:
-        check_same_sensor(str(like.path), like.sensor, sensor_of(config, source))
+        like.sensor.check_same(str(like.path), Sensor.of(config, source))
     method = differing_settings([like.config, config])
     settings = {key: both[0] for key, both in method.items()} | (settings or {})
     return override(document, [f"{key}={json.dumps(value)}" for key, value in settings.items()]).data
 
 
-def diagnose_registered(path: Path) -> Diagnosis | None:
+def _diagnose_registered(path: Path) -> Diagnosis | None:
     """A recording that a registered source reads, whose only setting without default is `file`; None if no
     source does."""
     for name in SOURCES.names():
@@ -400,16 +353,20 @@ def diagnose_registered(path: Path) -> Diagnosis | None:
                 continue
             sections = {"source": settings}
             with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
-                contents = summarise(source)
+                facts, advice, _ = _summarise(source)
         except Exception:  # whatever a package does with a file that is not its own
             continue
         what = f"{path}: a recording that the source {name} reads"
-        return Diagnosis(what, notes=facts(contents), advice=shortcomings(contents), config=sections)
+        return Diagnosis(what, notes=facts, advice=advice, config=sections)
     return None
 
 
-def summarise(source: Source) -> Contents:
-    """Reads all samples of a source."""
+def _summarise(source: Source) -> tuple[tuple[str, ...], tuple[str, ...], float]:
+    """Reads all samples of a source.
+
+    Returns:
+        what they hold, and what they lack for a good map, in words; median motion between two views, m.
+    """
     motions, times, truths, views = [], [], 0, []
     for sample in source:
         motions.append(np.asarray(sample.reading.odometry, float))
@@ -420,49 +377,21 @@ def summarise(source: Source) -> Contents:
     length = np.hypot(motion[:, 0], motion[:, 1])
     between = np.diff(np.cumsum(length)[viewed])
     moved = between[between > 0]
-    track = MotionTrack(time, np.ones(len(time), bool), motion, None)
-    return Contents(
-        samples=len(time),
-        views=int(viewed.sum()),
-        motion=typical_motion(track) if len(time) > 1 else None,
-        path=float(length.sum()),
-        step=float(np.median(moved)) if len(moved) else 0.0,
-        truth=truths / max(len(time), 1),
-        view_shape=source.view_shape,
-        whiskers=source.whiskers,
-    )
-
-
-def cell_size(step: float, max_range: float) -> float:
-    """Side of a pose cell, m, to two digits: a share of the sensor's range, else the motion between views.
-
-    Args:
-        step: median motion between two views, m. max_range: of the sensor, m, NaN without one.
-    """
-    size = max_range / CELLS_IN_RANGE if np.isfinite(max_range) else step or DEFAULT_CELL
-    return float(f"{size:.2g}")
-
-
-def facts(contents: Contents) -> tuple[str, ...]:
-    """The contents in words."""
-    notes = []
-    if contents.motion is not None:
-        notes.append(
-            f"odometry: {contents.path:.3g} m, typically {contents.motion.speed:.2g} m/s and "
-            f"{contents.motion.turn_rate:.2g} rad/s, a sample every {contents.motion.interval:.2g} s"
+    step = float(np.median(moved)) if len(moved) else 0.0
+    facts, path = [], float(length.sum())
+    if len(time) > 1:
+        typical = typical_motion(MotionTrack(time, np.ones(len(time), bool), motion, None))
+        facts.append(
+            f"odometry: {path:.3g} m, typically {typical.speed:.2g} m/s and "
+            f"{typical.turn_rate:.2g} rad/s, a sample every {typical.interval:.2g} s"
         )
-    shape = " x ".join(map(str, contents.view_shape[:2]))
-    kind = f"of {contents.whiskers} whiskers" if contents.whiskers else f"of {shape} values"
-    notes.append(f"views: {contents.views} {kind}, {contents.step:.2g} m apart")
-    notes.append(f"truth: for {contents.truth:.0%} of the samples" if contents.truth else "truth: unknown")
-    return tuple(notes)
-
-
-def shortcomings(contents: Contents) -> tuple[str, ...]:
-    """What the recording lacks for a good map, in words."""
+    shape = " x ".join(map(str, source.view_shape[:2]))
+    kind = f"of {source.whiskers} whiskers" if source.whiskers else f"of {shape} values"
+    facts.append(f"views: {viewed.sum()} {kind}, {step:.2g} m apart")
+    facts.append(f"truth: for {truths / len(time):.0%} of the samples" if truths else "truth: unknown")
     advice = []
-    if not contents.views:
+    if not viewed.any():
         advice.append("without views or place labels no place is recognised: the map is the odometry")
-    if contents.path == 0:
+    if path == 0:
         advice.append("the odometry does not move: check its topic or columns")
-    return tuple(advice)
+    return tuple(facts), tuple(advice), step

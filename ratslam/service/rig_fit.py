@@ -97,7 +97,11 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     Raises:
         InputError: the truth covers too few windows, or the robot does not move.
     """
-    ends = _window_ends(time, truth)
+    starts: list[int] = []  # rows with a true pose, at least `WINDOW` apart: the ends of the windows
+    for row in np.flatnonzero(np.isfinite(truth).all(axis=1)).tolist():
+        if not starts or time[row] - time[starts[-1]] >= WINDOW:
+            starts.append(row)
+    ends = np.array(starts, int)
     windows = _measure(motion, truth, ends, OdometryCorrection())
     path, turned = float(windows.length.sum()), float(windows.turned.sum())
     if len(ends) - 1 < LEAST_WINDOWS or path == 0:
@@ -108,6 +112,9 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     windows = _measure(motion, truth, ends, OdometryCorrection(turn_scale=start[0], heading_bias=start[1]))
     values, draws = _solve(windows, turns), _bootstrap(windows, turns, seed)
     pairs = [(float(value), float(sd)) for value, sd in zip(values, draws.std(axis=0), strict=True)]
+    heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
+    chord = windows.true_chord - values[0] * windows.chord
+    slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
     return WheelFit(
         length_scale=pairs[0],
         turn_scale=pairs[1] if turns else None,
@@ -117,7 +124,7 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
         length_noise=pairs[5],
         position_noise=pairs[6],
         windows=len(windows.length),
-        slips=int(_slips(windows, values).sum()),
+        slips=int(slips.sum()),
         path=path,
         turned=turned,
     )
@@ -125,16 +132,6 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
 
 def _if_sure(found: tuple[float, float], assumed: float) -> float:
     return found[0] if abs(found[0] - assumed) > KEPT_SDS * found[1] else assumed
-
-
-def _window_ends(time: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Rows with a true pose, at least `WINDOW` apart: the ends of the windows."""
-    known = np.flatnonzero(np.isfinite(truth).all(axis=1))
-    ends: list[int] = []
-    for row in known.tolist():
-        if not ends or time[row] - time[ends[-1]] >= WINDOW:
-            ends.append(row)
-    return np.array(ends, int)
 
 
 def _measure(
@@ -145,7 +142,7 @@ def _measure(
     sums = np.cumsum(np.column_stack([np.hypot(raw[:, 0], raw[:, 1]), raw[:, 2], np.abs(raw[:, 2])]), axis=0)
     length, turn, turned = np.diff(sums[ends], axis=0).T
     known = np.flatnonzero(np.isfinite(truth).all(axis=1))
-    # A turn of more than half a circle between two true poses is told apart by the odometry.
+    # A turn of more than half a circle between two true poses is resolved by the odometry.
     steps = np.diff(sums[known, 1])
     steps = steps + wrap(np.diff(truth[known, 2]) - steps)
     true_sum = np.concatenate([[0.0], np.cumsum(steps)])[np.searchsorted(known, ends)]
@@ -204,13 +201,6 @@ def _bootstrap(windows: _Windows, turns: bool, seed: int) -> np.ndarray:
     return np.array(draws)
 
 
-def _slips(windows: _Windows, values: np.ndarray) -> np.ndarray:
-    """[M] bool, the windows whose turn or distance no noise explains."""
-    heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
-    chord = windows.true_chord - values[0] * windows.chord
-    return np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
-
-
 def _clip_slips(error: np.ndarray) -> np.ndarray:
     most = SLIP * robust_sd(error)
     return np.clip(error, -most, most)
@@ -256,58 +246,54 @@ class Rig(NamedTuple):
     notes: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
 
+    @classmethod
+    def join(cls, rigs: Iterable[Rig]) -> Rig:
+        """All parts as one rig."""
+        parts = list(rigs)
+        settings: dict[str, Any] = {}
+        for part in parts:
+            settings = merge_settings(settings, part.settings)
+        return cls(
+            tuple(quantity for part in parts for quantity in part.quantities),
+            settings,
+            tuple(note for part in parts for note in part.notes),
+            tuple(reason for part in parts for reason in part.unknown),
+        )
 
-def join_rigs(rigs: Iterable[Rig]) -> Rig:
-    """All parts as one rig."""
-    parts = list(rigs)
-    settings: dict[str, Any] = {}
-    for part in parts:
-        settings = merge_settings(settings, part.settings)
-    return Rig(
-        tuple(quantity for part in parts for quantity in part.quantities),
-        settings,
-        tuple(note for part in parts for note in part.notes),
-        tuple(reason for part in parts for reason in part.unknown),
-    )
+    def included(self) -> dict[str, Any]:
+        """All settings, nested, for a configuration to include; quantities within `KEPT_SDS` of what was
+        assumed are left out."""
+        settings = self.settings
+        for quantity in self.quantities:
+            if quantity.setting and quantity.differs:
+                value: Any = float(f"{quantity.value:.6g}")
+                for key in reversed(quantity.setting.split(".")):
+                    value = {key: value}
+                settings = merge_settings(settings, value)
+        return settings
 
+    def render(self) -> str:
+        """The quantities as a table, with notes and what the record does not tell."""
+        rows: list[Sequence[str]] = [HEADING]
+        for quantity in self.quantities:
+            assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
+            sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
+            setting = quantity.setting
+            if setting and not quantity.differs:
+                setting = f"unchanged, within {KEPT_SDS:g} sd"
+            rows.append((quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting))
+        lines = aligned(rows) if self.quantities else []
+        return "\n".join([*lines, *self.notes, *(f"not determined: {reason}" for reason in self.unknown)])
 
-def rig_settings(rig: Rig) -> dict[str, Any]:
-    """The settings of a rig, nested, for a configuration to include; quantities within `KEPT_SDS` of what was
-    assumed are left out."""
-    settings = rig.settings
-    for quantity in rig.quantities:
-        if quantity.setting and quantity.differs:
-            value: Any = float(f"{quantity.value:.6g}")
-            for key in reversed(quantity.setting.split(".")):
-                value = {key: value}
-            settings = merge_settings(settings, value)
-    return settings
-
-
-def render_rig(rig: Rig) -> str:
-    """The quantities as a table, with notes and what the record does not tell."""
-    lines = aligned([HEADING, *map(_row, rig.quantities)]) if rig.quantities else []
-    return "\n".join([*lines, *rig.notes, *(f"not determined: {reason}" for reason in rig.unknown)])
-
-
-def rig_file(rig: Rig, record: str) -> str:
-    """The file that a configuration includes: the settings, below the table as comments."""
-    text = f"The rig from {record}, written by `python -m ratslam fit`.\n{render_rig(rig)}"
-    comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
-    settings = rig_settings(rig)
-    use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."
-    if not settings:
-        use = "# No setting differs from what was assumed: there is nothing to include."
-    return f"{comment}\n{use}\n{dump_data(settings)}"
-
-
-def _row(quantity: Quantity) -> Sequence[str]:
-    assumed = "-" if quantity.assumed is None else f"{quantity.assumed:.4g}"
-    sd = "-" if quantity.sd is None else f"{quantity.sd:.2g}"
-    setting = quantity.setting and (
-        quantity.setting if quantity.differs else f"unchanged, within {KEPT_SDS:g} sd"
-    )
-    return quantity.name, assumed, f"{quantity.value:.4g}", sd, quantity.unit, setting
+    def file_text(self, record: str) -> str:
+        """The file that a configuration includes: the settings, below the table as comments."""
+        text = f"The rig from {record}, written by `python -m ratslam fit`.\n{self.render()}"
+        comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+        settings = self.included()
+        use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."
+        if not settings:
+            use = "# No setting differs from what was assumed: there is nothing to include."
+        return f"{comment}\n{use}\n{dump_data(settings)}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

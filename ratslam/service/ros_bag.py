@@ -1,17 +1,13 @@
 """A run as one MCAP file for ROS 2 tools, or as a ROS 2 bag: a folder with that file and `metadata.yaml`.
 
-Standard ROS 2 messages from arrays, in CDR; ROS itself is not needed.
-
-Frames are those of REP 105: `map` and `odom` start at the robot's first pose, `base_link` is the robot. All
-poses are planar, so z, roll and pitch and their variances are 0.
-
-Reads from a run directory what a file for ROS tools holds.
+Standard ROS 2 messages in CDR, made of the arrays of a run directory; ROS itself is not needed. Frames are
+those of REP 105: `map` and `odom` start at the robot's first pose, `base_link` is the robot. All poses are
+planar, so z, roll and pitch and their variances are 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,6 +49,7 @@ class RosMessages:
             cure = "pip install 'ratslam[ros]'"
             raise InputError("export", "rosbags is not installed", "the extra 'ros'", cure) from None
         self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._blanks: dict[str, dict[str, Any]] = {}  # default values of the fields, by type
 
     def definition(self, name: str) -> str:
         """The definition of a message type and of all types in it, as MCAP files store it."""
@@ -192,18 +189,11 @@ class RosMessages:
 
     def _make(self, name: str, **given: Any) -> Any:
         """A message with the given fields; numbers, texts and lists that are not given are 0 or empty."""
-        blank = self._blank(name)
-        return self._store.types[name](**{field: given.get(field, blank[field]) for field in blank})
-
-    def _blank(self, name: str) -> dict[str, Any]:
         if name not in self._blanks:
             fields = self._store.fielddefs[name][1]
             self._blanks[name] = {field: self._default(description) for field, description in fields}
-        return self._blanks[name]
-
-    @cached_property
-    def _blanks(self) -> dict[str, dict[str, Any]]:
-        return {}
+        blank = self._blanks[name]
+        return self._store.types[name](**{field: given.get(field, blank[field]) for field in blank})
 
     def _default(self, description: Any) -> Any:
         from rosbags.interfaces import Nodetype
@@ -256,15 +246,23 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
         InputError: a file is missing or malformed, or a time does not fit into a ROS 2 stamp.
     """
     run = arrange_pieces(read_run(directory))
-    steps = len(run.time)
+    steps, truth = len(run.time), None
     columns = [read_column(directory / "steps.csv", name)[:steps] for name in ("sd_x", "sd_y", "sd_heading")]
     closures = read_closure_table(directory)
     known = np.flatnonzero(((closures.steps >= 0) & (closures.steps < steps)).all(axis=1))
+    bad = ~((run.time >= 0) & (run.time <= LAST_SECOND))
+    if bad.any():
+        expected = f"0 to {LAST_SECOND} s, the range of ROS 2 stamps"
+        raise InputError(str(directory / "online.tum"), f"a time of {run.time[bad][0]:g} s", expected)
+    if run.truth is not None:
+        there = np.isfinite(run.truth).all(axis=1)
+        truth = np.full_like(run.truth, np.nan)
+        truth[there] = compose(inverse(align(run.final[there], run.truth[there])), run.truth[there])
     return ExportedRun(
-        stamps=ros_stamps(directory, run.time),
+        stamps=np.rint(run.time * 1e9).astype(np.int64),
         run=run,
         spread=np.stack(columns, axis=1),
-        truth=truth_in_map(run),
+        truth=truth,
         candidates=closures.steps[known],
         verdicts=[closures.verdicts[k] for k in known],
         grid=read_nav2(directory / "map.yaml") if (directory / "map.yaml").exists() else None,
@@ -272,62 +270,35 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
     )
 
 
-def ros_stamps(directory: Path, time: np.ndarray) -> np.ndarray:
-    """Times [N] (s) in ns.
-
-    Raises:
-        InputError: a time does not fit into a ROS 2 stamp.
-    """
-    bad = ~((time >= 0) & (time <= LAST_SECOND))
-    if bad.any():
-        expected = f"0 to {LAST_SECOND} s, the range of ROS 2 stamps"
-        raise InputError(str(directory / "online.tum"), f"a time of {time[bad][0]:g} s", expected)
-    return np.rint(time * 1e9).astype(np.int64)
-
-
-def truth_in_map(run: RunArrays) -> np.ndarray | None:
-    """The true poses [N, 3], moved as near as possible to the final trajectory; None without truth."""
-    if run.truth is None:
-        return None
-    known = np.isfinite(run.truth).all(axis=1)
-    moved = np.full_like(run.truth, np.nan)
-    moved[known] = compose(inverse(align(run.final[known], run.truth[known])), run.truth[known])
-    return moved
-
-
 def _images(
     directory: Path, time: np.ndarray, warn: Callable[[str], None]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Whisker images of the run directory, or the views of its recording if that is still there."""
+    """Whisker images of the run directory, or the views of its recording if that is still there; none for a
+    simulation, which would have to be repeated."""
     if (directory / "views.npz").exists():
         views = read_whisker_views(directory / "views.npz").view
         yield from enumerate(_pixels(view[..., None]) for view in views[: len(time)])
         return
     try:
-        yield from _recorded_views(directory, time)
+        config = load_config(directory / "config.yaml")
+        if config.recording is None:
+            return
+        digest = read_manifest(directory).digest
+        with open_observations(config) as (_, source):
+            if source.digest != digest:
+                cure = "the views are those of another recording"
+                raise InputError(source.name, "changed since the run", "the recording of the run", cure)
+            step = 0
+            for sample, observation in read_observations(source):
+                if step == len(time):
+                    return
+                if sample.time != time[step]:  # a continued run starts later in its recording
+                    continue
+                if observation.view_seen and observation.view.size:
+                    yield step, _pixels(observation.view)
+                step += 1
     except InputError as error:
         warn(f"the file has no views: {error}")
-
-
-def _recorded_views(directory: Path, time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """The views of the recording of a run; none for a simulation, which would have to be repeated."""
-    config = load_config(directory / "config.yaml")
-    if config.recording is None:
-        return
-    digest = read_manifest(directory).digest
-    with open_observations(config) as (_, source):
-        if source.digest != digest:
-            cure = "the views are those of another recording"
-            raise InputError(source.name, "changed since the run", "the recording of the run", cure)
-        step = 0
-        for sample, observation in read_observations(source):
-            if step == len(time):
-                return
-            if sample.time != time[step]:  # a continued run starts later in its recording
-                continue
-            if observation.view_seen and observation.view.size:
-                yield step, _pixels(observation.view)
-            step += 1
 
 
 def _pixels(view: np.ndarray) -> np.ndarray:
@@ -349,39 +320,26 @@ LATCHED = ("/path/map", "/path/odometry", "/path/truth", "/map", "/markers")
 """Topics with one message, at the first stamp: late subscribers get it too."""
 
 
-class Stamped(NamedTuple):
-    """A message with its topic and stamp in ns."""
-
-    topic: str
-    stamp: int
-    message: Any
-
-
-class Topic(NamedTuple):
-    """A topic in a file: its message type, and the number of its messages."""
-
-    kind: str
-    messages: int
-
-
-def run_messages(exported: ExportedRun, ros: RosMessages) -> Iterator[Stamped]:
-    """All messages of a run, in order of time."""
+def _messages(exported: ExportedRun, ros: RosMessages) -> Iterator[tuple[str, int, Any]]:
+    """All messages of a run in order of time, each with its topic and its stamp in ns."""
     first = int(exported.stamps[0])
     for topic, message in _latched_messages(exported, ros, first):
-        yield Stamped(topic, first, message)
+        yield (topic, first, message)
     run = exported.run
     images = exported.images()
     image = next(images, None)
     start = inverse(run.odometry[0])  # so that odom and map agree at the first step
     odometry = compose(compose(run.online[0], start), run.odometry)
-    twist = _twists(run.time, odometry)
+    twist = np.zeros_like(odometry)  # mean velocity of each step in its own frame; 0 without a duration
+    duration = np.diff(run.time)[:, None]
+    np.divide(between(odometry[:-1], odometry[1:]), duration, out=twist[1:], where=duration > 0)
     offset = compose(run.online, inverse(odometry))
     for step, stamp in enumerate(exported.stamps.tolist()):
-        yield Stamped("/tf", stamp, ros.transforms(stamp, offset[step], odometry[step]))
-        yield Stamped("/odom", stamp, ros.odometry(stamp, odometry[step], twist[step]))
-        yield Stamped("/pose", stamp, ros.pose(stamp, run.online[step], exported.spread[step]))
+        yield ("/tf", stamp, ros.transforms(stamp, offset[step], odometry[step]))
+        yield ("/odom", stamp, ros.odometry(stamp, odometry[step], twist[step]))
+        yield ("/pose", stamp, ros.pose(stamp, run.online[step], exported.spread[step]))
         if image is not None and image[0] == step:
-            yield Stamped("/view", stamp, ros.image(stamp, image[1]))
+            yield ("/view", stamp, ros.image(stamp, image[1]))
             image = next(images, None)
 
 
@@ -417,19 +375,11 @@ def _markers(exported: ExportedRun, ros: RosMessages, stamp: int) -> list[Any]:
     return parts
 
 
-def _twists(time: np.ndarray, odometry: np.ndarray) -> np.ndarray:
-    """Mean velocity [N, 3] of each step in its own frame, m/s, m/s, rad/s; 0 without a duration."""
-    twist = np.zeros_like(odometry)
-    duration = np.diff(time)[:, None]
-    np.divide(between(odometry[:-1], odometry[1:]), duration, out=twist[1:], where=duration > 0)
-    return twist
-
-
-def write_mcap(path: Path, exported: ExportedRun, ros: RosMessages) -> dict[str, Topic]:
+def write_mcap(path: Path, exported: ExportedRun, ros: RosMessages) -> dict[str, tuple[str, int]]:
     """Writes an MCAP file with the ROS 2 profile; equal runs give equal bytes.
 
     Returns:
-        its topics.
+        its topics, each with its message type and the number of its messages.
     """
     kinds: dict[str, str] = {}
     channels: dict[str, int] = {}
@@ -438,18 +388,18 @@ def write_mcap(path: Path, exported: ExportedRun, ros: RosMessages) -> dict[str,
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="ratslam")
         schemas: dict[str, int] = {}
-        for topic, stamp, message in run_messages(exported, ros):
+        for topic, stamp, message in _messages(exported, ros):
             if topic not in channels:
                 kind = message.__msgtype__
                 if kind not in schemas:
                     schemas[kind] = writer.register_schema(kind, "ros2msg", ros.definition(kind).encode())
-                profile = {"offered_qos_profiles": quality_of_service(topic)}
+                profile = {"offered_qos_profiles": _quality_of_service(topic)}
                 channels[topic] = writer.register_channel(topic, "cdr", schemas[kind], profile)
                 kinds[topic], counts[topic] = kind, 0
             writer.add_message(channels[topic], stamp, ros.serialize(message), stamp, counts[topic])
             counts[topic] += 1
         writer.finish()
-    return {topic: Topic(kind, counts[topic]) for topic, kind in kinds.items()}
+    return {topic: (kind, counts[topic]) for topic, kind in kinds.items()}
 
 
 def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) -> None:
@@ -460,7 +410,7 @@ def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) 
     span = {
         "duration": {"nanoseconds": last - first},
         "starting_time": {"nanoseconds_since_epoch": first},
-        "message_count": sum(topic.messages for topic in topics.values()),
+        "message_count": sum(count for _, count in topics.values()),
     }
     information = {
         "version": 5,
@@ -470,13 +420,13 @@ def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) 
             {
                 "topic_metadata": {
                     "name": name,
-                    "type": topic.kind,
+                    "type": kind,
                     "serialization_format": "cdr",
-                    "offered_qos_profiles": quality_of_service(name),
+                    "offered_qos_profiles": _quality_of_service(name),
                 },
-                "message_count": topic.messages,
+                "message_count": count,
             }
-            for name, topic in topics.items()
+            for name, (kind, count) in topics.items()
         ],
         "compression_format": "",
         "compression_mode": "",
@@ -487,7 +437,7 @@ def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) 
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
 
 
-def quality_of_service(topic: str) -> str:
+def _quality_of_service(topic: str) -> str:
     """The profile that rosbag2 plays a topic with: reliable, kept for late subscribers if `LATCHED`."""
     latched = topic in LATCHED
     forever = {"sec": 2147483647, "nsec": 4294967295}

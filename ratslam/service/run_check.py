@@ -1,12 +1,11 @@
-"""Whether to believe the map of a run, and which settings to try first.
+"""Whether to believe the map of a run and which settings to try first; whether a live session could start.
 
-Whether a live session could start: robot, whiskers, clocks, disk and settings; nothing moves.
+The latter checks robot, whiskers, clocks, disk and settings, and moves nothing.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +46,8 @@ def diagnose_run(path: Path) -> Diagnosis:
     Raises:
         InputError: it is not a run directory, or has no steps.
     """
+    import networkx  # slow to import
+
     check_run_directory(path)
     manifest = read_manifest(path)
     proceed = f"continue it: python -m ratslam run {path}/config.yaml --continue {path}/map.npz"
@@ -55,7 +56,7 @@ def diagnose_run(path: Path) -> Diagnosis:
     if manifest.killed and not has_steps(path):
         return Diagnosis(f"{path}: a run that was killed before its first step", advice=(proceed,))
     run, config = read_run(path), load_config(path / "config.yaml")
-    closures, outcomes = count_closures(path), count_outcomes(path)
+    closures = count_closures(path)
     status = "killed" if manifest.killed else manifest.status
     what = f"{path}: a run of {len(run.time)} steps ({status}), backend {config.backend}"
     verdict = judge_map(run.doubt, run.unjudged)
@@ -63,17 +64,27 @@ def diagnose_run(path: Path) -> Diagnosis:
     if manifest.killed:
         judgement = "It was killed, or ended by an error: the poses are those found on the way, not judged"
     given = [f"warning about the input: {sentence}" for sentence in run.warnings] or ["input: clean"]
-    notes = [judgement, *given, *error_notes(run)]
+    notes = [judgement, *given, _error_note(run)]
     if closures is not None:
         notes.append(
             f"loop closures: {closures.accepted} of {closures.proposed} accepted, "
             f"in {closures.accepted_sequences} of {closures.sequences} sequences"
         )
-    pieces = count_pieces(path)
+    pieces = 0
+    if (path / "map.json").exists():
+        pieces = networkx.number_weakly_connected_components(read_json(path / "map.json"))
     if pieces > 1:
         notes.append(f"the map has {pieces} pieces; nothing determines their relative poses")
-    faults = outcome_faults(outcomes, len(run.time))
-    advice = settings_to_try(run, config, closures)
+    parse = lambda row: (row["outcome"] or "ok", row["lost"] == "1")  # noqa: E731
+    rows = read_rows(path / "steps.csv", "the columns outcome and lost", parse)
+    outcomes = Counter(outcome for outcome, _ in rows) + Counter(lost=sum(lost for _, lost in rows))
+    faults = [
+        f"{count} of {len(run.time)} steps: {name.replace('_', ' ')}"
+        + (f" ({CAUSES[name]})" if name in CAUSES else "")
+        for name, count in sorted(outcomes.items())
+        if name != "ok" and count
+    ]
+    advice = _settings_to_try(run, config, closures)
     if (path / "calibration.yaml").exists():
         advice.append(f"copy {path}/calibration.yaml into the configuration of this robot's next session")
     if manifest.killed or (status != "complete" and (path / "map.npz").exists()):
@@ -81,30 +92,15 @@ def diagnose_run(path: Path) -> Diagnosis:
     return Diagnosis(what, (), tuple(notes), tuple(faults), tuple(advice))
 
 
-def error_notes(run: RunArrays) -> list[str]:
+def _error_note(run: RunArrays) -> str:
     """Position errors of map and odometry, if truth is known."""
     rows = truth_rows(run)
     if run.truth is None or len(rows) < 2:
-        return ["truth: unknown, so nothing but the health tells how good the map is"]
+        return "truth: unknown, so nothing but the health tells how good the map is"
     final, odometry = ate(run.final[rows], run.truth[rows]), ate(run.odometry[rows], run.truth[rows])
     better = "better" if final < SAME * odometry else "no better"
     better = "worse" if SAME * final > odometry else better
-    return [f"truth: map {final:.3g} m off, odometry {odometry:.3g} m (ATE): {better} than odometry"]
-
-
-def count_outcomes(path: Path) -> Counter[str]:
-    """Number of steps by outcome, and of those that were lost."""
-    parse = lambda row: (row["outcome"] or "ok", row["lost"] == "1")  # noqa: E731
-    rows = read_rows(path / "steps.csv", "the columns outcome and lost", parse)
-    return Counter(outcome for outcome, _ in rows) + Counter(lost=sum(lost for _, lost in rows))
-
-
-def count_pieces(path: Path) -> int:
-    """Number of connected components of the map; 0 without a graph."""
-    import networkx
-
-    file = path / "map.json"
-    return networkx.number_weakly_connected_components(read_json(file)) if file.exists() else 0
+    return f"truth: map {final:.3g} m off, odometry {odometry:.3g} m (ATE): {better} than odometry"
 
 
 CAUSES = {
@@ -117,17 +113,7 @@ CAUSES = {
 """Causes of outcomes."""
 
 
-def outcome_faults(outcomes: Counter[str], steps: int) -> list[str]:
-    """Outcomes other than ok, with their causes."""
-    found = {name: count for name, count in outcomes.items() if name != "ok" and count}
-    return [
-        f"{count} of {steps} steps: {name.replace('_', ' ')}"
-        + (f" ({CAUSES[name]})" if name in CAUSES else "")
-        for name, count in sorted(found.items())
-    ]
-
-
-def settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None) -> list[str]:
+def _settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | None) -> list[str]:
     """Settings to try first, each with its reason."""
     advice = []
     moved = np.hypot(*between(run.odometry[:-1], run.odometry[1:])[:, :2].T)
@@ -159,22 +145,18 @@ def diagnose_live(config: RunConfig, name: str, directory: Path) -> Diagnosis:
     Raises:
         InputError: it is not the configuration of a live session.
     """
-    if config.live is None:
+    live = config.live
+    if live is None:
         raise InputError(name, "no section `live`", "the configuration of a live session")
-    passed: list[str] = []
+    robot = "an arm" if live.create is None else "a Create"
+    passed = [f"settings: backend {config.backend}, {robot}"]
     try:
-        for line in _checks(config, directory):
+        if live.create is not None:
+            lines = check_create(live, directory)
+        else:
+            lines = check_arm_session(live, config.touch.head, directory)
+        for line in lines:
             passed.append(line)  # those before a failure count
     except (InputError, SessionFault) as error:
         return Diagnosis(f"{name}: the live session cannot start", (), tuple(passed), (str(error),))
     return Diagnosis(f"{name}: the live session can start; nothing was moved", (), tuple(passed))
-
-
-def _checks(config: RunConfig, directory: Path) -> Iterator[str]:
-    live = config.live
-    assert live is not None
-    yield f"settings: backend {config.backend}, {'a Create' if live.create is not None else 'an arm'}"
-    if live.create is not None:
-        yield from check_create(live, directory)
-    else:
-        yield from check_arm_session(live, config.touch.head, directory)

@@ -1,6 +1,6 @@
-"""Checks of a source: its attributes, its samples, and that they can be read again.
+"""Conformance checks of a source: its attributes, its samples, and that they can be read again.
 
-A source under test, and what its checks share.
+`require_shapes` and `require_masked` serve the checks of front ends too.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.service.check_results import (
-    Check,
     Result,
     Violation,
+    check,
+    checks_of,
     leaves,
     read_assignments,
     require,
@@ -29,12 +30,13 @@ from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEn
 from robot.touch_source import TOUCH, head_config_of, open_touch_source, report_config_of
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
-from tactile.base.settings import Settings
 from tactile.base.types import Observation
 from tactile.frontend import TouchConfig
 
 SAMPLES = 4096
 """Samples of a source that are examined unless said otherwise."""
+OPENED, READ, OBSERVED = range(3)
+"""Groups of checks, in their order."""
 
 
 class Reading(NamedTuple):
@@ -52,9 +54,26 @@ class Reading(NamedTuple):
     complete: bool
     suppresses: bool
 
+    @classmethod
+    def of(cls, source: Source, most: int) -> Reading:
+        """Reads the first samples of a source, of a recording twice, and closes it."""
+        source.__enter__()
+        try:
+            samples: list[Sample] = []
+            copies: list[Sample] = []
+            iterator = iter(source)
+            for sample in islice(iterator, most):
+                samples.append(sample)
+                copies.append(copy.deepcopy(sample))
+            complete = len(samples) < most or next(iterator, None) is None
+            again = list(islice(source, most)) if source.digest else []  # a live robot has none
+        finally:
+            suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
+        return cls(samples, copies, again, complete, suppresses)
+
 
 class SourceTrial:
-    """A source with settings, and what its checks share.
+    """A source with settings: what its checks share, and the checks.
 
     Args:
         settings: an instance of the entry's `config_class`. frontend: for readings that are not observations.
@@ -73,12 +92,12 @@ class SourceTrial:
     @cached_property
     def reading(self) -> Reading:
         """What was read of the source."""
-        return read(self.source, self.most)
+        return Reading.of(self.source, self.most)
 
     @cached_property
     def observing(self) -> Source:
         """The samples of the first pass, through the front end that they need."""
-        stored = StoredSource(self.source, self.reading.samples)
+        stored = _StoredSource(self.source, self.reading.samples)
         config = TouchConfig(frontend=self.frontend)
         heads = {
             "head": head_config_of(stored.info, config.head),
@@ -100,30 +119,140 @@ class SourceTrial:
                 raise Violation(what, "Observation, or a front end (--touch NAME) that takes such readings")
         return found
 
+    @check(OPENED, "the entry is complete", "a configuration names it with its settings")
+    def entry_is_complete(self) -> str:
+        entry = self.entry
+        require_settings_class(entry.config_class)
+        for suffix in entry.suffixes:
+            sound = suffix.startswith(".") and suffix == suffix.lower()
+            require(sound, f"suffix {suffix!r}", "a lower-case suffix such as '.bag'")
+        reads = not entry.suffixes or "file" in entry.config_class.model_fields
+        require(reads, f"suffixes {entry.suffixes} without a setting `file`", "a setting `file` of type Path")
+        return ", ".join(entry.suffixes)
 
-def read(source: Source, most: int) -> Reading:
-    """Reads the first samples of a source, of a recording twice, and closes it."""
-    source.__enter__()
-    try:
-        samples: list[Sample] = []
-        copies: list[Sample] = []
-        iterator = iter(source)
-        for sample in islice(iterator, most):
-            samples.append(sample)
-            copies.append(copy.deepcopy(sample))
-        complete = len(samples) < most or next(iterator, None) is None
-        again = list(islice(source, most)) if is_recording(source) else []
-    finally:
-        suppresses = bool(source.__exit__(None, None, None))  # type: ignore[func-returns-value]
-    return Reading(samples, copies, again, complete, suppresses)
+    @check(OPENED, "it has all attributes of a source", "the backend is built from them")
+    def has_attributes(self) -> str:
+        source = self.source
+        missing = [name for name in (*ATTRIBUTES, *METHODS) if not hasattr(source, name)]
+        require(not missing, f"{type(source).__name__} without {', '.join(missing)}", "all of a Source")
+        rate, shape, length = source.rate_hz, source.view_shape, source.length
+        require(isinstance(source.name, str) and source.name != "", f"name {source.name!r}", "a short name")
+        sound = isinstance(rate, float | int) and np.isfinite(rate) and rate >= 0
+        require(bool(sound), f"rate_hz {rate!r}", "samples per second, 0 if unknown")
+        sound = isinstance(shape, tuple) and len(shape) == 3 and all(_is_count(n, 1) for n in shape)
+        require(sound, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
+        require(_is_count(source.whiskers), f"whiskers {source.whiskers!r}", "a number from 0")
+        require(length is None or _is_count(length), f"length {length!r}", "a number of samples, or None")
+        require(
+            isinstance(source.digest, str), f"digest {source.digest!r}", "sha256 (hex), '' for a live robot"
+        )
+        require(isinstance(source.info, SourceInfo), f"info {type(source.info).__name__}", "SourceInfo")
+        source.info.to_json()
+        return f"view_shape {shape}, {source.whiskers} whiskers"
+
+    @check(READ, "it yields samples", "a run needs a time and a reading at each step")
+    def yields_samples(self) -> str:
+        samples = self.reading.samples
+        for k, sample in enumerate(samples):
+            found = f"sample {k} is of type {type(sample).__name__}"
+            require(isinstance(sample, Sample), found, "robot.sources.source.Sample")
+        require(len(samples) > 0, "no samples", "at least one")
+        return f"{len(samples)} read"
+
+    @check(OBSERVED, "it closes without hiding errors", "a run that fails would look complete")
+    def closes(self) -> None:
+        require(
+            not self.reading.suppresses, "__exit__ returned a true value", "None: errors must get through"
+        )
+
+    @check(OBSERVED, "times never decrease", "trajectories are matched with truth by time")
+    def times_increase(self) -> None:
+        times = [sample.time for sample in self.reading.samples]
+        for k, time in enumerate(times):
+            sound = isinstance(time, float | int | np.floating | np.integer) and bool(np.isfinite(time))
+            require(sound, f"time {time!r} of sample {k}", "a finite number of seconds")
+        back = np.flatnonzero(np.diff(np.array(times, float)) < 0)
+        if len(back):
+            k = int(back[0])
+            raise Violation(
+                f"time {times[k + 1]} of sample {k + 1} after {times[k]}", "times that never decrease"
+            )
+
+    @check(OBSERVED, "observations have the declared shapes", "the kernel is compiled for them")
+    def views_have_shapes(self) -> None:
+        source = self.observing
+        for k, observation in enumerate(self.observations):
+            require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
+
+    @check(OBSERVED, "absent values are masked, not NaN", "one NaN spoils a step")
+    def masks_values(self) -> None:
+        for k, observation in enumerate(self.observations):
+            require_masked(observation, f"observation {k}", self.observing.info.signed_views)
+
+    @check(OBSERVED, "truth is [3] or None", "scores are computed from it")
+    def truth_is_pose(self) -> str:
+        known = 0
+        for k, sample in enumerate(self.reading.samples):
+            if sample.truth is not None:
+                truth, known = sample.truth, known + 1
+                sound = (
+                    isinstance(truth, np.ndarray) and truth.shape == (3,) and bool(np.isfinite(truth).all())
+                )
+                require(sound, f"truth {truth!r} of sample {k}", "an array [3] of finite numbers, or None")
+        return f"known in {known} of {len(self.reading.samples)} samples"
+
+    @check(OBSERVED, "the length is right", "memory is reserved for it")
+    def length_is_right(self) -> str:
+        length, count = self.source.length, len(self.reading.samples)
+        if length is None:
+            return "not known in advance"
+        if self.reading.complete:
+            require(length == count, f"length {length}, but {count} samples", "the number of samples")
+            return ""
+        require(length > count, f"length {length}, but more than {count} samples", "the number of samples")
+        return f"first {count} of {length} samples examined"
+
+    @check(OBSERVED, "the rate fits the times", "recordings are written in chunks of a second by it")
+    def rate_fits(self) -> str:
+        rate = self.source.rate_hz
+        found = rate_of(np.array([sample.time for sample in self.reading.samples], float))
+        if rate == 0 or found == 0:
+            return "not known"
+        require(
+            found / 2 <= rate <= 2 * found, f"rate_hz {rate:g}, but {found:.3g} Hz by the times", "the same"
+        )
+        return f"{found:.3g} Hz"
+
+    @check(OBSERVED, "a sample keeps its values", "a run processes samples in chunks")
+    def keeps_samples(self) -> None:
+        what = "a sample and the same sample after the next ones were read"
+        require_equal(self.reading.copies, self.reading.samples, what)
+
+    @check(OBSERVED, "the digest identifies the input", "`run --continue` compares it")
+    def digest_identifies(self) -> str:
+        source = self.source
+        if not source.digest:
+            found = f"no digest, but the length {source.length}"
+            require(source.length is None, found, "sha256 (hex) of all input of a recording")
+            return "a live source"
+        again = self.entry.open(self.settings, None).digest
+        require(
+            source.digest == again, f"digest {source.digest} and then {again}", "the same for the same input"
+        )
+        return ""
+
+    @check(OBSERVED, "it can be read again", "a result could not be reproduced")
+    def repeats(self) -> str:
+        if not self.source.digest:
+            return "a live source, read once"
+        first = self.reading.copies
+        require_equal(first, self.reading.again, "the samples of two passes")
+        other = Reading.of(self.entry.open(self.settings, None), self.most)
+        require_equal(first, other.samples, "the samples of two openings")
+        return ""
 
 
-def is_recording(source: Source) -> bool:
-    """Whether it can be read again: a live robot has no digest."""
-    return source.digest != ""
-
-
-class StoredSource(ClosedSource):
+class _StoredSource(ClosedSource):
     """Samples that were read from a source, with its attributes."""
 
     def __init__(self, source: Source, samples: Sequence[Sample]) -> None:
@@ -160,27 +289,18 @@ def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what:
         require(fits, f"{path} of {what} is {text}", f"NumPy {names[kind]} {shape}")
 
 
-def require_finite(found: Observation, what: str) -> None:
-    """Raises `Violation` if an observation has NaN or infinite values.
+def require_masked(found: Observation, what: str, signed: bool = False) -> None:
+    """Raises `Violation` if an observation has NaN or infinite values, or a view outside 0..1.
 
     Args:
-        what: the observation, for the message.
+        what: the observation, for the message. signed: whether views are signed departures, of any size.
     """
     for path, leaf in leaves(found):
-        finite = bool(np.isfinite(leaf).all())
-        require(
-            finite, f"{path} of {what} has NaN or infinity", "absent values masked, for example view_seen"
-        )
-
-
-def require_brightness(found: Observation, what: str) -> None:
-    """Raises `Violation` if the view of an observation has values outside 0..1.
-
-    Args:
-        what: the observation, for the message.
-    """
-    low, high = float(np.min(found.view, initial=0.0)), float(np.max(found.view, initial=0.0))
-    require(low >= 0 and high <= 1, f"view of {what} has values {low:g} to {high:g}", "values in 0..1")
+        finite, cure = bool(np.isfinite(leaf).all()), "absent values masked, for example view_seen"
+        require(finite, f"{path} of {what} has NaN or infinity", cure)
+    if not signed:
+        low, high = float(np.min(found.view, initial=0.0)), float(np.max(found.view, initial=0.0))
+        require(low >= 0 and high <= 1, f"view of {what} has values {low:g} to {high:g}", "values in 0..1")
 
 
 ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
@@ -206,171 +326,24 @@ def check_source(
     if touch is not None:
         models["touch"] = TOUCH.get(touch, "--touch").config_class
     settings = read_assignments(models, assignments)
-    frontend = touch and PluginConfig(plugin=touch, settings=_as_data(settings["touch"]))
-    trial = SourceTrial(entry, settings["settings"], frontend or None, most)
+    frontend = None
+    if touch is not None:
+        given = settings["touch"]
+        plain = {} if given is None else json.loads(given.model_dump_json(exclude_unset=True))
+        frontend = PluginConfig(plugin=touch, settings=plain)
+    trial = SourceTrial(entry, settings["settings"], frontend, most)
     try:
         _ = trial.source
     except InputError:
         raise
     except Exception:  # reported by a check
         pass
-    return run_checks(GROUPS, trial)
-
-
-def _as_data(settings: Settings | None) -> dict[str, Any]:
-    return {} if settings is None else dict(json.loads(settings.model_dump_json(exclude_unset=True)))
-
-
-def _entry(trial: SourceTrial) -> str:
-    entry = trial.entry
-    require_settings_class(entry.config_class)
-    for suffix in entry.suffixes:
-        sound = suffix.startswith(".") and suffix == suffix.lower()
-        require(sound, f"suffix {suffix!r}", "a lower-case suffix such as '.bag'")
-    reads = not entry.suffixes or "file" in entry.config_class.model_fields
-    require(reads, f"suffixes {entry.suffixes} without a setting `file`", "a setting `file` of type Path")
-    return ", ".join(entry.suffixes)
-
-
-def _attributes(trial: SourceTrial) -> str:
-    source = trial.source
-    missing = [name for name in (*ATTRIBUTES, *METHODS) if not hasattr(source, name)]
-    require(not missing, f"{type(source).__name__} without {', '.join(missing)}", "all of a Source")
-    rate, shape, length = source.rate_hz, source.view_shape, source.length
-    require(isinstance(source.name, str) and source.name != "", f"name {source.name!r}", "a short name")
-    sound = isinstance(rate, float | int) and np.isfinite(rate) and rate >= 0
-    require(bool(sound), f"rate_hz {rate!r}", "samples per second, 0 if unknown")
-    sound = isinstance(shape, tuple) and len(shape) == 3 and all(_is_count(n, 1) for n in shape)
-    require(sound, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
-    require(_is_count(source.whiskers), f"whiskers {source.whiskers!r}", "a number from 0")
-    require(length is None or _is_count(length), f"length {length!r}", "a number of samples, or None")
-    require(isinstance(source.digest, str), f"digest {source.digest!r}", "sha256 (hex), '' for a live robot")
-    require(isinstance(source.info, SourceInfo), f"info {type(source.info).__name__}", "SourceInfo")
-    source.info.to_json()
-    return f"view_shape {shape}, {source.whiskers} whiskers"
+    return run_checks(CHECKS, trial)
 
 
 def _is_count(value: Any, least: int = 0) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= least
 
 
-def _samples(trial: SourceTrial) -> str:
-    samples = trial.reading.samples
-    for k, sample in enumerate(samples):
-        found = f"sample {k} is of type {type(sample).__name__}"
-        require(isinstance(sample, Sample), found, "robot.sources.source.Sample")
-    require(len(samples) > 0, "no samples", "at least one")
-    return f"{len(samples)} read"
-
-
-def _context(trial: SourceTrial) -> str:
-    require(not trial.reading.suppresses, "__exit__ returned a true value", "None: errors must get through")
-    return ""
-
-
-def _times(trial: SourceTrial) -> str:
-    times = [sample.time for sample in trial.reading.samples]
-    for k, time in enumerate(times):
-        sound = isinstance(time, float | int | np.floating | np.integer) and bool(np.isfinite(time))
-        require(sound, f"time {time!r} of sample {k}", "a finite number of seconds")
-    back = np.flatnonzero(np.diff(np.array(times, float)) < 0)
-    if len(back):
-        k = int(back[0])
-        raise Violation(
-            f"time {times[k + 1]} of sample {k + 1} after {times[k]}", "times that never decrease"
-        )
-    return ""
-
-
-def _views(trial: SourceTrial) -> str:
-    source = trial.observing
-    for k, observation in enumerate(trial.observations):
-        require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
-    return ""
-
-
-def _masks(trial: SourceTrial) -> str:
-    for k, observation in enumerate(trial.observations):
-        require_finite(observation, f"observation {k}")
-        if not trial.observing.info.signed_views:
-            require_brightness(observation, f"observation {k}")
-    return ""
-
-
-def _truth(trial: SourceTrial) -> str:
-    known = 0
-    for k, sample in enumerate(trial.reading.samples):
-        if sample.truth is not None:
-            truth, known = sample.truth, known + 1
-            sound = isinstance(truth, np.ndarray) and truth.shape == (3,) and bool(np.isfinite(truth).all())
-            require(sound, f"truth {truth!r} of sample {k}", "an array [3] of finite numbers, or None")
-    return f"known in {known} of {len(trial.reading.samples)} samples"
-
-
-def _length(trial: SourceTrial) -> str:
-    length, count = trial.source.length, len(trial.reading.samples)
-    if length is None:
-        return "not known in advance"
-    if trial.reading.complete:
-        require(length == count, f"length {length}, but {count} samples", "the number of samples")
-        return ""
-    require(length > count, f"length {length}, but more than {count} samples", "the number of samples")
-    return f"first {count} of {length} samples examined"
-
-
-def _rate(trial: SourceTrial) -> str:
-    rate = trial.source.rate_hz
-    found = rate_of(np.array([sample.time for sample in trial.reading.samples], float))
-    if rate == 0 or found == 0:
-        return "not known"
-    require(found / 2 <= rate <= 2 * found, f"rate_hz {rate:g}, but {found:.3g} Hz by the times", "the same")
-    return f"{found:.3g} Hz"
-
-
-def _digest(trial: SourceTrial) -> str:
-    source = trial.source
-    if not is_recording(source):
-        found = f"no digest, but the length {source.length}"
-        require(source.length is None, found, "sha256 (hex) of all input of a recording")
-        return "a live source"
-    again = trial.entry.open(trial.settings, None).digest
-    require(source.digest == again, f"digest {source.digest} and then {again}", "the same for the same input")
-    return ""
-
-
-def _repeats(trial: SourceTrial) -> str:
-    if not is_recording(trial.source):
-        return "a live source, read once"
-    first = trial.reading.copies
-    require_equal(first, trial.reading.again, "the samples of two passes")
-    other = read(trial.entry.open(trial.settings, None), trial.most)
-    require_equal(first, other.samples, "the samples of two openings")
-    return ""
-
-
-def _kept(trial: SourceTrial) -> str:
-    what = "a sample and the same sample after the next ones were read"
-    require_equal(trial.reading.copies, trial.reading.samples, what)
-    return ""
-
-
-OPEN_CHECKS = (
-    Check("the entry is complete", "a configuration names it with its settings", _entry),
-    Check("it has all attributes of a source", "the backend is built from them", _attributes),
-)
-SAMPLE_CHECKS = (Check("it yields samples", "a run needs a time and a reading at each step", _samples),)
-CONTENT_CHECKS = (
-    Check("it closes without hiding errors", "a run that fails would look complete", _context),
-    Check("times never decrease", "trajectories are matched with truth by time", _times),
-    Check("observations have the declared shapes", "the kernel is compiled for them", _views),
-    Check("absent values are masked, not NaN", "one NaN spoils a step", _masks),
-    Check("truth is [3] or None", "scores are computed from it", _truth),
-    Check("the length is right", "memory is reserved for it", _length),
-    Check("the rate fits the times", "recordings are written in chunks of a second by it", _rate),
-    Check("a sample keeps its values", "a run processes samples in chunks", _kept),
-    Check("the digest identifies the input", "`run --continue` compares it", _digest),
-    Check("it can be read again", "a result could not be reproduced", _repeats),
-)
-GROUPS = (OPEN_CHECKS, SAMPLE_CHECKS, CONTENT_CHECKS)
-CHECKS = tuple(check for group in GROUPS for check in group)
-"""All checks of a source; the checks of a group assume those of the groups before it."""
+CHECKS = checks_of(SourceTrial)
+"""All checks of a source."""

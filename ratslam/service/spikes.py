@@ -1,23 +1,12 @@
-"""Poisson spikes of recorded pose cells.
+"""Poisson spikes of recorded pose cells, by time rescaling (Brown et al. 2002, Neural Computation 14: 325).
 
-The rate of a cell is `peak_rate * activity / reference`, in Hz. It holds from the step at which the activity
-was recorded to the next one (piecewise constant), so the last step has no spikes after it. The reference is
-an activity that the caller gives, as a rule that of a settled packet (`settled_peak`): the largest
-activity of the chosen cells would make the rate of a cell depend on which others were chosen. A packet
-sharper than the reference fires faster than the peak rate.
-
-Spikes are those of an inhomogeneous Poisson process, by time rescaling (Brown et al. 2002, Neural
-Computation 14: 325): arrival times of a process of rate 1 are mapped through the inverse of the integral of
-the rate. That is exact for piecewise constant rates: the count of a step is Poisson with the integral of the
-rate as its mean, and times are uniform within the step.
-There is no refractory period, no burst and no adaptation; two spikes may be as close as they like.
-
-A cell draws from a stream that is named after its index. Its spikes do not depend on which other cells were
-chosen, and a longer recording begins with the spikes of a shorter one.
-
-The pose that each cell of the network stands for.
-
-The activity at which a cell fires at its peak rate.
+The rate of a cell, `peak_rate * activity / reference` in Hz, holds from a step to the next one. The
+reference is an activity that the caller gives, as a rule that of a settled packet (`settled_peak`): the
+largest activity of the chosen cells would make the rate of a cell depend on the others. Arrival times of a
+process of rate 1 are mapped through the inverse of the integral of the rate, which is exact for piecewise
+constant rates. There is no refractory period, no burst and no adaptation. A cell draws from a stream named
+after its index: its spikes do not depend on which other cells were chosen, and a longer recording begins
+with those of a shorter one.
 """
 
 from __future__ import annotations
@@ -120,7 +109,10 @@ def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig 
     for k, cell in enumerate(np.asarray(recording.cell).tolist()):
         integral = np.concatenate([[0.0], np.cumsum(expected_counts[:, k])])
         arrivals = _unit_arrivals(stream(config.seed, f"spikes of cell {cell}"), integral[-1])
-        times.append(_invert(time, integral, arrivals))
+        # The times at which the integral of the rate reaches the arrivals.
+        row = np.searchsorted(integral, arrivals, side="right") - 1
+        share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
+        times.append(np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1]))
     return SpikeTrains(np.asarray(recording.cell, np.int32), times, float(time[0]), float(time[-1]))
 
 
@@ -156,13 +148,6 @@ def _unit_arrivals(random: np.random.Generator, end: float) -> np.ndarray:
         last = float(blocks[-1][-1])
     arrivals = np.concatenate([np.zeros(0), *blocks])
     return arrivals[arrivals < end]
-
-
-def _invert(time: np.ndarray, integral: np.ndarray, arrivals: np.ndarray) -> np.ndarray:
-    """The times at which the integral [T] of the rate over times [T] reaches the arrivals."""
-    row = np.searchsorted(integral, arrivals, side="right") - 1
-    share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
-    return np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1])
 
 
 def write_spikes(path: str | Path, spikes: SpikeTrains) -> None:

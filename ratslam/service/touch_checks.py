@@ -1,4 +1,4 @@
-"""Checks of a touch front end on the readings of a source."""
+"""Conformance checks of a touch front end on the readings of a source: shapes, masks, motion, no memory."""
 
 from __future__ import annotations
 
@@ -9,22 +9,17 @@ from typing import Any
 import numpy as np
 
 from ratslam.service.check_results import (
-    Check,
     Result,
     Violation,
+    check,
+    checks_of,
     read_assignments,
     require,
     require_equal,
     require_settings_class,
     run_checks,
 )
-from ratslam.service.source_checks import (
-    Reading,
-    read,
-    require_brightness,
-    require_finite,
-    require_shapes,
-)
+from ratslam.service.source_checks import Reading, require_masked, require_shapes
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, Source
 from robot.touch_source import TOUCH, ReadingProcessor, TouchEntry
@@ -37,6 +32,8 @@ READINGS = 256
 """Readings that are examined."""
 MOTION_TOLERANCE = 1e-6
 """Difference allowed between motions, m, rad and s: front ends may round."""
+BUILT, OBSERVED, COMPARED = range(3)
+"""Groups of checks, in their order."""
 
 
 def check_touch(name: str, assignments: Sequence[str] = (), source: str | None = None) -> Iterator[Result]:
@@ -54,26 +51,23 @@ def check_touch(name: str, assignments: Sequence[str] = (), source: str | None =
     if source is not None:
         models["source"] = SOURCES.get(source, "--source").config_class
     settings = read_assignments(models, assignments)
-    readings = simulated_head()
+    readings = None
     if source is not None:
         readings = SOURCES.get(source, "--source").open(settings["source"] or NoSettings(), None)
-    return run_checks(GROUPS, TouchTrial(entry, settings["settings"], readings))
-
-
-def simulated_head() -> Source:
-    """A simulated session of the whisker head, whose readings are `Whisk`s."""
-    return HeadSimulation(SimulationConfig(), HeadConfig())
+    return run_checks(CHECKS, TouchTrial(entry, settings["settings"], readings))
 
 
 class TouchTrial:
-    """A touch front end with settings, and what its checks share.
+    """A touch front end with settings: what its checks share, and the checks.
 
     Args:
-        settings: an instance of the entry's `config_class`. source: of its readings.
+        settings: an instance of the entry's `config_class`. source: of its readings; None: a simulated
+            session of the whisker head, whose readings are `Whisk`s.
     """
 
-    def __init__(self, entry: TouchEntry, settings: Any, source: Source) -> None:
-        self.entry, self.settings, self.source = entry, settings, source
+    def __init__(self, entry: TouchEntry, settings: Any, source: Source | None = None) -> None:
+        self.entry, self.settings = entry, settings
+        self.source = source or HeadSimulation(SimulationConfig(), HeadConfig())
 
     def build(self) -> ReadingProcessor:
         """A new front end, as for a pass through the source."""
@@ -85,7 +79,7 @@ class TouchTrial:
 
     @cached_property
     def reading(self) -> Reading:
-        return read(self.source, READINGS)
+        return Reading.of(self.source, READINGS)
 
     @property
     def readings(self) -> list[Any]:
@@ -101,102 +95,83 @@ class TouchTrial:
         """The observations among the results, each with its name."""
         return [(f"the observation of reading {k}", o) for k, o in enumerate(self.results) if o is not None]
 
+    @check(BUILT, "the entry is complete", "a configuration names it with its settings")
+    def entry_is_complete(self) -> None:
+        require_settings_class(self.entry.config_class)
 
-def _entry(trial: TouchTrial) -> str:
-    require_settings_class(trial.entry.config_class)
-    return ""
+    @check(BUILT, "it builds for the source", "the backend is built from its attributes")
+    def builds(self) -> str:
+        front, source = self.first, self.source
+        missing = [name for name in ("view_shape", "whiskers", "observe") if not hasattr(front, name)]
+        require(
+            not missing, f"{type(front).__name__} without {', '.join(missing)}", "all of a ReadingProcessor"
+        )
+        shape, whiskers = front.view_shape, front.whiskers
+        counts = (
+            isinstance(shape, tuple) and len(shape) == 3 and all(isinstance(n, int) and n > 0 for n in shape)
+        )
+        require(counts, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
+        found = f"{whiskers} whiskers for those of {source.name}"
+        require(whiskers == source.whiskers, found, f"{source.whiskers}, as the source says")
+        return f"view_shape {shape}, {whiskers} whiskers"
 
+    @check(OBSERVED, "observations have the declared shapes", "the kernel is compiled for them")
+    def views_have_shapes(self) -> str:
+        observations = self.observations()
+        found = f"None for all {len(self.results)} readings of {self.source.name}"
+        require(len(observations) > 0, found, "an observation for some of them")
+        for what, one in observations:
+            require_shapes(one, self.first.view_shape, self.first.whiskers, what)
+        return f"{len(observations)} observations of {len(self.results)} readings of {self.source.name}"
 
-def _builds(trial: TouchTrial) -> str:
-    front, source = trial.first, trial.source
-    missing = [name for name in ("view_shape", "whiskers", "observe") if not hasattr(front, name)]
-    require(not missing, f"{type(front).__name__} without {', '.join(missing)}", "all of a ReadingProcessor")
-    shape, whiskers = front.view_shape, front.whiskers
-    counts = isinstance(shape, tuple) and len(shape) == 3 and all(isinstance(n, int) and n > 0 for n in shape)
-    require(counts, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
-    found = f"{whiskers} whiskers for those of {source.name}"
-    require(whiskers == source.whiskers, found, f"{source.whiskers}, as the source says")
-    return f"view_shape {shape}, {whiskers} whiskers"
+    @check(COMPARED, "absent values are masked, not NaN", "one NaN spoils a step")
+    def masks_values(self) -> None:
+        for what, one in self.observations():
+            require_masked(one, what)
 
+    @check(COMPARED, "no motion is lost", "the pose is the sum of all motions")
+    def carries_motion(self) -> str:
+        if not all(hasattr(reading, "odometry") for reading in self.readings):
+            return "readings without odometry"
+        waiting: list[Any] = []
+        for k, (reading, result) in enumerate(zip(self.readings, self.results, strict=True)):
+            waiting.append(reading.odometry)
+            if result is None:
+                continue
+            if len(waiting) > 1:
+                together = np.zeros(3)  # m, m, rad, of successive motions
+                for motion in waiting:
+                    together = compose(together, np.array(motion[:3], float))
+                expected = np.append(together, sum(float(motion[3]) for motion in waiting))
+                found = np.array(result.odometry, float)
+                if not np.allclose(expected, found, rtol=0, atol=MOTION_TOLERANCE):
+                    what = f"odometry {found.tolist()} in the observation of reading {k} after None"
+                    raise Violation(what, f"{expected.tolist()}, with the motion of the readings before it")
+            waiting = []
+        return f"None for {sum(result is None for result in self.results)} readings"
 
-def _shapes(trial: TouchTrial) -> str:
-    observations = trial.observations()
-    found = f"None for all {len(trial.results)} readings of {trial.source.name}"
-    require(len(observations) > 0, found, "an observation for some of them")
-    for what, one in observations:
-        require_shapes(one, trial.first.view_shape, trial.first.whiskers, what)
-    return f"{len(observations)} observations of {len(trial.results)} readings of {trial.source.name}"
+    @check(COMPARED, "readings are not changed", "another pass would read other values")
+    def changes_no_reading(self) -> None:
+        _ = self.results
+        copies = [sample.reading for sample in self.reading.copies]
+        require_equal(copies, self.readings, "readings before and after they were observed")
 
+    @check(COMPARED, "it is deterministic", "a result could not be reproduced")
+    def is_deterministic(self) -> None:
+        expected, front = self.results, self.build()
+        found = [front.observe(reading) for reading in self.readings]
+        require_equal(expected, found, "the results of two front ends with equal settings")
 
-def _masks(trial: TouchTrial) -> str:
-    for what, one in trial.observations():
-        require_finite(one, what)
-        require_brightness(one, what)
-    return ""
-
-
-def _carried_motion(trial: TouchTrial) -> str:
-    if not all(hasattr(reading, "odometry") for reading in trial.readings):
-        return "readings without odometry"
-    waiting: list[Any] = []
-    for k, (reading, result) in enumerate(zip(trial.readings, trial.results, strict=True)):
-        waiting.append(reading.odometry)
-        if result is None:
-            continue
-        if len(waiting) > 1:
-            expected, found = _together(waiting), np.array(result.odometry, float)
-            if not np.allclose(expected, found, rtol=0, atol=MOTION_TOLERANCE):
-                what = f"odometry {found.tolist()} in the observation of reading {k} after None"
-                raise Violation(what, f"{expected.tolist()}, with the motion of the readings before it")
-        waiting = []
-    return f"None for {sum(result is None for result in trial.results)} readings"
-
-
-def _together(motions: Sequence[Any]) -> np.ndarray:
-    """[4] dx m, dy m, dtheta rad, dt s of successive motions together."""
-    pose = np.zeros(3)
-    for motion in motions:
-        pose = compose(pose, np.array(motion[:3], float))
-    return np.append(pose, sum(float(motion[3]) for motion in motions))
-
-
-def _deterministic(trial: TouchTrial) -> str:
-    expected, front = trial.results, trial.build()
-    found = [front.observe(reading) for reading in trial.readings]
-    require_equal(expected, found, "the results of two front ends with equal settings")
-    return ""
-
-
-def _separate(trial: TouchTrial) -> str:
-    expected, first, second = trial.results, trial.build(), trial.build()
-    require(first is not second, "one front end for two passes", "a new one for each pass from `build`")
-    found = []
-    for k, reading in enumerate(trial.readings):
-        found.append(first.observe(reading))
-        second.observe(trial.readings[k // 2])  # another pass, at another place
-    require_equal(expected, found, "the results of a pass alone and beside another one")
-    return ""
-
-
-def _unchanged(trial: TouchTrial) -> str:
-    _ = trial.results
-    copies = [sample.reading for sample in trial.reading.copies]
-    require_equal(copies, trial.readings, "readings before and after they were observed")
-    return ""
+    @check(COMPARED, "it keeps nothing between passes", "each pass must give the same observations")
+    def separates_passes(self) -> None:
+        expected, first, second = self.results, self.build(), self.build()
+        require(first is not second, "one front end for two passes", "a new one for each pass from `build`")
+        found = []
+        for k, reading in enumerate(self.readings):
+            found.append(first.observe(reading))
+            second.observe(self.readings[k // 2])  # another pass, at another place
+        require_equal(expected, found, "the results of a pass alone and beside another one")
 
 
-ENTRY_CHECKS = (
-    Check("the entry is complete", "a configuration names it with its settings", _entry),
-    Check("it builds for the source", "the backend is built from its attributes", _builds),
-)
-SHAPE_CHECKS = (Check("observations have the declared shapes", "the kernel is compiled for them", _shapes),)
-CONTENT_CHECKS = (
-    Check("absent values are masked, not NaN", "one NaN spoils a step", _masks),
-    Check("no motion is lost", "the pose is the sum of all motions", _carried_motion),
-    Check("readings are not changed", "another pass would read other values", _unchanged),
-    Check("it is deterministic", "a result could not be reproduced", _deterministic),
-    Check("it keeps nothing between passes", "each pass must give the same observations", _separate),
-)
-GROUPS = (ENTRY_CHECKS, SHAPE_CHECKS, CONTENT_CHECKS)
-CHECKS = tuple(check for group in GROUPS for check in group)
-"""All checks of a touch front end; the checks of a group assume those of the groups before it."""
+CHECKS = checks_of(TouchTrial)
+"""All checks of a touch front end."""

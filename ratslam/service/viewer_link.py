@@ -2,8 +2,7 @@
 
 The run puts messages into a bounded queue and never waits; a thread writes them into a pipe. If the viewer is
 slow, the pipe and then the queue fill up and messages are dropped; if it ends, all later ones are.
-
-Where the view goes: an .rrd file, or a viewer on this machine.
+`prepare_target` checks where the view goes: an .rrd file, or a viewer on this machine.
 """
 
 from __future__ import annotations
@@ -170,14 +169,14 @@ def prepare_target(text: str) -> str:
     if text == START:
         _start_viewer()
         return VIEWER
-    host, port = split_address(text)
+    host, port = _split_address(text)
     if not _answers(host, port):
         cure = f"start one with `rerun --bind 127.0.0.1`, or let `--rerun {START}` do it"
         raise InputError(f"--rerun {text}", "no viewer answers", "a running one", cure)
     return text
 
 
-def split_address(text: str) -> tuple[str, int]:
+def _split_address(text: str) -> tuple[str, int]:
     """Host and port of a loopback address.
 
     Raises:
@@ -192,7 +191,7 @@ def split_address(text: str) -> tuple[str, int]:
 
 def _start_viewer() -> None:
     """Starts a viewer that outlives this program; rerun's default would listen on every interface."""
-    host, port = split_address(VIEWER)
+    host, port = _split_address(VIEWER)
     if _answers(host, port):
         return
     command = [sys.executable, "-m", "rerun", "--bind", host, "--port", str(port), "--expect-data-soon"]

@@ -1,6 +1,4 @@
-"""Draws the progress of a run with rerun.
-
-The process that draws: reads messages from its standard input and logs them with rerun.
+"""The process that draws a run with rerun: reads messages from its standard input and logs them.
 
 python -m ratslam.service.viewer_process TARGET
 """
@@ -13,7 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -70,7 +68,7 @@ class Drawing:
         """Draws what does not change."""
         self._run = run
         self._recording.send_recording_name(f"{run.name}, {run.backend}")
-        self._recording.send_blueprint(blueprint(run))
+        self._recording.send_blueprint(_blueprint(run))
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         arrow = self._rr.Arrows3D(vectors=[[0.15, 0.0, 0.0]], colors=[BLUE])
         self._log("world/robot/heading", arrow, static=True)
@@ -98,7 +96,15 @@ class Drawing:
         self._start = step.time if self._start is None else self._start
         self._recording.set_time(STEP, sequence=step.number)
         self._recording.set_time(TIME, duration=step.time - self._start)
-        self._note(step)
+        # Path, place and link of the step; steps that were dropped get its pose.
+        self._odometry.append(step.odometry)
+        self._online.append(step.pose)
+        for _ in range(len(self._path.rows), step.number + 1):
+            self._path.append(step.pose)
+        if step.place >= 0:
+            self._place_step.setdefault(step.place, step.number)
+            if step.previous >= 0 and step.previous != step.place:
+                self._links.add((step.previous, step.place))
         turn = self._rr.RotationAxisAngle([0, 0, 1], radians=float(step.pose[2]))
         place = [*step.pose[:2], 0.0]
         self._log("world/robot", self._rr.Transform3D(translation=place, rotation_axis_angle=turn))
@@ -112,17 +118,6 @@ class Drawing:
             self._log("view", self._rr.Image(shown))
         if self._run.head is not None:
             self._draw_whiskers(observation)
-
-    def _note(self, step: StepReport) -> None:
-        """Remembers path, place and link of a step; steps that were dropped get its pose."""
-        self._odometry.append(step.odometry)
-        self._online.append(step.pose)
-        for _ in range(len(self._path.rows), step.number + 1):
-            self._path.append(step.pose)
-        if step.place >= 0:
-            self._place_step.setdefault(step.place, step.number)
-            if step.previous >= 0 and step.previous != step.place:
-                self._links.add((step.previous, step.place))
 
     def _draw_whiskers(self, observation: Any) -> None:
         head = self._run.head
@@ -172,8 +167,8 @@ class Drawing:
         self._log("world/links", self._rr.LineStrips3D(strips, colors=[GREY], radii=points(1.0)))
 
     def _draw_closures(self, closures: np.ndarray) -> None:
-        for judgement in self._verdicts.changes(closures):
-            text = f"step {judgement.later} with step {judgement.earlier}: {judgement.verdict}"
+        for earlier, later, verdict in self._verdicts.changes(closures):
+            text = f"step {later} with step {earlier}: {verdict}"
             self._log("judgements", self._rr.TextLog(text))
         known = closures[(closures[:, :2] < len(self._path.rows)).all(axis=1)]
         for sign, name in VERDICTS.items():
@@ -191,21 +186,16 @@ class Drawing:
         self._log("pose_cells/activity", self._rr.DepthImage(picture, colormap=colours))
         self._log("pose_cells/heading", self._rr.BarChart(activity.heading))
         if activity.packets is not None:
-            self._draw_packets(activity.packets)
+            heading, mass = activity.packets[:, 2:].T
+            arrows = self._rr.Arrows3D(
+                origins=_on_floor(activity.packets),
+                vectors=0.15 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(mass))]),
+                colors=[[*ORANGE, round(255 * min(1.0, share))] for share in mass.tolist()],
+                labels=[f"{share:.0%}" for share in mass],
+            )
+            self._log("world/packets", arrows)
             novelty = max(0.0, 1.0 - float(activity.heading.sum()))
             self._log("health/novelty", self._rr.Scalars(novelty))
-
-    def _draw_packets(self, packets: np.ndarray) -> None:
-        heading, mass = packets[:, 2:].T
-        vectors = 0.15 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(mass))])
-        colours = [[*ORANGE, round(255 * min(1.0, share))] for share in mass.tolist()]
-        arrows = self._rr.Arrows3D(
-            origins=_on_floor(packets),
-            vectors=vectors,
-            colors=colours,
-            labels=[f"{share:.0%}" for share in mass],
-        )
-        self._log("world/packets", arrows)
 
     def _draw_grid(self, grid: GridDrawing) -> None:
         cells = np.rint(100 * grid.probability).astype(np.uint8)[::-1]
@@ -233,22 +223,16 @@ def _on_floor(poses: np.ndarray) -> np.ndarray:
 VERDICTS = {1: "accepted", 0: "open", -1: "removed"}
 
 
-class Judgement(NamedTuple):
-    """A new verdict on a candidate: the earlier and the later step, and the verdict by name."""
-
-    earlier: int
-    later: int
-    verdict: str
-
-
 class VerdictLog:
     """The last verdict on each candidate."""
 
     def __init__(self) -> None:
         self._verdict: dict[tuple[int, int], int] = {}
 
-    def changes(self, closures: np.ndarray) -> list[Judgement]:
-        """The judgements since the last call; `dropped` is the verdict on one that was accepted before.
+    def changes(self, closures: np.ndarray) -> list[tuple[int, int, str]]:
+        """The new verdicts since the last call: earlier and later step of the candidate, verdict by name.
+
+        `dropped` is the verdict on one that was accepted before.
 
         Args:
             closures: [n, 3], see `Map.judged_closures`.
@@ -260,11 +244,11 @@ class VerdictLog:
                 continue
             self._verdict[earlier, later] = sign
             name = "dropped" if before == 1 else VERDICTS[sign]
-            found.append(Judgement(earlier, later, name))
+            found.append((earlier, later, name))
         return found
 
 
-def blueprint(run: RunDescription) -> Any:
+def _blueprint(run: RunDescription) -> Any:
     """The map and the loop closures on the left; on the right what the run has of pose cells, view and
     whiskers, and its health."""
     import rerun.blueprint as rrb

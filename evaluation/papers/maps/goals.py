@@ -37,7 +37,7 @@ from evaluation.papers.maps.stored_maps import StoredMap
 from evaluation.papers.tables.comparison import Record
 from ratslam.places.localiser import Localiser
 from ratslam.runs.goal_planner import GoalPlanner, contact_map, felt_points
-from ratslam.runs.localise import localising_for_goals
+from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.slam import Slam
@@ -228,7 +228,7 @@ class ClosedLoop:
         self._live = live_config(made.config)
         # Localises a robot that stands where a map ended, in that map.
         saved = read_map(made.stored.path)
-        self._slam = Slam(localising_for_goals(saved.config, saved, "here"), saved.source)
+        self._slam = Slam(localising(saved.config, saved, "here"), saved.source)
         self._frontend = Frontend(made.config.touch)
         self._arm = VirtualArm(self._live, walls_of(made), made.end)
         self._cell = made.config.pose_cells.cell_size

@@ -6,7 +6,7 @@ import configparser
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import validate
@@ -21,65 +21,57 @@ IMAGE, VISUAL = "recording.image", "recording.visual_odometry"
 TEMPLATES, CELLS, NETWORK, MAP = "templates", "pose_cells", "attractor", "experience.solver"
 
 
-class Parameter(NamedTuple):
-    """A parameter of OpenRatSLAM and its counterpart here.
+_Parameter = tuple[Value, tuple[str, ...]]
+"""A parameter of OpenRatSLAM: the value of a missing key there, of the type of the parameter (None: there is
+no default), and the dotted settings here that take it."""
 
-    Attributes:
-        default: value of a missing key there; its type is that of the parameter. None: no default.
-        paths: dotted settings here that take the value.
-    """
-
-    default: Value
-    paths: tuple[str, ...]
-
-
-RATSLAM: dict[str, Parameter] = {
-    "image_crop_x_min": Parameter(0, (f"{IMAGE}.crop.x_min",)),
-    "image_crop_x_max": Parameter(-1, (f"{IMAGE}.crop.x_max",)),
-    "image_crop_y_min": Parameter(0, (f"{IMAGE}.crop.y_min",)),
-    "image_crop_y_max": Parameter(-1, (f"{IMAGE}.crop.y_max",)),
-    "template_y_size": Parameter(1, (f"{IMAGE}.rows",)),
-    "template_x_size": Parameter(1, (f"{IMAGE}.columns",)),
-    "pc_dim_xy": Parameter(21, (f"{CELLS}.cells_xy",)),
-    "pc_dim_th": Parameter(36, (f"{CELLS}.cells_heading",)),
-    "pc_cell_x_size": Parameter(1.0, (f"{CELLS}.cell_size",)),
-    "pc_w_e_dim": Parameter(7, (f"{NETWORK}.excite_width",)),
-    "pc_w_e_var": Parameter(1.0, (f"{NETWORK}.excite_sigma",)),
-    "pc_w_i_dim": Parameter(5, (f"{NETWORK}.inhibit_width",)),
-    "pc_w_i_var": Parameter(2.0, (f"{NETWORK}.inhibit_sigma",)),
-    "pc_global_inhib": Parameter(2e-5, (f"{NETWORK}.global_inhibition",)),
-    "vt_match_threshold": Parameter(0.03, (f"{TEMPLATES}.threshold",)),
-    "vt_shift_match": Parameter(25, (f"{TEMPLATES}.shift",)),
-    "vt_step_match": Parameter(5, (f"{TEMPLATES}.shift_step",)),
-    "vt_panoramic": Parameter(False, (f"{TEMPLATES}.panoramic",)),
-    "vt_normalisation": Parameter(0.0, (f"{TEMPLATES}.normalise_mean",)),
-    "vt_patch_normalise": Parameter(0, (f"{TEMPLATES}.patch",)),
-    "vt_min_patch_normalisation_std": Parameter(0.0, (f"{TEMPLATES}.patch_sd",)),
-    "pc_vt_inject_energy": Parameter(0.15, (f"{TEMPLATES}.energy",)),
-    "vt_active_decay": Parameter(1.0, (f"{TEMPLATES}.habituation",)),
-    "pc_vt_restore": Parameter(0.05, (f"{TEMPLATES}.recovery",)),
-    "exp_delta_pc_threshold": Parameter(2.0, ("places.radius", "places.radius_heading")),
-    "exp_loops": Parameter(10, (f"{MAP}.loops",)),
-    "exp_correction": Parameter(0.5, (f"{MAP}.correction",)),
-    "exp_initial_em_deg": Parameter(90.0, ()),
+RATSLAM: dict[str, _Parameter] = {
+    "image_crop_x_min": (0, (f"{IMAGE}.crop.x_min",)),
+    "image_crop_x_max": (-1, (f"{IMAGE}.crop.x_max",)),
+    "image_crop_y_min": (0, (f"{IMAGE}.crop.y_min",)),
+    "image_crop_y_max": (-1, (f"{IMAGE}.crop.y_max",)),
+    "template_y_size": (1, (f"{IMAGE}.rows",)),
+    "template_x_size": (1, (f"{IMAGE}.columns",)),
+    "pc_dim_xy": (21, (f"{CELLS}.cells_xy",)),
+    "pc_dim_th": (36, (f"{CELLS}.cells_heading",)),
+    "pc_cell_x_size": (1.0, (f"{CELLS}.cell_size",)),
+    "pc_w_e_dim": (7, (f"{NETWORK}.excite_width",)),
+    "pc_w_e_var": (1.0, (f"{NETWORK}.excite_sigma",)),
+    "pc_w_i_dim": (5, (f"{NETWORK}.inhibit_width",)),
+    "pc_w_i_var": (2.0, (f"{NETWORK}.inhibit_sigma",)),
+    "pc_global_inhib": (2e-5, (f"{NETWORK}.global_inhibition",)),
+    "vt_match_threshold": (0.03, (f"{TEMPLATES}.threshold",)),
+    "vt_shift_match": (25, (f"{TEMPLATES}.shift",)),
+    "vt_step_match": (5, (f"{TEMPLATES}.shift_step",)),
+    "vt_panoramic": (False, (f"{TEMPLATES}.panoramic",)),
+    "vt_normalisation": (0.0, (f"{TEMPLATES}.normalise_mean",)),
+    "vt_patch_normalise": (0, (f"{TEMPLATES}.patch",)),
+    "vt_min_patch_normalisation_std": (0.0, (f"{TEMPLATES}.patch_sd",)),
+    "pc_vt_inject_energy": (0.15, (f"{TEMPLATES}.energy",)),
+    "vt_active_decay": (1.0, (f"{TEMPLATES}.habituation",)),
+    "pc_vt_restore": (0.05, (f"{TEMPLATES}.recovery",)),
+    "exp_delta_pc_threshold": (2.0, ("places.radius", "places.radius_heading")),
+    "exp_loops": (10, (f"{MAP}.loops",)),
+    "exp_correction": (0.5, (f"{MAP}.correction",)),
+    "exp_initial_em_deg": (90.0, ()),
 }
 """Parameters of the section [ratslam]."""
 
-VISUAL_ODOMETRY: dict[str, Parameter] = {
-    "camera_fov_deg": Parameter(None, (f"{VISUAL}.fov_deg",)),
-    "camera_hz": Parameter(10.0, ()),
-    "vtrans_scaling": Parameter(None, (f"{VISUAL}.scaling",)),
-    "vtrans_max": Parameter(None, (f"{VISUAL}.max_speed",)),
+VISUAL_ODOMETRY: dict[str, _Parameter] = {
+    "camera_fov_deg": (None, (f"{VISUAL}.fov_deg",)),
+    "camera_hz": (10.0, ()),
+    "vtrans_scaling": (None, (f"{VISUAL}.scaling",)),
+    "vtrans_max": (None, (f"{VISUAL}.max_speed",)),
     **{
-        f"{name}_image_{side}": Parameter(default, (f"{VISUAL}.{crop}.{side}",))
+        f"{name}_image_{side}": (default, (f"{VISUAL}.{crop}.{side}",))
         for name, crop in (("vrot", "rotation"), ("vtrans", "translation"))
         for side, default in (("x_min", 0), ("x_max", -1), ("y_min", 0), ("y_max", -1))
     },
 }
 """Parameters of the section [visual_odometry]."""
 
-SECTIONS: Mapping[str, Mapping[str, Parameter]] = {
-    "general": {"topic_root": Parameter("", ())},
+SECTIONS: Mapping[str, Mapping[str, _Parameter]] = {
+    "general": {"topic_root": ("", ())},
     "ratslam": RATSLAM,
     "visual_odometry": VISUAL_ODOMETRY,
 }
@@ -87,22 +79,14 @@ IGNORED = ("draw",)
 """Sections about windows."""
 
 
-class Converted(NamedTuple):
-    """A converted parameter file.
-
-    Attributes:
-        settings: nested, as in a configuration file. notes: what has no counterpart or needs the user.
-    """
-
-    settings: dict[str, Any]
-    notes: list[str]
-
-
-def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
+def convert_parameters(path: Path, recording: Path | None = None) -> tuple[dict[str, Any], list[str]]:
     """The configuration that corresponds to a parameter file of OpenRatSLAM.
 
     Args:
         recording: the bag or video to map, as it shall stand in the configuration; None: ROOT.bag.
+
+    Returns:
+        the settings, nested as in a configuration file; notes on what has no counterpart or needs the user.
 
     Raises:
         InputError: the file cannot be read, or values are impossible; with file and line.
@@ -115,20 +99,27 @@ def convert_parameters(path: Path, recording: Path | None = None) -> Converted:
     settings: dict[str, Any] = {"recording": {"file": str(file)}, "backend": "classic"}
     settings["experience"] = {"solver": {"name": "relaxation"}}
     chosen = RATSLAM | (VISUAL_ODOMETRY if "camera_fov_deg" in values else {})
-    for key, parameter in chosen.items():
-        value = _converted(key, values, parameter)
+    for key, (default, paths) in chosen.items():
+        value = values.get(key, default)
+        if key.endswith("_max") and value == -1:
+            value = None  # open: up to the edge of the image
+        elif key == "vtrans_scaling" and isinstance(value, float):
+            value /= _rate(values)  # there a speed, here a distance between frames
         section = "ratslam" if key in RATSLAM else "visual_odometry"
-        for setting in parameter.paths:
+        for setting in paths:
             keys = tuple(setting.split("."))
             if value is not None:
-                _put(settings, keys, value)
+                part = settings
+                for name in keys[:-1]:
+                    part = part.setdefault(name, {})
+                part[keys[-1]] = value
             if key in values:
                 at = f"{path}:{lines[section, key]}: {key}:"
                 places[keys] = Place(at, at)
     notes += _put_source(settings, file, root, values)
     notes += _notes(values, settings)
     validate(Document(settings, places), RunConfig)
-    return Converted(settings, notes)
+    return settings, notes
 
 
 def _read_values(
@@ -154,7 +145,7 @@ def _read_values(
                 notes.append(f"{where}: {key} in [{section}] is unknown and ignored")
                 continue
             try:
-                values[key] = _value(text, known[key].default)
+                values[key] = _value(text, known[key][0])
                 if key == "camera_hz" and _rate(values) <= 0:
                     raise ValueError("a rate above 0")
             except ValueError as error:
@@ -215,26 +206,10 @@ def _value(text: str, default: Value) -> Value:
     return value
 
 
-def _converted(key: str, values: Mapping[str, Value], parameter: Parameter) -> Value:
-    """The value of a parameter in the units used here; None: open."""
-    value = values.get(key, parameter.default)
-    if key.endswith("_max") and value == -1:
-        return None  # up to the edge of the image
-    if key == "vtrans_scaling" and isinstance(value, float):
-        return value / _rate(values)  # there a speed, here a distance between frames
-    return value
-
-
 def _rate(values: Mapping[str, Value]) -> float:
-    rate = values.get("camera_hz", VISUAL_ODOMETRY["camera_hz"].default)
+    rate = values.get("camera_hz", VISUAL_ODOMETRY["camera_hz"][0])
     assert isinstance(rate, float)  # as its default
     return rate
-
-
-def _put(settings: dict[str, Any], keys: KeyPath, value: Value) -> None:
-    for key in keys[:-1]:
-        settings = settings.setdefault(str(key), {})
-    settings[str(keys[-1])] = value
 
 
 def _put_source(settings: dict[str, Any], file: Path, root: str, values: Mapping[str, Value]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Configurations and the citation that come with the program, in a checkout and in an installed wheel."""
+"""Configurations, presets and the citation that come with the program, in a checkout and in a wheel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ def packaged_configs() -> dict[str, str]:
 
     The line is the first comment of the file, and the environment variables that must be set for it.
     """
-    return {path.stem: _line(path.read_text(encoding="utf-8")) for path in _files()}
+    lines = {}
+    for path in _files():
+        text = path.read_text(encoding="utf-8")
+        line = text.partition("\n")[0].removeprefix("#").strip()
+        variables = sorted(set(re.findall(r"\$\{(\w+)\}", text)))
+        lines[path.stem] = f"{line} Needs {' and '.join(variables)}." if variables else line
+    return lines
 
 
 def find_config(text: str | os.PathLike[str], folder: Path = Path()) -> Path:
@@ -53,12 +59,6 @@ def read_citation() -> str:
 def _files() -> list[Path]:
     folder = next((folder for folder in FOLDERS if folder.is_dir()), FOLDERS[0])
     return sorted(folder.glob("*.yaml"))
-
-
-def _line(text: str) -> str:
-    line = text.partition("\n")[0].removeprefix("#").strip()
-    variables = sorted(set(re.findall(r"\$\{(\w+)\}", text)))
-    return f"{line} Needs {' and '.join(variables)}." if variables else line
 
 
 PresetName = Literal["touch", "arm", "create", "visual_odometry"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
 
@@ -15,7 +15,7 @@ from evaluation.metrics.metric_registry import METRICS
 from ratslam.classic.config import CellsConfig
 from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.runs.settings.packaged import PresetName, find_config
-from ratslam.runs.settings.renamed_keys import RENAMED, with_moved_settings
+from ratslam.runs.settings.renamed_keys import with_moved_settings
 from ratslam.runs.settings.strict_yaml import load, merge_includes, validate
 from ratslam.runs.settings.yaml_document import Document, KeyPath
 from robot.live.live_config import LiveConfig
@@ -92,7 +92,6 @@ class SourceConfig(Settings):
 class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, SourceConfig):
     """A run: `python -m ratslam run config.yaml`. `ratslam.methods.config` has the methods' sections."""
 
-    renamed_keys = RENAMED
     include: tuple[Path, ...] = ()
     """Files of settings to use where this file leaves them open, such as `rig.yaml` of `fit` or
     `calibration.yaml` of a run; a later one comes before an earlier one."""
@@ -119,9 +118,9 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
             for name in ("recording", "simulation", "create_simulation", "rat_simulation", "live")
             for part in [getattr(self, name)]
         }
-        parts["source"] = self.source and resolved_plugin(self.source, SOURCES, folder)
+        parts["source"] = self.source and _resolved_plugin(self.source, SOURCES, folder)
         frontend = self.touch.frontend
-        frontend = frontend and resolved_plugin(frontend, TOUCH, folder)
+        frontend = frontend and _resolved_plugin(frontend, TOUCH, folder)
         touch = {"reports": self.touch.reports.resolved(folder), "frontend": frontend}
         parts["touch"] = self.touch.model_copy(update=touch)
         file = self.localise.map
@@ -154,20 +153,17 @@ def load_config(
     document = merge_includes(with_moved_settings(load(path, assignments)), path.parent)
     _check_sources(document, assignments)
     config = validate(document, model)
-    check_plugins(document, config)
+    _check_plugins(document, config)
     here = config.with_absolute_paths(Path.cwd())
     for keys in [keys for keys, place in document.places.items() if place.value.startswith("--set")]:
-        text = document.value(keys)
-        if isinstance(text, str) and (full := str(_value_at(here, keys))) != text:  # a relative path
-            document.value(keys[:-1])[keys[-1]] = full
+        text: Any = document.value(keys)
+        value: Any = here
+        if isinstance(text, str):
+            for key in keys:
+                value = getattr(value, str(key)) if isinstance(value, Settings) else value[key]
+            if str(value) != text:  # a relative path
+                document.value(keys[:-1])[keys[-1]] = str(value)
     return validate(document, model).with_absolute_paths(path.parent.resolve())
-
-
-def _value_at(value: Any, keys: Sequence[str | int]) -> Any:
-    """The value at a path of keys through settings, mappings and lists."""
-    for key in keys:
-        value = getattr(value, str(key)) if isinstance(value, Settings) else value[key]
-    return value
 
 
 def _check_sources(document: Document, assignments: Sequence[str]) -> None:
@@ -182,31 +178,37 @@ def _check_sources(document: Document, assignments: Sequence[str]) -> None:
             raise InputError(f"--set {name}", found, "settings of that", cure)
 
 
-class Chosen(NamedTuple):
-    """A registered part that a configuration names: the path of its name, that of its settings, and where it
-    is registered."""
-
-    name: KeyPath
-    settings: KeyPath
-    registry: Registry[Any]
-    plugin: str
-
-
-def check_plugins(document: Document, config: RunConfig) -> None:
+def _check_plugins(document: Document, config: RunConfig) -> None:
     """Checks the names and settings of all registered parts in a configuration.
 
     Raises:
         InputErrors: all errors, each with file, line, column and key path.
     """
+    from ratslam.methods.method_registry import BACKENDS  # loads JAX
+
+    # Of each part: the path of its name, that of its settings, where it is registered, and its name.
+    parts: list[tuple[KeyPath, KeyPath, Registry[Any], str]] = [
+        (("backend",), ("backend_settings",), BACKENDS, config.backend)
+    ]
+    sections: list[tuple[KeyPath, Registry[Any], PluginConfig | None]] = [
+        (("source",), SOURCES, config.source),
+        (("touch", "frontend"), TOUCH, config.touch.frontend),
+        *((("score", "metrics", k), METRICS, one) for k, one in enumerate(config.score.metrics)),
+    ]
+    parts += [
+        ((*path, "plugin"), (*path, "settings"), registry, part.plugin)
+        for path, registry, part in sections
+        if part is not None
+    ]
     errors: list[InputError] = []
-    for part in _chosen(config):
+    for name, settings, registry, plugin in parts:
         try:
-            entry = part.registry.get(part.plugin, document.at_value(part.name))
-            if part.plugin not in part.registry.builtin:
-                validate(document.section(part.settings), entry.config_class)
-            elif document.value(part.settings):
-                found = f"settings of a registered {part.registry.noun}, but '{part.plugin}' is one of ours"
-                raise InputError(document.at_key(part.settings), found)
+            entry = registry.get(plugin, document.at_value(name))
+            if plugin not in registry.builtin:
+                validate(document.section(settings), entry.config_class)
+            elif document.value(settings):
+                found = f"settings of a registered {registry.noun}, but '{plugin}' is one of ours"
+                raise InputError(document.at_key(settings), found)
         except InputErrors as several:
             errors += several.errors
         except InputError as error:
@@ -215,24 +217,10 @@ def check_plugins(document: Document, config: RunConfig) -> None:
         raise InputErrors(errors)
 
 
-def resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path) -> PluginConfig:
+def _resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path) -> PluginConfig:
     """The configuration of a part with the relative paths in its settings taken from `folder`."""
     model = registry.get(config.plugin, "plugin").config_class
     settings = read_settings(model, config.settings, "settings")
     paths = {name: folder / value for name, value in settings if isinstance(value, Path)}
     given: dict[str, Any] = json.loads(settings.model_copy(update=paths).model_dump_json(exclude_unset=True))
     return config.model_copy(update={"settings": given})
-
-
-def _chosen(config: RunConfig) -> Iterator[Chosen]:
-    from ratslam.methods.method_registry import BACKENDS  # loads JAX
-
-    yield Chosen(("backend",), ("backend_settings",), BACKENDS, config.backend)
-    parts: list[tuple[KeyPath, Registry[Any], PluginConfig | None]] = [
-        (("source",), SOURCES, config.source),
-        (("touch", "frontend"), TOUCH, config.touch.frontend),
-    ]
-    parts += [(("score", "metrics", k), METRICS, one) for k, one in enumerate(config.score.metrics)]
-    for path, registry, part in parts:
-        if part is not None:
-            yield Chosen((*path, "plugin"), (*path, "settings"), registry, part.plugin)

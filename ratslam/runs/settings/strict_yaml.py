@@ -1,10 +1,8 @@
 """Configuration files: YAML read strictly, validated in one pass, written back exactly.
 
-Turns validation errors of pydantic into messages with the place in the configuration file.
-
-Files that are given for a configuration and are none: what they are, and the command that reads them.
-
-Files of settings that a configuration includes, such as the rig that `fit` writes.
+`load` reads a file, `override` applies `--set`, `merge_includes` adds the files of settings that it includes
+(such as the rig that `fit` writes), `validate` makes a model of it, and `dump` is its inverse. Errors of
+pydantic become messages with file, line and column. `kind_of` tells other files from configurations.
 """
 
 from __future__ import annotations
@@ -15,11 +13,11 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Sequence
 from math import inf
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -51,73 +49,9 @@ _WORDS = {
 }
 
 
-def input_errors(error: ValidationError, model: type[Settings], document: Document) -> list[InputError]:
-    """One error for each wrong value, in the order of the file; one for all alternatives of a union."""
-    order = {path: rank for rank, path in enumerate(document.places)}
-    found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
-    found.sort(key=lambda pair: order[document.nearest(pair[0].path)])
-    merged: dict[tuple[str, str, str], dict[str, None]] = {}
-    for spot, details in found:
-        renamed = _renaming_errors(details, spot.path, model, document)
-        for one in renamed or [_input_error(details, spot, model, document)]:
-            merged.setdefault((one.where, one.found, one.cure), {})[one.expected] = None
-    errors = [
-        InputError(where, found, " or ".join(filter(None, expected)), cure)
-        for (where, found, cure), expected in merged.items()
-    ]
-    rest = len(errors) - _MAX_ERRORS
-    return errors[:_MAX_ERRORS] + ([InputError("", f"and {rest} more errors")] if rest > 0 else [])
-
-
-class _Spot(NamedTuple):
-    """The place of an error in the data and in the types.
-
-    Attributes:
-        path: key path in the data.
-        owner: model of which the last key of the path is a field; None if unknown or not a model.
-        kinds: types of the value; several for a union, none if unknown.
-    """
-
-    path: KeyPath
-    owner: type[BaseModel] | None
-    kinds: list[Any]
-
-
-def _renaming_errors(
-    details: ErrorDetails, path: KeyPath, model: type[Settings], document: Document
-) -> list[InputError]:
-    """The errors for an unknown key that was renamed: one for each key in it, if it is a section."""
-    if details["type"] != "extra_forbidden":
-        return []
-    found = _new_names(join_keys(path), document.value(path), model.renamed_keys)
-    return [InputError(document.at_key(tuple(old.split("."))), sentence) for old, sentence in found]
-
-
-def _new_names(old: str, value: Any, renamed: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Old key and a sentence with the new one, for each key of a section that has new names in it."""
-    new = _new_name(old, renamed)
-    if new == old:
-        return
-    if isinstance(value, dict) and value and any(name.startswith((f"{old}.", f"{new}.")) for name in renamed):
-        for key, part in value.items():
-            yield from _new_names(f"{old}.{key}", part, renamed)
-    else:
-        yield old, f"`{old}` is now `{new}`" if _is_path(new) else new
-
-
-def _new_name(path: str, renamed: Mapping[str, str]) -> str:
-    """Follows renames of a key or a section above it to the last name, or to a replacement sentence."""
-    for _ in range(len(renamed)):
-        above = max((name for name in renamed if f"{path}.".startswith(f"{name}.")), key=len, default=None)
-        if above is None or not _is_path(path):
-            break
-        new = renamed[above]
-        path = new + path.removeprefix(above) if _is_path(new) else new
-    return path
-
-
-def _is_path(text: str) -> bool:
-    return re.fullmatch(r"[\w.]+", text) is not None
+_Spot = tuple[KeyPath, type[BaseModel] | None, list[Any]]
+"""The place of an error: its key path in the data; the model of which the last key is a field, None if
+unknown or not a model; the types of the value, several for a union and none if unknown."""
 
 
 def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], document: Document) -> InputError:
@@ -160,10 +94,11 @@ def _input_error(details: ErrorDetails, spot: _Spot, model: type[Settings], docu
 
 
 def _wrong_length(spot: _Spot, expected: str, document: Document) -> InputError:
-    for kind in spot.kinds:
+    path, _, kinds = spot
+    for kind in kinds:
         if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
             expected = f"{len(get_args(kind))} values"
-    return InputError(document.at_value(spot.path), describe(document.value(spot.path)), expected)
+    return InputError(document.at_value(path), describe(document.value(path)), expected)
 
 
 def _wrong_word(path: KeyPath, expected: str, document: Document) -> InputError:
@@ -190,12 +125,17 @@ def _spot(loc: Sequence[str | int], model: type[Settings]) -> _Spot:
     kinds: list[Any] = [model]
     for item in loc:
         if len(kinds) > 1:
-            kinds = [kind for kind in kinds if _is_named(kind, item)][:1]
+            kinds = [
+                kind
+                for kind in kinds
+                if _is_model(kind)  # pydantic names it by its class or by a tag
+                and (kind.__name__ == item or any(item in _words(kind, field) for field in kind.model_fields))
+            ][:1]
         elif item != "[key]":
             path += (item,)
             owner = kinds[0] if kinds and _is_model(kinds[0]) else None
             kinds = _alternatives(_inside(kinds[0], item)) if kinds else []
-    return _Spot(path, owner, kinds)
+    return path, owner, kinds
 
 
 def _is_model(kind: Any) -> bool:
@@ -210,13 +150,6 @@ def _alternatives(kind: Any) -> list[Any]:
     if origin in (Union, UnionType):
         return [part for member in get_args(kind) if member is not NoneType for part in _alternatives(member)]
     return [kind]
-
-
-def _is_named(kind: Any, name: str | int) -> bool:
-    """Whether pydantic names this alternative of a union `name`: by its class or by a tag."""
-    if not _is_model(kind):
-        return False
-    return kind.__name__ == name or any(name in _words(kind, field) for field in kind.model_fields)
 
 
 def _words(kind: Any, field: str | int) -> Sequence[Any]:
@@ -392,8 +325,18 @@ def open_path(data: Any, key: str, where: str) -> tuple[Any, KeyPath]:
             alone = _ALONE.get(path[:-1])
             if alone is not None and isinstance(data.get(path[-1]), str):
                 data[path[-1]] = {alone: data[path[-1]]}
-            data = _open_section(data, path[-1])
-        path += (_step(data, name, where, path),)
+            if isinstance(data, dict) and data.get(str(path[-1])) is None:
+                data[str(path[-1])] = {}
+            data = data[path[-1]]
+        if isinstance(data, dict):
+            path += (name,)
+        elif isinstance(data, list):
+            if not (name.isascii() and name.isdigit() and len(name) < 9 and int(name) < len(data)):
+                found = f"{join_keys(path)} has {len(data)} items"
+                raise InputError(where, found, f"an index below {len(data)}")
+            path += (int(name),)
+        else:
+            raise InputError(where, f"{join_keys(path)} is {describe(data)}", "a section to put a key in")
     return data, path
 
 
@@ -403,24 +346,40 @@ def validate(document: Document, model: type[Model]) -> Model:
     Raises:
         InputErrors: all errors in it, each with its place.
     """
-    if errors := [error for path in document.places for error in _beyond_measure(document, path)]:
+    errors = []
+    for path in document.places:
+        value = document.value(path)
+        if isinstance(value, float) and 0 < abs(value) < inf and not SMALLEST <= abs(value) <= LARGEST:
+            expected = f"0, or a number of {SMALLEST:g} to {LARGEST:g}"
+        elif isinstance(value, int) and abs(value) > MOST and path[-1:] != ("seed",):
+            expected = f"at most {MOST}"
+        else:
+            continue
+        errors.append(InputError(document.at_value(path), describe(value), expected))
+    if errors:
         raise InputErrors(errors)
     try:
         # As JSON: pydantic is then strict, but accepts lists for tuples and texts for paths.
         return model.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as error:
-        raise InputErrors(input_errors(error, model, document)) from None
+        raise InputErrors(_input_errors(error, model, document)) from None
 
 
-def _beyond_measure(document: Document, path: KeyPath) -> list[InputError]:
-    value = document.value(path)
-    if isinstance(value, float) and 0 < abs(value) < inf and not SMALLEST <= abs(value) <= LARGEST:
-        expected = f"0, or a number of {SMALLEST:g} to {LARGEST:g}"
-    elif isinstance(value, int) and abs(value) > MOST and path[-1:] != ("seed",):
-        expected = f"at most {MOST}"
-    else:
-        return []
-    return [InputError(document.at_value(path), describe(value), expected)]
+def _input_errors(error: ValidationError, model: type[Settings], document: Document) -> list[InputError]:
+    """One error for each wrong value, in the order of the file; one for all alternatives of a union."""
+    order = {path: rank for rank, path in enumerate(document.places)}
+    found = [(_spot(details["loc"], model), details) for details in error.errors(include_url=False)]
+    found.sort(key=lambda pair: order[document.nearest(pair[0][0])])
+    merged: dict[tuple[str, str, str], dict[str, None]] = {}
+    for spot, details in found:
+        one = _input_error(details, spot, model, document)
+        merged.setdefault((one.where, one.found, one.cure), {})[one.expected] = None
+    errors = [
+        InputError(where, found, " or ".join(filter(None, expected)), cure)
+        for (where, found, cure), expected in merged.items()
+    ]
+    rest = len(errors) - _MAX_ERRORS
+    return errors[:_MAX_ERRORS] + ([InputError("", f"and {rest} more errors")] if rest > 0 else [])
 
 
 def dump(model: BaseModel) -> str:
@@ -450,25 +409,6 @@ def _escape(data: Any) -> Any:
             return data.replace("${", "$${")
         case _:
             return data
-
-
-def _step(section: Any, key: str, where: str, path: KeyPath) -> str | int:
-    """`key` as a key of a section or as an index of a list."""
-    if isinstance(section, dict):
-        return key
-    if isinstance(section, list):
-        count = len(section)
-        if key.isascii() and key.isdigit() and len(key) < 9 and int(key) < count:
-            return int(key)
-        raise InputError(where, f"{join_keys(path)} has {count} items", f"an index below {count}")
-    raise InputError(where, f"{join_keys(path)} is {describe(section)}", "a section to put a key in")
-
-
-def _open_section(section: Any, key: str | int) -> Any:
-    """The subsection at a key; created if it is missing."""
-    if isinstance(section, dict) and section.get(str(key)) is None:
-        section[str(key)] = {}
-    return section[key]
 
 
 KEY = "include"

@@ -1,16 +1,9 @@
-"""A configuration as plain data with the place of each key and value.
+"""A configuration as plain data with the place of each key and value: its reader, and its writer (`Dumper`).
 
-Reads YAML strictly into plain data with the place of every key and value.
-
-Duplicate keys, anchors and tags are refused: every value has one place, and no file expands into a larger
-one.
-
-Values of unquoted YAML words: YAML 1.2, and stricter.
-
-Only `true` and `false` are booleans (`no` is text), `1e-3` is a number, `12:30` is text, and `010`, which
-other readers read as eight or as ten, is refused.
-
-Writes plain data as YAML that readers of YAML 1.1 and of YAML 1.2 read alike.
+YAML 1.2, and stricter. Duplicate keys, anchors and tags are refused: every value has one place, and no file
+expands into a larger one. Of unquoted words only `true` and `false` are booleans (`no` is text), `1e-3` is a
+number, `12:30` is text, and `010`, which other readers read as eight or as ten, is refused. What is written,
+readers of YAML 1.1 and of YAML 1.2 read alike.
 """
 
 from __future__ import annotations
@@ -59,11 +52,13 @@ class Document:
 
     def at_key(self, path: KeyPath) -> str:
         """`file:line:column: a.b` of a key; of the nearest section above if it is missing."""
-        return label(self.places[self.nearest(path)].key, self.above + path)
+        return _label(self.places[self.nearest(path)].key, self.above + path)
 
     def at_value(self, path: KeyPath) -> str:
         """`file:line:column: a.b` of a value; of the nearest section above if it is missing."""
-        return label(self.places[path].value, self.above + path) if path in self.places else self.at_key(path)
+        return (
+            _label(self.places[path].value, self.above + path) if path in self.places else self.at_key(path)
+        )
 
     def value(self, path: KeyPath) -> Any:
         """The value at a path; None if there is none."""
@@ -82,7 +77,7 @@ class Document:
         return path
 
 
-def label(place: str, path: KeyPath) -> str:
+def _label(place: str, path: KeyPath) -> str:
     """A place and a key path for messages: `config.yaml:5:3: pose_cells.shape`, `--set a.b`."""
     return f"{place} {join_keys(path)}".rstrip(": ")
 
@@ -173,13 +168,13 @@ class Reader:
 
     def _error(self, path: KeyPath, found: str, expected: str = "", cure: str = "") -> InputError:
         """An error at the last event."""
-        return InputError(label(self._place(self._line, self._column), path), found, expected, cure)
+        return InputError(_label(self._place(self._line, self._column), path), found, expected, cure)
 
     def _syntax(self, error: yaml.MarkedYAMLError) -> InputError:
         """A syntax error of the parser as an `InputError`."""
         problem = error.problem or error.context or ""
         if "<stream end>" in problem and self._brackets:
-            return InputError(label(self._brackets[-1], self._root), "a bracket that is not closed")
+            return InputError(_label(self._brackets[-1], self._root), "a bracket that is not closed")
         mark = error.problem_mark or error.context_mark
         if mark is not None:
             self._line, self._column = mark.line + 1, mark.column + 1
@@ -214,49 +209,43 @@ class Reader:
         if event.tag:
             raise self._error(path, f"a tag ({event.tag})", "a plain value")
         if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event, path)
+            value = event.value if event.style else _read_word(event.value)
+            if isinstance(value, tuple):
+                self._errors.append(self._error(path, *value))
+            if not isinstance(value, str):
+                return value
+            text = re.sub(r"(\$?)\$\{([^}]*)(\}?)", lambda found: self._variable(found, path), value)
+            return self._text_of(text, path)
         if len(path) - len(self._root) >= _MAX_DEPTH:
             raise self._error(path[:3], f"sections nested more than {_MAX_DEPTH} deep")
         if event.flow_style:
             self._brackets.append(place)
-        data = self._mapping(path) if isinstance(event, yaml.MappingStartEvent) else self._sequence(path)
+        data: Any = []
+        if isinstance(event, yaml.MappingStartEvent):
+            data = self._mapping(path)
+        else:
+            while not isinstance(item := self._next(), yaml.SequenceEndEvent):
+                data.append(self._value(item, (*path, len(data))))
         if event.flow_style:
             self._brackets.pop()
         return data
-
-    def _sequence(self, path: KeyPath) -> list[Any]:
-        items: list[Any] = []
-        while not isinstance(event := self._next(), yaml.SequenceEndEvent):
-            items.append(self._value(event, (*path, len(items))))
-        return items
 
     def _mapping(self, path: KeyPath) -> dict[str, Any]:
         data: dict[str, Any] = {}
         while not isinstance(event := self._next(), yaml.MappingEndEvent):
             place = self._place(self._line, self._column)
-            name = self._key(event, path)
+            if not isinstance(event, yaml.ScalarEvent) or event.anchor or event.tag:
+                raise self._error(path, "a key that is not plain text", "a plain key")
+            if not event.style and not isinstance(_read_word(event.value), str):
+                cure = f"write '{event.value}'"
+                self._errors.append(self._error(path, f"the key {event.value or 'is empty'}", "text", cure))
+            name = self._text_of(event.value, path)
             at = (*path, name)
             if name in data:
                 first = self.places[at].key.rstrip(":")
                 self._errors.append(self._error(at, "given twice", cure=f"the first is at {first}"))
             data[name] = self._value(self._next(), at, place)
         return data
-
-    def _key(self, event: yaml.Event, path: KeyPath) -> str:
-        if not isinstance(event, yaml.ScalarEvent) or event.anchor or event.tag:
-            raise self._error(path, "a key that is not plain text", "a plain key")
-        if not event.style and not isinstance(read_word(event.value), str):
-            cure = f"write '{event.value}'"
-            self._errors.append(self._error(path, f"the key {event.value or 'is empty'}", "text", cure))
-        return self._text_of(event.value, path)
-
-    def _scalar(self, event: yaml.ScalarEvent, path: KeyPath) -> Any:
-        value = event.value if event.style else read_word(event.value)
-        if isinstance(value, Refused):
-            self._errors.append(self._error(path, *value))
-        if not isinstance(value, str):
-            return value
-        return self._text_of(re.sub(r"(\$?)\$\{([^}]*)(\}?)", lambda m: self._variable(m, path), value), path)
 
     def _text_of(self, text: str, path: KeyPath) -> str:
         """The text; an error if it has control characters that no file name may have."""
@@ -286,28 +275,20 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _LEADING_ZERO = re.compile(r"[-+]?0[0-9]")
 
 
-class Refused(NamedTuple):
-    """A word that is refused because readers disagree about it."""
-
-    found: str
-    expected: str
-    cure: str = ""
-
-
-def read_word(word: str) -> Any:
-    """Value of an unquoted word: None, bool, int, float, str or `Refused`."""
+def _read_word(word: str) -> Any:
+    """Value of an unquoted word: None, bool, int, float or str; found, expected and cure if it is refused."""
     if word in _WORDS:
         return _WORDS[word]
     integer = _INTEGER.fullmatch(word)
     if not integer and not _FLOAT.fullmatch(word):
         return word
     if _LEADING_ZERO.match(word):
-        return Refused(f"{word:.60}", "a number without leading zeros", "quote it if it is a name")
+        return f"{word:.60}", "a number without leading zeros", "quote it if it is a name"
     if integer and len(word) <= 20 and -(1 << 63) <= int(word, 0) < 1 << 63:
         return int(word, 0)
     if not integer and math.isfinite(float(word)):
         return float(word)
-    return Refused(f"{word:.60}", "a number that fits 64 bits")
+    return f"{word:.60}", "a number that fits 64 bits"
 
 
 _TEXT = "tag:yaml.org,2002:str"
@@ -319,7 +300,12 @@ class Dumper(yaml.SafeDumper):
     def resolve(self, kind: type, value: Any, implicit: Any) -> Any:
         """The tag that a reader gives a node: that of YAML 1.1, or a number if our reader finds one."""
         tag = super().resolve(kind, value, implicit)
-        if kind is yaml.ScalarNode and implicit[0] and tag == _TEXT and not isinstance(read_word(value), str):
+        if (
+            kind is yaml.ScalarNode
+            and implicit[0]
+            and tag == _TEXT
+            and not isinstance(_read_word(value), str)
+        ):
             return "tag:yaml.org,2002:float"
         return tag
 
@@ -327,16 +313,15 @@ class Dumper(yaml.SafeDumper):
         """Always true: anchors are refused on reading, so a shared list is written twice."""
         return True
 
+    def represent_list(self, items: Any) -> yaml.SequenceNode:
+        """A list without lists or sections in it in one line."""
+        flat = not any(isinstance(item, list | dict) for item in items)
+        return self.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flat)
 
-def _represent_list(dumper: Dumper, items: list[Any]) -> yaml.Node:
-    flat = not any(isinstance(item, list | dict) for item in items)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flat)
+    def represent_str(self, text: str) -> yaml.ScalarNode:
+        """Escaped if not printable: else the emitter folds U+0085 and similar characters like spaces."""
+        return self.represent_scalar(_TEXT, text, style=None if text.isprintable() else '"')
 
 
-def _represent_text(dumper: Dumper, text: str) -> yaml.Node:
-    # Unless escaped, the emitter folds U+0085 and similar characters like spaces.
-    return dumper.represent_scalar(_TEXT, text, style=None if text.isprintable() else '"')
-
-
-Dumper.add_representer(list, _represent_list)
-Dumper.add_representer(str, _represent_text)
+Dumper.add_representer(list, Dumper.represent_list)
+Dumper.add_representer(str, Dumper.represent_str)

@@ -11,7 +11,7 @@ from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data
 from ratslam.service.record_fit import walls_of
-from ratslam.service.rig_fit import Quantity, Rig, rig_file, rig_settings
+from ratslam.service.rig_fit import Quantity, Rig
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions
@@ -120,13 +120,13 @@ def test_settings_are_those_that_differ() -> None:
         ),
         {"touch": {"head": {"dead": [2]}}},
     )
-    assert rig_settings(rig) == {
+    assert rig.included() == {
         "recording": {"odometry": {"turn_scale": 1.1}},
         "touch": {"head": {"dead": [2]}},
     }
-    assert "turn_scale: 1.1" in dump_data(rig_settings(rig))
-    assert "nothing to include" in rig_file(Rig(), "a.csv")
-    assert set(rig_settings(rig)) <= set(RunConfig.model_fields)
+    assert "turn_scale: 1.1" in dump_data(rig.included())
+    assert "nothing to include" in Rig().file_text("a.csv")
+    assert set(rig.included()) <= set(RunConfig.model_fields)
 
 
 def test_the_walls_are_those_of_the_simulation() -> None:

@@ -12,7 +12,7 @@ import pytest
 import ratslam
 from ratslam.core.session import Step
 from ratslam.runs.build_session import open_observations
-from ratslam.runs.estimate import pose_estimate
+from ratslam.runs.estimate import PoseEstimate
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.types import MotionKind, Report, Whisk
 
@@ -124,7 +124,7 @@ def test_the_covariance_is_turned_to_the_map() -> None:
     """The backend's estimate says along x, and the map is turned by 90° against it."""
     still = np.int32(0)
     estimate = ratslam.Estimate(np.zeros(3), np.array([2.0, 1.0, 0.5]), still, still, still, np.bool_(False))
-    found = pose_estimate(Step(estimate, None, np.array([5.0, 0.0, np.pi / 2]), np.nan), "ok")
+    found = PoseEstimate.of_step(Step(estimate, None, np.array([5.0, 0.0, np.pi / 2]), np.nan), "ok")
     np.testing.assert_allclose(found.covariance, np.diag([1.0, 4.0, 0.25]), atol=1e-12)
 
 
@@ -236,8 +236,5 @@ def test_other_files_are_not_loaded(own: Path, tmp_path: Path) -> None:
     with pytest.raises(ratslam.InputError, match="no such file; expected a map"):
         ratslam.Slam.load(tmp_path / "none")
     np.savez(tmp_path / "map.npz", steps=np.array(3))
-    with pytest.raises(ratslam.InputError, match="does not say how it was made"):
+    with pytest.raises(ratslam.InputError, match="a file without 'format'"):
         ratslam.Slam.load(tmp_path / "map.npz")
-    np.savez(tmp_path / "cut.npz", steps=np.array(3), config=np.array(NO_SOURCE), source=np.array("{}"))
-    with pytest.raises(ratslam.InputError, match="not a description of a source"):
-        ratslam.Slam.load(tmp_path / "cut.npz")

@@ -35,9 +35,9 @@ def test_only_other_values_are_listed(tmp_path: Path) -> None:
 def test_a_setting_that_must_be_given_has_no_default(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("recording: {file: '/private/<b>.npz'}\n")
-    (setting,) = changed_settings(path)
-    assert (setting.path, setting.default) == ("recording.file", "")
-    assert setting.value == '"<b>.npz"'  # pages are shared, folders are private
+    ((name, value, default),) = changed_settings(path)
+    assert (name, default) == ("recording.file", "")
+    assert value == '"<b>.npz"'  # pages are shared, folders are private
 
 
 def test_a_malformed_configuration_is_refused(tmp_path: Path) -> None:

@@ -142,7 +142,8 @@ NOTES = {
 @pytest.mark.parametrize("case", NOTES)
 def test_what_has_no_counterpart_is_noted(case: str, write) -> None:
     text, expected = NOTES[case]
-    notes = "\n".join(convert_parameters(write(text)).notes)
+    _, notes = convert_parameters(write(text))
+    notes = "\n".join(notes)
     assert all(words in notes for words in expected)
 
 

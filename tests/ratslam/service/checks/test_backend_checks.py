@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ratslam.service.backend_checks import CHECKS, GROUPS, BackendTrial
+from ratslam.service.backend_checks import CHECKS, BackendTrial
 from ratslam.service.check_results import run_checks
 from tactile.base.plugins import NoSettings
 from tests.ratslam.service.checks import broken_backends as broken
@@ -12,12 +12,12 @@ from tests.ratslam.service.checks.broken_backends import entry_of
 
 
 def first_failure(entry):
-    results = run_checks(GROUPS, BackendTrial(entry, NoSettings()))
+    results = run_checks(CHECKS, BackendTrial(entry, NoSettings()))
     return next((result for result in results if result.status == "FAIL"), None)
 
 
 def test_a_sound_backend_passes():
-    results = list(run_checks(GROUPS, BackendTrial(entry_of(broken.Sound), NoSettings())))
+    results = list(run_checks(CHECKS, BackendTrial(entry_of(broken.Sound), NoSettings())))
     assert [result.line() for result in results if result.status != "ok"] == []
     assert [result.check for result in results] == list(CHECKS)
 

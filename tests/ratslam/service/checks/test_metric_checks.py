@@ -11,7 +11,7 @@ from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import MetricEntry
 from evaluation.metrics.run_metrics import RUN_METRICS
 from ratslam.service.check_results import run_checks
-from ratslam.service.metric_checks import CHECKS, GROUPS, MetricTrial
+from ratslam.service.metric_checks import CHECKS, MetricTrial
 from tactile.base.plugins import NoSettings
 
 
@@ -29,7 +29,7 @@ def trial_of(metric):
     ids=lambda one: one.name,
 )
 def test_our_metrics_pass(metric):
-    results = list(run_checks(GROUPS, trial_of(metric)))
+    results = list(run_checks(CHECKS, trial_of(metric)))
     assert [result.line() for result in results if result.status != "ok"] == []
     assert [result.check for result in results] == list(CHECKS)
 
@@ -84,10 +84,10 @@ BROKEN = {
 
 @pytest.mark.parametrize(("metric", "check", "words"), BROKEN.values(), ids=BROKEN)
 def test_a_broken_metric_is_told_what_is_wrong(metric, check, words):
-    failed = next(result for result in run_checks(GROUPS, trial_of(metric)) if result.status == "FAIL")
+    failed = next(result for result in run_checks(CHECKS, trial_of(metric)) if result.status == "FAIL")
     assert (failed.check.name, words in failed.text) == (check, True), failed.line()
 
 
 def test_a_sound_metric_passes():
-    results = list(run_checks(GROUPS, trial_of(SOUND)))
+    results = list(run_checks(CHECKS, trial_of(SOUND)))
     assert [result.line() for result in results if result.status != "ok"] == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.service.check_results import run_checks
-from ratslam.service.touch_checks import CHECKS, GROUPS, TouchTrial, simulated_head
+from ratslam.service.touch_checks import CHECKS, TouchTrial
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import TouchEntry, report_config_of
 from tactile.base.plugins import NoSettings
@@ -16,7 +16,7 @@ from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFronte
 
 
 def trial_of(build, source=None):
-    return TouchTrial(TouchEntry(NoSettings, build), NoSettings(), source or simulated_head())
+    return TouchTrial(TouchEntry(NoSettings, build), NoSettings(), source)
 
 
 def head(settings, info):
@@ -35,7 +35,7 @@ OURS = {
 
 @pytest.mark.parametrize("trial", OURS.values(), ids=OURS)
 def test_our_front_ends_pass(trial):
-    results = list(run_checks(GROUPS, trial()))
+    results = list(run_checks(CHECKS, trial()))
     assert [result.line() for result in results if result.status != "ok"] == []
     assert [result.check for result in results] == list(CHECKS)
 
@@ -127,12 +127,12 @@ BROKEN = {
 @pytest.mark.parametrize(("kind", "check", "words"), BROKEN.values(), ids=BROKEN)
 def test_a_broken_front_end_is_told_what_is_wrong(kind, check, words):
     trial = trial_of(lambda settings, info: kind())
-    failed = next(result for result in run_checks(GROUPS, trial) if result.status == "FAIL")
+    failed = next(result for result in run_checks(CHECKS, trial) if result.status == "FAIL")
     assert (failed.check.name, words in failed.text) == (check, True), failed.line()
 
 
 def test_a_sound_front_end_passes():
-    results = run_checks(GROUPS, trial_of(lambda settings, info: Front()))
+    results = run_checks(CHECKS, trial_of(lambda settings, info: Front()))
     assert [result.line() for result in results if result.status != "ok"] == []
 
 
@@ -140,7 +140,7 @@ def test_one_front_end_for_all_passes_is_told():
     front = Front()
     failed = [
         result
-        for result in run_checks(GROUPS, trial_of(lambda settings, info: front))
+        for result in run_checks(CHECKS, trial_of(lambda settings, info: front))
         if result.status != "ok"
     ]
     assert [result.check.name for result in failed] == ["it keeps nothing between passes"]

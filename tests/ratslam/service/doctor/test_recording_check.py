@@ -11,7 +11,7 @@ import pytest
 from ratslam.cli import main
 from ratslam.runs.build_session import open_source
 from ratslam.runs.localise import localising
-from ratslam.runs.map_settings import differences, differing_settings, sensor_of
+from ratslam.runs.map_settings import Sensor, differing_settings
 from ratslam.runs.saved_map import SavedMap, describe_readings
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
@@ -252,7 +252,7 @@ def test_a_configuration_like_a_map_fits_it(folder: Path, name: str, settings: l
     assert not found.faults
     with open_source(validate(parse(dump_data(found.config), "like.yaml"), RunConfig)) as source:
         completed = complete(validate(parse(dump_data(found.config), "like.yaml"), RunConfig), source)
-        assert differences(like.sensor, sensor_of(completed, source)) == []
+        assert like.sensor.differences(Sensor.of(completed, source)) == []
     assert differing_settings([config, completed]) == {}
 
 

@@ -10,7 +10,7 @@ import pytest
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import RevisitFit, fit_record, fit_revisits, fit_wheels_of
-from ratslam.service.rig_fit import fit_wheels, rig_settings
+from ratslam.service.rig_fit import fit_wheels
 from robot.sources.in_memory import load_into_memory
 
 ROOT = Path(__file__).parents[4]
@@ -43,7 +43,7 @@ def test_a_record_without_truth_tells_no_length_scale(known: bool, monkeypatch: 
     assert [quantity.name for quantity in rig.quantities] == (["turn scale", "heading bias"] if known else [])
     assert any("length scale" in reason for reason in rig.unknown)
     settings = {"recording": {"odometry": {"heading_bias": 0.03}}} if known else {}
-    assert rig_settings(rig) == settings
+    assert rig.included() == settings
 
 
 def test_the_record_of_the_square_is_fitted_from_its_truth() -> None:

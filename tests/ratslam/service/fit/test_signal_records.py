@@ -10,7 +10,7 @@ import pytest
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import fit_record
-from ratslam.service.rig_fit import Rig, rig_settings
+from ratslam.service.rig_fit import Rig
 from robot.recordings.mcap_reader import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.whisker_geometry import HeadConfig
@@ -48,13 +48,13 @@ def test_noise_of_raw_whisks_is_found(raw: Rig) -> None:
 
 
 def test_a_dead_whisker_becomes_a_setting(raw: Rig) -> None:
-    assert rig_settings(raw)["touch"]["head"]["dead"] == [DEAD]
+    assert raw.included()["touch"]["head"]["dead"] == [DEAD]
     assert any(line.strip() == f"whisker {DEAD}: dead: no signal" for line in raw.notes)
 
 
 def test_the_rest_angle_of_raw_whisks_is_found(raw: Rig) -> None:
     """From detected contacts, whose delay is part of it."""
-    assert 60 < rig_settings(raw)["touch"]["head"]["rest_deg"] < 62.5
+    assert 60 < raw.included()["touch"]["head"]["rest_deg"] < 62.5
 
 
 def test_whiskers_of_the_arm_in_clutter(reference_data: Path, tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_whiskers_of_the_arm_in_clutter(reference_data: Path, tmp_path: Path) ->
     assert "drift of right4" in unknown
     assert "stage-to-signal map: no known touch" in unknown
     assert not any("nan" in line for line in rig.notes)
-    assert rig_settings(rig) == {}
+    assert rig.included() == {}
 
 
 def stage_file(path: Path, scrambled: bool) -> Path:

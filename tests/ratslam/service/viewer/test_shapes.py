@@ -1,10 +1,9 @@
-"""Whisker curves, verdicts and the schedule of whole maps."""
+"""Whisker curves and verdicts."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ratslam.runs.runner import MapSchedule
 from ratslam.service.viewer_process import POINTS, VerdictLog, whisker_curves
 from tactile.whisker_geometry import HeadConfig, tip_points, ur10_head
 
@@ -48,14 +47,3 @@ def test_verdicts_are_told_once_and_an_accepted_one_that_falls_is_dropped():
         (1, 10, "dropped"),
     ]
     assert log.changes(np.zeros((0, 3), int)) == []
-
-
-def test_whole_maps_cost_a_small_multiple_of_the_last_one():
-    """If a report costs as much as the map has steps."""
-    for first in (0, 5000):
-        schedule = MapSchedule(first)
-        steps = range(first + 16, first + 20_000, 16)
-        due = [count for count in steps if schedule.is_due(count)]
-        assert due[0] == first + 16
-        assert len(due) > 20
-        assert sum(due) < 20 * steps[-1]
