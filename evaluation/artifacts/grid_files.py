@@ -1,11 +1,9 @@
-"""Files `grid.npz` (occupancy map) and `arena.npz` (its ground truth).
+"""Occupancy maps as files: `grid.npz` and its ground truth `arena.npz`; `map.yaml` with `map.pgm` for nav2.
 
-Occupancy maps for nav2: `map.yaml` and `map.pgm`, as its map_server reads them.
-
-For map_server (with `negate: 0`) bright pixels are free, the first row of the image has the largest y, and
-`origin` is the lower left corner. In mode `trinary` a cell is occupied above one threshold, free below the
-other and unknown between. Unknown cells are customarily 205, an occupancy of 0.196, so the usual free_thresh
-of 0.25 turns them into free ones.
+As nav2's map_server reads them (with `negate: 0`), bright pixels are free, the first row of the image has the
+largest y, and `origin` is the lower left corner. In mode `trinary` a cell is occupied above one threshold,
+free below the other and unknown between. Unknown cells are customarily 205, an occupancy of 0.196, so the
+usual free_thresh of 0.25 turns them into free ones.
 """
 
 from __future__ import annotations
@@ -88,7 +86,8 @@ def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
     image = f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].tobytes()
     write_atomically(folder / f"{name}.pgm", lambda path: path.write_bytes(image))
     file = yaml.safe_dump(f"{name}.pgm", width=1 << 30).splitlines()[0]
-    x, y, cell = (_number(value) for value in (*grid.origin, grid.cell))
+    # All digits without an exponent, since some YAML readers take 1e-05 as a string.
+    x, y, cell = (np.format_float_positional(float(value), trim="0") for value in (*grid.origin, grid.cell))
     write_text_atomically(
         folder / f"{name}.yaml",
         f"image: {file}\nmode: trinary\nresolution: {cell}\norigin: [{x}, {y}, 0.0]\n"
@@ -125,11 +124,6 @@ def read_nav2(path: str | Path) -> Nav2Map:
     else:
         raise InputError(f"{path}: mode", repr(mode), "trinary, scale or raw")
     return Nav2Map(cell.astype(int), place, resolution)
-
-
-def _number(value: float) -> str:
-    """All digits without an exponent, since some YAML readers take 1e-05 as a string."""
-    return np.format_float_positional(float(value), trim="0")
 
 
 def _value(path: Path, given: dict[str, Any], key: str) -> float:

@@ -92,9 +92,12 @@ def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface
 
     free = truth.inside & ~truth.occupied
     points, normals = _points(truth.segments)
-    faces = np.zeros(len(points), bool)
+    faces, (height, width) = np.zeros(len(points), bool), free.shape
     for step in (-_FAR, -_NEAR, _NEAR, _FAR):
-        faces |= _at(free, grid, points + step * grid.cell * normals)
+        beside = points + step * grid.cell * normals
+        column, row = np.floor((beside - grid.origin) / grid.cell).astype(int).T
+        known = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        faces[known] |= free[row[known], column[known]]
     points = points[faces]
     if len(points) == 0:
         return TouchableSurface(free, np.zeros_like(free), points)
@@ -129,12 +132,3 @@ def _points(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = (np.arange(len(row)) - first + 0.5) / count[row]
     normal = np.stack([-along[row, 1], along[row, 0]], axis=1) / length[row, None]
     return start[row] + share[:, None] * along[row], normal
-
-
-def _at(cells: np.ndarray, grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
-    """The value [K] of the cells [H, W] bool at points [K, 2]; False outside."""
-    column, row = np.floor((points - grid.origin) / grid.cell).astype(int).T
-    known = (row >= 0) & (row < cells.shape[0]) & (column >= 0) & (column < cells.shape[1])
-    found = np.zeros(len(points), bool)
-    found[known] = cells[row[known], column[known]]
-    return found

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts import closure_table
-from evaluation.artifacts.closure_table import read_closures
+from evaluation.artifacts.closure_table import CHANGES, read_changes, read_closures
 from evaluation.artifacts.grid_files import read_grid, read_grid_truth
 from evaluation.artifacts.recorded_views import read_whisker_views
 from evaluation.artifacts.run_reader import read_run, read_scorecard, read_walls
@@ -46,8 +45,8 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         images = read_whisker_views(directory / "views.npz")
         plots["whiskers"] = lambda: draw_whiskers(run, card, images, walls)
         plots["experiences"] = lambda: draw_experience_history(run, card)
-    if (directory / closure_table.NAME).exists():
-        changes = closure_table.read_changes(directory / closure_table.NAME)
+    if (directory / CHANGES).exists():
+        changes = read_changes(directory / CHANGES)
         plots["changes"] = lambda: draw_changes(card.name, run, changes, walls)
     if (directory / "grid.npz").exists():
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))

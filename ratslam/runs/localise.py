@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import NAME, ChangeRow, read_changes
+from evaluation.artifacts.closure_table import CHANGES, ChangeRow, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.estimates import Localisation
 from ratslam.grid.localiser import GridLocaliser
@@ -182,6 +182,6 @@ def localise(
         card = runner.finish(interrupted)
         made = runner.session.map
         assert isinstance(made, Localiser | GridLocaliser)
-        changes = read_changes(directory / NAME) if isinstance(made, Localiser) else []
+        changes = read_changes(directory / CHANGES) if isinstance(made, Localiser) else []
         summary = LocalisationSummary(made.states(), made.localisation().mass, changes)
     return card, summary, interrupted

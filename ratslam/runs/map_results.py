@@ -13,9 +13,15 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
-from evaluation.artifacts.run_reader import MERGED_MAP_NAME as MERGED
-from evaluation.artifacts.run_reader import NAME as PIECES
-from evaluation.artifacts.run_reader import has_steps, is_merged, read_run, read_session_steps, write_pieces
+from evaluation.artifacts.run_reader import MERGE_REPORT as MERGED
+from evaluation.artifacts.run_reader import (
+    PIECES,
+    has_steps,
+    is_merged,
+    read_run,
+    read_session_steps,
+    write_pieces,
+)
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -23,7 +29,7 @@ from evaluation.metrics.trajectory import read_tum, write_tum
 from evaluation.plots.map_plot import draw_sessions
 from evaluation.plots.run_plots import plot_writers
 from evaluation.report import PAGE_START
-from evaluation.report.page import PageRun, check_report_libraries, write_page
+from evaluation.report.page import check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
 from ratslam.runs.settings.changed_settings import ChangedSetting, changed_settings
@@ -49,7 +55,7 @@ def write_report(directories: Sequence[Path], path: Path) -> None:
     """
     check_report_libraries("report")
     require_new_file(path, replaces=PAGE_START)
-    runs = [PageRun(read_run_report(directory), _settings(directory)) for directory in directories]
+    runs = [(read_run_report(directory), _settings(directory)) for directory in directories]
     write_page(path, runs, read_citation())
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.artifacts.run_reader import read_pieces, read_run, write_pieces
 from evaluation.metrics.run_metrics import PIECES, arrange_pieces, ate_within_pieces
-from evaluation.metrics.scorecard import score_run, scorecard_lines
+from evaluation.metrics.scorecard import score_run
 from evaluation.metrics.trajectory import ate, write_tum
 from evaluation.plots.map_plot import align_layers, draw_changes, draw_map, map_headline
 from evaluation.report.verdict import describe_score
@@ -35,7 +35,7 @@ def parted(circle):
 def test_a_run_in_one_piece_is_scored_as_before(circle):
     one = circle._replace(piece=np.zeros(len(circle.time), int))
     assert score_run(one) == score_run(circle)
-    assert PIECES not in scorecard_lines(score_run(one))
+    assert PIECES not in score_run(one).lines()
     assert arrange_pieces(one) is one
 
 

@@ -95,12 +95,12 @@ def test_files_are_explained(tmp_path: Path) -> None:
     for name in ("steps.csv", "config.yaml", "<b>.txt", ".hidden"):
         (tmp_path / name).write_text("ab")
     found = list_run_files(tmp_path)
-    assert [(file.name, file.size) for file in found] == [
+    assert [(name, size) for name, size, _ in found] == [
         ("config.yaml", 2),
         ("steps.csv", 2),
         ("<b>.txt", 2),
     ]
-    assert found[-1].content == OTHER
+    assert found[-1][2] == OTHER
 
 
 def test_the_readme_and_the_page_explain_the_same_files() -> None:
