@@ -1,7 +1,5 @@
-"""Decoding of position from the activity of recorded cells, with the error of the decoded position.
-
-Drift of the packet: decoded pose minus true pose over time.
-"""
+"""Position decoded from the activity of recorded cells (Zhang et al. 1998), with its error; and the drift of
+the activity packet, its decoded pose minus the true pose over time (Burak & Fiete 2009)."""
 
 from __future__ import annotations
 

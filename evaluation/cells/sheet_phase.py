@@ -49,7 +49,7 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     """Rates [C, bins, bins] of the chosen cells over y, x of the torus, NaN where the rat was not, and
     seconds [bins, bins].
 
-    The true path is moved into the frame of the sheet (`drift.truth_in_sheet`) and folded, so the box may
+    The true path is moved into the frame of the sheet (`decoding.truth_in_sheet`) and folded, so the box may
     have any heading. Bin b is centred on b / bins of the side.
 
     Raises:
