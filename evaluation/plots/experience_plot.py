@@ -23,7 +23,13 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
     judged, reason = _judge(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
-    figure = style.new_figure(_HEIGHT, card.name, reason if judged is None else _line(judged))
+    line = reason
+    if judged is not None:
+        arr = f"ARR {judged.arr:.2f} ({judged.relocalisations} of {judged.entries} steps after it)"
+        arcr = f"ARCR {judged.arcr:.2f} ({judged.correct} of {judged.relocalisations} correct, strict mode)"
+        parts = (f"base set of {judged.base} steps", arr, arcr)
+        line = "  ·  ".join(part for part in parts if "nan" not in part)
+    figure = style.new_figure(_HEIGHT, card.name, line)
     inner = style.WIDTH - style.LEFT - style.RIGHT
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
@@ -63,10 +69,3 @@ def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[Experienc
         return experience_metric(run.experience[rows], run.truth[rows], config), ""
     except InputError as error:
         return None, f"no verdicts: {error.where} {error.found}"
-
-
-def _line(found: ExperienceMetric) -> str:
-    arr = f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)"
-    arcr = f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, strict mode)"
-    parts = (f"base set of {found.base} steps", arr, arcr)
-    return "  ·  ".join(part for part in parts if "nan" not in part)

@@ -1,11 +1,5 @@
-"""Plot of the map of a run with truth, odometry and walls.
-
-Plot of the places at which a localised session does not agree with its map.
-
-Plot of a map that was merged of several sessions.
-
-Plot of a way over the experiences of a map.
-"""
+"""Plots in the frame of a map: the map of a run with truth, odometry and walls; the places at which a
+localised session does not agree with its map; the sessions of a merged map; a way over its experiences."""
 
 from __future__ import annotations
 
@@ -76,7 +70,9 @@ def draw_map(
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
-    _paint_start(axes, layers)
+    truth = layers.truth
+    start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
+    axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
     style.add_legend(figure, axes)
     return figure
 
@@ -241,12 +237,6 @@ def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.insert(line, 1 + np.flatnonzero(step > _JUMP * usual), np.nan, axis=0)
 
 
-def _paint_start(axes: style.Axes, layers: Layers) -> None:
-    truth = layers.truth
-    start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
-    axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
-
-
 _MARGIN = 0.06  # m around all
 _KINDS = {
     "new": (VERMILLION, "something new"),
@@ -275,7 +265,15 @@ def draw_changes(
     seen = path if run.found.any() or len(ground) else np.zeros((1, 2))
     low, high = bounds(seen, ground[:, :2], places, wall_corners(shown, to_map))
     box = np.stack([low - _MARGIN, high + _MARGIN])
-    figure, axes = style.map_figure(box, name, _headline(run, changes), style.MAP)
+    line, found = "not found in the map: nothing compared", run.found.sum()
+    if changes:
+        verb, surest = "place has" if len(changes) == 1 else "places have", changes[0]
+        sure = f"surest: {surest.evidence:.0f} nat in {surest.passes} passes"
+        line = f"{len(changes)} {verb} changed  ·  {sure}"
+    elif found:
+        steps = f"{found:,} of {len(run.time):,} steps"
+        line = f"the session agrees with the map in the {steps} that were found"
+    figure, axes = style.map_figure(box, name, line, style.MAP)
     if len(shown):
         draw_walls(axes, shown, to_map)
     if len(ground):
@@ -303,18 +301,6 @@ def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, si
         axes.text(*at, str(number), color=color, fontsize=11, fontweight="bold", zorder=7)
 
 
-def _headline(run: RunArrays, changes: Sequence[ChangeRow]) -> str:
-    if not changes:
-        known = run.found.sum()
-        where = f"in the {known:,} of {len(run.time):,} steps that were found"
-        return (
-            f"the session agrees with the map {where}" if known else "not found in the map: nothing compared"
-        )
-    places = "place has" if len(changes) == 1 else "places have"
-    surest = changes[0]
-    return f"{len(changes)} {places} changed  ·  surest: {surest.evidence:.0f} nat in {surest.passes} passes"
-
-
 def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequence[int]) -> style.Figure:
     """Draws the paths of the sessions of a merged map, each in a colour of its own; pieces that nothing joins
     beside each other.
@@ -323,7 +309,14 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
         path: [T, 3] poses of all steps in the map, m, m, rad. piece: [T] the piece of each. steps: number of
             steps of each session, in the order of `path`.
     """
-    shown = _beside_each_other(path, piece)
+    # The pieces where pictures show them: beside each other.
+    count = len(path)
+    run = RunArrays(
+        time=np.arange(float(count)), truth=None, online=path, final=path, odometry=path,
+        experience=np.full(count, -1), created=np.zeros(0, int), nodes=np.zeros((0, 3)),
+        links=np.zeros((0, 2), int), piece=piece,
+    )  # fmt: skip
+    shown = arrange_pieces(run).final[:, :2]
     pieces, largest = len(np.unique(piece)), int(np.bincount(piece).argmax())
     joined = "joined" if pieces == 1 else f"{pieces} pieces"
     line = f"{len(steps)} sessions, {len(path)} steps  ·  {joined}"
@@ -342,17 +335,6 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
         axes.plot(*shown[end - count], "o", ms=8, mfc="none", mec=GREEN, mew=1.6, zorder=4, label=label)
     style.add_legend(figure, axes)
     return figure
-
-
-def _beside_each_other(path: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """[T, 2] positions with the pieces where pictures show them."""
-    none, count = np.zeros(0, int), len(path)
-    run = RunArrays(
-        time=np.arange(float(count)), truth=None, online=path, final=path, odometry=path,
-        experience=np.full(count, -1), created=none, nodes=np.zeros((0, 3)), links=np.zeros((0, 2), int),
-        piece=piece,
-    )  # fmt: skip
-    return arrange_pieces(run).final[:, :2]
 
 
 def draw_way(

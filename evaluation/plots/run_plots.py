@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,11 +65,10 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     Raises:
         InputError: a file is missing or malformed.
     """
-    return {f"{name}.png": partial(_save, draw) for name, draw in run_plots(directory).items()}
-
-
-def _save(draw: Callable[[], Figure], path: Path) -> None:
-    draw().savefig(path)
+    return {
+        f"{name}.png": lambda path, draw=draw: draw().savefig(path)  # type: ignore[misc]
+        for name, draw in run_plots(directory).items()
+    }
 
 
 def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:

@@ -44,7 +44,7 @@ from tactile.base.types import Cycle, Observation, Whisk
 from tactile.contact_stream import Touch
 from tactile.frontend import Frontend
 from tactile.rig_signals import HeadFit, SignalFit, SignalRecord, fit_head, fit_signals, head_with
-from tactile.wall_estimation.signal_map import fit_signal_map, predict_signal
+from tactile.wall_estimation.signal_map import fit_signal_map
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
 REST_SHARE = 0.05
@@ -385,7 +385,7 @@ def held_out_errors(record: StageCalibration) -> tuple[np.ndarray, np.ndarray]:
     for fold in _folds(len(record.signal)):
         known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
         for out, mean in (
-            (error, predict_signal(known, record.position[fold])),
+            (error, known.predict(record.position[fold])),
             (control, record.signal[~fold].mean(axis=0)),
         ):
             out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))

@@ -1,10 +1,8 @@
-"""Atomic file writes: a reader finds the old file or the complete new one, never a part of it.
+"""Files: written atomically, made new without replacing any, read from outside within bounds.
 
-New files and folders: checked before the work, made whole, and never in the place of what others made.
-
-Reading files from outside within bounds, with one line for whatever is wrong with them.
-
-Reading of .npz files, with errors that name the file.
+An atomic write leaves the old file or the complete new one, never a part of it. New files and folders are
+checked before the work, made whole, and never put in the place of what others made. Readers (text, JSON,
+YAML, CSV, .npz) bound the size of what they read, and tell in one line whatever is wrong with a file.
 """
 
 from __future__ import annotations
@@ -121,7 +119,11 @@ def require_new_file(path: Path, *, replaces: bytes = b"", parents: bool = False
         InputError: something is there already, be it a file, a folder, a link or a device; or its folder is
             missing or cannot be written in.
     """
-    if os.path.lexists(path) and not (replaces and _begins(path, replaces)):
+    replaceable = False
+    if replaces and path.is_file() and not path.is_symlink():
+        with path.open("rb") as file:
+            replaceable = re.match(replaces, file.read(_BEGINNING), re.DOTALL) is not None
+    if os.path.lexists(path) and not replaceable:
         dangles = path.is_symlink() and not path.exists()
         found = f"a link to {os.readlink(path)}, which does not exist" if dangles else "exists already"
         expected = "a new file, or one that this command made before" if replaces else "a new file"
@@ -155,14 +157,6 @@ def require_own_folder(path: Path, marks: Sequence[str]) -> None:
         if file.is_symlink() or not (file.is_file() or file.is_dir()):
             raise InputError(str(file), "a link or a device", "files of this command", CURE)
     require_writable(path / f"{marks[0]}.new")
-
-
-def _begins(path: Path, pattern: bytes) -> bool:
-    """Whether a path is a file of its own that begins with a pattern."""
-    if path.is_symlink() or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return re.match(pattern, file.read(_BEGINNING), re.DOTALL) is not None
 
 
 def require_writable(path: Path) -> None:
