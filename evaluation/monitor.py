@@ -72,6 +72,22 @@ class RunProgress(NamedTuple):
         count = len(self.path)
         return f"{count} steps" if self.total is None else f"{count} of {self.total} steps"
 
+    def status_line(self, pace: float | None) -> str:
+        """The state of a run in one line; `pace` is in steps per second."""
+        parts = [f"{self.name}: {self.status}", self.step_count, f"{path_length(self.odometry):.1f} m"]
+        parts += [] if pace is None else [f"{pace:.0f} steps/s"]
+        parts += [] if self.online_error is None else [f"error {self.online_error:.3g} m"]
+        parts += [
+            f"{count} {name}" for name, count in sorted(self.outcomes.items(), key=lambda item: -item[1])
+        ]
+        parts += [f"{self.lost} lost"] if self.lost else []
+        parts += [f"map_doubted ({self.doubt:.0%})"] if (self.doubt or 0.0) > DOUBTED else []
+        parts += [f"input warned ({len(self.warnings)})"] if self.warnings else []
+        parts += [f"checkpoint at {self.checkpoint}"] if self.checkpoint else []
+        if self.status == RUNNING and self.silence > SILENCE_SHOWN:
+            parts.append(f"silent for {self.silence:.0f} s")
+        return ", ".join(parts)
+
 
 class RunMonitor:
     """Reads a run directory repeatedly; each line is read once and no file stays open.
@@ -259,26 +275,11 @@ def watch_run(
             figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
             with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
                 write_atomically(file, figure.savefig)
-        report(status_line(seen, pace))
+        report(seen.status_line(pace))
         if once or seen.status != RUNNING or seen.silence > patience:
             return seen
         before, last = seen, began
         time.sleep(max(every, REST_FACTOR * (time.monotonic() - began)))
-
-
-def status_line(seen: RunProgress, pace: float | None) -> str:
-    """The state of a run in one line; `pace` is in steps per second."""
-    parts = [f"{seen.name}: {seen.status}", seen.step_count, f"{path_length(seen.odometry):.1f} m"]
-    parts += [] if pace is None else [f"{pace:.0f} steps/s"]
-    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
-    parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
-    parts += [f"{seen.lost} lost"] if seen.lost else []
-    parts += [f"map_doubted ({seen.doubt:.0%})"] if (seen.doubt or 0.0) > DOUBTED else []
-    parts += [f"input warned ({len(seen.warnings)})"] if seen.warnings else []
-    parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []
-    if seen.status == RUNNING and seen.silence > SILENCE_SHOWN:
-        parts.append(f"silent for {seen.silence:.0f} s")
-    return ", ".join(parts)
 
 
 def path_length(odometry: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid
 from tactile.base.errors import InputError, os_errors_of
 from tactile.base.files import read_npz, read_plain_yaml, write_atomically, write_text_atomically
 
@@ -29,7 +29,7 @@ def read_grid(path: str | Path) -> OccupancyGrid:
 
     def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
         grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
-        check_grid(grid)
+        grid.check()
         return grid
 
     expected = "an occupancy map: probability [H, W], origin [2] and cell"
@@ -79,7 +79,7 @@ class Nav2Map(NamedTuple):
 
 def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
     """Writes NAME.pgm (binary, 8 bits, dark is occupied) and NAME.yaml into a folder, each atomically."""
-    check_grid(grid)
+    grid.check()
     free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
     pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN)).astype(np.uint8)
     height, width = pixel.shape

@@ -24,9 +24,7 @@ from evaluation.metrics.occupancy_grid import (
     OccupancyGrid,
     TouchableSurface,
     cell_centres,
-    check_grid,
     touchable_surface,
-    truth_occupancy,
 )
 from evaluation.metrics.statistics import auc
 from tactile.base.settings import Settings
@@ -100,7 +98,7 @@ def grid_error(
     grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface, convention: Convention
 ) -> GridError:
     """The error of one map. `surface` is `occupancy_grid.touchable_surface(grid, truth)`."""
-    true = truth_occupancy(truth, surface.wall, convention.outside)
+    true = truth.occupancy(surface.wall, convention.outside)
     true = smooth_truth(true) if convention.smooth else true
     cells = truth.inside | surface.wall if convention.mask == "arena" else np.ones_like(truth.inside)
     if not cells.any():
@@ -272,7 +270,7 @@ def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> Grid
     Raises:
         ValueError: the map is invalid or not on the cells of the truth.
     """
-    check_grid(grid, truth)
+    grid.check(truth)
     surface = touchable_surface(grid, truth)
     findings = _cells(grid, surface) | _chamfer(grid, truth, surface)
     return GridScore(

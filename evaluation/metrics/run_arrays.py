@@ -72,6 +72,13 @@ class RunArrays(NamedTuple):
         numbers, steps = np.unique(self.piece[self.found], return_counts=True)
         return int(numbers[steps.argmax()]) if len(numbers) else -1
 
+    @property
+    def truth_rows(self) -> np.ndarray:
+        """The steps [K] with a true pose."""
+        if self.truth is None:
+            return np.zeros(0, int)
+        return np.flatnonzero(np.isfinite(self.truth).all(axis=1))
+
     def ranked_pieces(self) -> list[tuple[int, int]]:
         """Rank and number of each piece: `main` first, with rank 0, then by the number of their steps."""
         numbers, sizes = np.unique(self.piece, return_counts=True)
@@ -109,10 +116,3 @@ class RunArrays(NamedTuple):
             index = np.asarray(getattr(self, name))
             if index.size and not (low <= index.min() and index.max() < high):
                 raise InputError(f"run.{name}", f"{index.min()} to {index.max()}", f"{low} to {high - 1}")
-
-
-def truth_rows(run: RunArrays) -> np.ndarray:
-    """The steps [K] with a true pose."""
-    if run.truth is None:
-        return np.zeros(0, int)
-    return np.flatnonzero(np.isfinite(run.truth).all(axis=1))

@@ -22,7 +22,7 @@ from evaluation.metrics.energy_metric import (
 )
 from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import (
     align,
     ate,
@@ -83,7 +83,7 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
     if len(pieces) < 2:
         return run
     final, online, nodes = run.final.copy(), run.online.copy(), run.nodes.copy()
-    rows, to_map, shown = truth_rows(run), None, list[np.ndarray]()
+    rows, to_map, shown = run.truth_rows, None, list[np.ndarray]()
     for one in pieces:
         steps, placed = run.piece == one, of_node == one
         known, moved = rows[steps[rows]], np.zeros(3)
@@ -197,7 +197,7 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         relations: true relative motions of the recording, if any. gap: distance of the pairs of
             `energy_gap`, steps.
     """
-    rows, truth = truth_rows(run), run.truth
+    rows, truth = run.truth_rows, run.truth
     note = "map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else ""
     findings = {
         "steps": Finding(len(run.time)),

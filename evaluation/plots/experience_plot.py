@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.metrics.exm import ExperienceMetric, experience_metric
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION
@@ -19,7 +19,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
 
     Without truth or a return to the start there are no verdicts; then all steps look the same.
     """
-    rows = truth_rows(run) if len(truth_rows(run)) else np.arange(len(run.time))
+    rows = run.truth_rows if len(run.truth_rows) else np.arange(len(run.time))
     judged, reason = _judge(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
@@ -59,7 +59,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
 
 def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
     """The strict Experience Metric of the steps `rows`, or None and the reason."""
-    if run.truth is None or len(truth_rows(run)) == 0:
+    if run.truth is None or len(run.truth_rows) == 0:
         return None, "no ground truth: re-localisations cannot be judged"
     if (run.experience[rows] < 0).all():
         return None, "no experiences"

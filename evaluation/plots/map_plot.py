@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.artifacts.closure_table import ChangeRow
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
@@ -41,6 +41,20 @@ class Layers(NamedTuple):
     nodes: np.ndarray
     to_map: np.ndarray = IN_PLACE
 
+    @classmethod
+    def align(cls, run: RunArrays) -> Layers:
+        """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without
+        truth, odometry starts at the first pose of the map."""
+        rows = run.truth_rows
+        if run.truth is None or len(rows) == 0:
+            to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
+            return cls(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
+        true = run.truth[rows]
+        to_map = align(true, run.final[rows])
+        odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
+        truth = compose(to_map, run.truth)
+        return cls(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
+
 
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
@@ -62,7 +76,7 @@ def draw_map(
     of = f"piece {run.main + 1}, the largest" if run.has_pieces and not localised else style.MAP
     line = map_headline(card, f"found in {known:,} of {len(run.time):,} steps" if localised else "")
     run = arrange_pieces(run)
-    layers = align_layers(run)
+    layers = Layers.align(run)
     shown = walls if layers.truth is not None else NO_WALLS
     figure, axes = style.map_figure(_frame(layers, shown), card.name, line, of)
     if len(shown):
@@ -120,20 +134,6 @@ def wall_corners(walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> np.ndarray
     """The four corners [B, 4, 2] of each wall [B, 5], moved by `to_map` [3]."""
     corners = walls[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
     return _xy(compose(to_map, np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=-1)))
-
-
-def align_layers(run: RunArrays) -> Layers:
-    """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without truth,
-    odometry starts at the first pose of the map."""
-    rows = truth_rows(run)
-    if run.truth is None or len(rows) == 0:
-        to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
-        return Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
-    true = run.truth[rows]
-    to_map = align(true, run.final[rows])
-    odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
-    truth = compose(to_map, run.truth)
-    return Layers(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
 
 
 def _xy(pose: np.ndarray) -> np.ndarray:
@@ -255,7 +255,7 @@ def draw_changes(
             surest first. walls: [B, 5] west, south, east, north, height, m, as the session found them; drawn
             with truth, in whose frame they are.
     """
-    rows = truth_rows(run)[run.found[truth_rows(run)]]
+    rows = run.truth_rows[run.found[run.truth_rows]]
     known = run.truth is not None and len(rows) > 0
     to_map = align(run.truth[rows], run.final[rows]) if known and run.truth is not None else IN_PLACE
     path = np.where(run.found[:, None], run.final[:, :2], np.nan)

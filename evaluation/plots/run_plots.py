@@ -19,7 +19,7 @@ from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
-from evaluation.plots.map_plot import align_layers, draw_changes, draw_map
+from evaluation.plots.map_plot import Layers, draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.files import read_json
 from tactile.base.se2 import between
@@ -76,7 +76,7 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     grid = read_grid(directory / "grid.npz")
     if len(run.state):
         shown = arrange_pieces(run)
-        layers = align_layers(shown)
+        layers = Layers.align(shown)
         true = np.full((1, 2), np.nan) if layers.truth is None else layers.truth
         known = np.where(run.found[:, None], shown.final[:, :2], np.nan)
         line = f"found in {run.found.sum():,} of {len(run.time):,} steps"

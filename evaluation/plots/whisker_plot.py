@@ -6,7 +6,7 @@ import numpy as np
 
 from evaluation.artifacts.recorded_views import WhiskerViews
 from evaluation.metrics.exm import base_end
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, split_at_jumps, wall_corners
@@ -44,7 +44,7 @@ def draw_whiskers(
 
     if len(images.view) != len(run.time):
         raise InputError("views.npz", f"{len(images.view)} images", f"{len(run.time)}, one for each step")
-    rows = truth_rows(run)
+    rows = run.truth_rows
     pose = run.final if len(rows) == 0 or run.truth is None else run.truth
     steps = np.arange(len(pose)) if len(rows) == 0 else rows
     shown = walls if len(rows) else NO_WALLS

@@ -13,7 +13,6 @@ import numpy as np
 
 from evaluation.artifacts.closure_table import ACCEPTED
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from evaluation.metrics.run_arrays import truth_rows
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import position_errors
 from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
@@ -133,7 +132,7 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
     truth."""
     traces, alone = [], len(reports) == 1
     for number, report in enumerate(reports):
-        run, rows = report.run, truth_rows(report.run)
+        run, rows = report.run, report.run.truth_rows
         if run.truth is None or len(rows) == 0:
             continue
         time, start = run.time[rows] - run.time[0], run.time[0]

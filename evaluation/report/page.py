@@ -15,7 +15,7 @@ import yaml
 
 from evaluation.artifacts.manifest import RUNNING
 from evaluation.report.charts import GRID_SCALES, PALETTE, error_chart, overlay_chart, run_charts
-from evaluation.report.run_report import RunReport, closure_records, describe_status, view_records
+from evaluation.report.run_report import RunReport, closure_records, view_records
 from evaluation.report.verdict import describe_score
 from tactile.base.errors import InputError
 from tactile.base.files import write_atomically
@@ -145,7 +145,7 @@ def _run_context(
     return {
         "number": number,
         "name": report.name,
-        "status": describe_status(report),
+        "status": report.describe_status(),
         "unfinished": report.manifest.status == RUNNING,
         "backend": report.backend,
         "source": report.source,

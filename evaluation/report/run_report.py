@@ -26,7 +26,7 @@ from evaluation.metrics.run_arrays import UNFINISHED, RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum
-from evaluation.plots.map_plot import Layers, align_layers
+from evaluation.plots.map_plot import Layers
 from evaluation.report.run_files import list_run_files
 from evaluation.report.verdict import Verdict, judge_map
 from tactile.base.errors import InputError
@@ -86,6 +86,18 @@ class RunReport(NamedTuple):
     views: ClosureViews | None
     files: Sequence[tuple[str, int, str]]
 
+    def describe_status(self) -> str:
+        """How the run ended, in a few words."""
+        count, total, status = len(self.run.time), self.manifest.total, self.manifest.status
+        steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
+        if status == "complete":
+            return f"finished, {steps}"
+        if status == "interrupted":
+            return f"interrupted after {steps}"
+        if status == RUNNING:
+            return f"not finished: killed, or still running, after {steps}"
+        return f"ended as {status} after {steps}"
+
 
 def read_run_report(directory: Path) -> RunReport:
     """Reads a run directory, also that of an interrupted, killed or unfinished run; such a run is scored and
@@ -141,19 +153,6 @@ def read_run_report(directory: Path) -> RunReport:
     )
 
 
-def describe_status(report: RunReport) -> str:
-    """How the run ended, in a few words."""
-    count, total, status = len(report.run.time), report.manifest.total, report.manifest.status
-    steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
-    if status == "complete":
-        return f"finished, {steps}"
-    if status == "interrupted":
-        return f"interrupted after {steps}"
-    if status == RUNNING:
-        return f"not finished: killed, or still running, after {steps}"
-    return f"ended as {status} after {steps}"
-
-
 def _method(directory: Path) -> dict[str, str]:
     """Backend and kind of source by the configuration."""
     try:
@@ -170,14 +169,14 @@ def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, Occupa
     """Paths, true walls [S, 4] and grid in one frame: that of the map."""
     nothing = np.zeros((0, 4))
     if not (directory / "grid.npz").exists():
-        return align_layers(run), nothing, None
+        return Layers.align(run), nothing, None
     grid, lines, truth = read_grid(directory / "grid.npz"), nothing, None
     if (directory / "arena.npz").exists():
         arena, start = read_grid_truth(directory / "arena.npz")
         lines = arena.segments
         truth = None if run.truth is None else between(start, run.truth)
     if truth is None:
-        return align_layers(run), lines, grid
+        return Layers.align(run), lines, grid
     paths = (truth[:, :2], run.odometry[:, :2], run.final[:, :2], run.nodes[:, :2])
     return Layers(*paths), lines, grid
 

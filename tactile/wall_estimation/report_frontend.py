@@ -30,7 +30,6 @@ from tactile.wall_estimation.strain_templates import (
     filter_strain,
     fit_tip_model,
     match_template,
-    read_templates,
     strain_sample_rate,
 )
 from tactile.whisker_geometry import Degrees, PlanarWhiskers
@@ -106,7 +105,7 @@ class ReportFrontend:
 
     def __init__(self, config: ReportFrontendConfig, templates: StrainTemplates | None = None) -> None:
         if config.templates is not None and config.walls in ("template", "fused"):
-            templates = read_templates(config.templates)
+            templates = StrainTemplates.read(config.templates)
         if config.walls == "template" and templates is None:
             expected, cure = "`templates`: a file of strain templates", f"{TRAIN_HINT}, or use `geometric`"
             raise InputError("walls", "`template` without strain templates", expected, cure)

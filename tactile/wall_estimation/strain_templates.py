@@ -112,6 +112,31 @@ class StrainTemplates(NamedTuple):
     mean: np.ndarray
     spread: np.ndarray
 
+    def write(self, path: Path | str) -> None:
+        """Writes the templates to an .npz file."""
+        with open(path, "wb") as file:
+            arrays = self._asdict() | {"training": np.array(self.training.model_dump_json())}
+            np.savez_compressed(file, strain_templates=np.int64(FILE_VERSION), **arrays)
+
+    @classmethod
+    def read(cls, path: Path | str) -> StrainTemplates:
+        """Reads a file of `write`.
+
+        Raises:
+            InputError: the file is missing, cannot be read or holds something else.
+        """
+
+        def parse(version: np.ndarray, settings: np.ndarray, *arrays: np.ndarray) -> StrainTemplates:
+            training, (angle, mean, spread) = TemplateTraining.model_validate_json(str(settings)), arrays
+            whole = int(version) == FILE_VERSION and angle.shape == training.angles.shape
+            whole &= mean.shape[:2] + mean.shape[3:] == (len(angle), training.samples, 2)
+            if not whole or spread.shape != (training.samples, 2) or not np.isfinite(mean).all():
+                raise ValueError("another version or incomplete")
+            return cls(training, angle, mean, spread)
+
+        names = ("strain_templates", *cls._fields)
+        return read_npz(path, names, parse, f"strain templates of version {FILE_VERSION}", TRAIN_HINT)
+
 
 class TemplateMatch(NamedTuple):
     """Result of template matching.
@@ -206,32 +231,6 @@ def match_template(
         refined += float(step * (below - above) / (2 * bend)) if bend > 0 else 0.0
     power = float((read**2).sum(axis=(1, 2)).mean())
     return TemplateMatch(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
-
-
-def write_templates(templates: StrainTemplates, path: Path | str) -> None:
-    """Writes templates to an .npz file."""
-    with open(path, "wb") as file:
-        arrays = templates._asdict() | {"training": np.array(templates.training.model_dump_json())}
-        np.savez_compressed(file, strain_templates=np.int64(FILE_VERSION), **arrays)
-
-
-def read_templates(path: Path | str) -> StrainTemplates:
-    """Reads a file of `write_templates`.
-
-    Raises:
-        InputError: the file is missing, cannot be read or holds something else.
-    """
-
-    def parse(version: np.ndarray, settings: np.ndarray, *arrays: np.ndarray) -> StrainTemplates:
-        training, (angle, mean, spread) = TemplateTraining.model_validate_json(str(settings)), arrays
-        whole = int(version) == FILE_VERSION and angle.shape == training.angles.shape
-        whole &= mean.shape[:2] + mean.shape[3:] == (len(angle), training.samples, 2)
-        if not whole or spread.shape != (training.samples, 2) or not np.isfinite(mean).all():
-            raise ValueError("another version or incomplete")
-        return StrainTemplates(training, angle, mean, spread)
-
-    names = ("strain_templates", *StrainTemplates._fields)
-    return read_npz(path, names, parse, f"strain templates of version {FILE_VERSION}", TRAIN_HINT)
 
 
 def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
