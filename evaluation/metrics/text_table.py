@@ -35,28 +35,6 @@ def read_text_table(path: str | Path, columns: Columns) -> tuple[np.ndarray, np.
     fields = _cells(lines[0][1])
     header = _numbers(fields) is None
     names = [name.lower() for name in fields] if header else list(columns)
-    where = _places(f"{path}:{lines[0][0]}", names, columns)
-    rows, at = [], []
-    for number, line in lines[header:]:
-        cells = _cells(line)
-        row = _numbers(cells)
-        if row is not None and len(row) == len(names) and all(abs(value) <= LARGEST for value in row):
-            rows.append([row[place] for place in where])
-            at.append(number)
-        elif number < len(every):  # the line ends with a newline
-            found = f"'{' '.join(cells)[:LONGEST]}'"
-            raise InputError(f"{path}:{number}", found, f"{len(names)} finite numbers: {' '.join(names)}")
-    if not rows:
-        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
-    return np.array(rows), np.array(at)
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
-
-
-def _places(where: str, names: list[str], columns: Columns) -> list[int]:
-    """Index of each column in the header."""
     found = [
         [names.index(name) for name in (column, *others) if name in names]
         for column, others in columns.items()
@@ -64,8 +42,25 @@ def _places(where: str, names: list[str], columns: Columns) -> list[int]:
     missing = [column for column, at in zip(columns, found, strict=True) if not at]
     if missing:
         known = "; ".join("/".join((column, *columns[column])) for column in missing)
-        raise InputError(where, f"no column {', '.join(missing)} among {' '.join(names)}", known)
-    return [at[0] for at in found]
+        lack = f"no column {', '.join(missing)} among {' '.join(names)}"
+        raise InputError(f"{path}:{lines[0][0]}", lack, known)
+    rows, at = [], []
+    for number, line in lines[header:]:
+        cells = _cells(line)
+        row = _numbers(cells)
+        if row is not None and len(row) == len(names) and all(abs(value) <= LARGEST for value in row):
+            rows.append([row[places[0]] for places in found])
+            at.append(number)
+        elif number < len(every):  # the line ends with a newline
+            shown = f"'{' '.join(cells)[:LONGEST]}'"
+            raise InputError(f"{path}:{number}", shown, f"{len(names)} finite numbers: {' '.join(names)}")
+    if not rows:
+        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
+    return np.array(rows), np.array(at)
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def _numbers(cells: list[str]) -> list[float] | None:

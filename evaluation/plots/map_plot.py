@@ -78,13 +78,20 @@ def draw_map(
     run = arrange_pieces(run)
     layers = Layers.align(run)
     shown = walls if layers.truth is not None else NO_WALLS
-    figure, axes = style.map_figure(_frame(layers, shown), card.name, line, of)
+    # The box around truth, walls and map, and around odometry near them.
+    truth = layers.truth
+    points = [layers.final, layers.nodes] + ([] if truth is None else [truth])
+    low, high = bounds(*points, wall_corners(shown, layers.to_map))
+    if len(shown) == 0:
+        room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
+        low = np.minimum(low, np.maximum(far_low, low - room))
+        high = np.maximum(high, np.minimum(far_high, high + room))
+    figure, axes = style.map_figure(style.frame(np.stack([low, high])), card.name, line, of)
     if len(shown):
         draw_walls(axes, shown, layers.to_map)
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
-    truth = layers.truth
     start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
     axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
     style.add_legend(figure, axes)
@@ -138,18 +145,6 @@ def wall_corners(walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> np.ndarray
 
 def _xy(pose: np.ndarray) -> np.ndarray:
     return np.asarray(pose)[..., :2]
-
-
-def _frame(layers: Layers, walls: np.ndarray) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] (m) around truth, walls, map and odometry near them."""
-    truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(walls, layers.to_map), *truth)
-    if len(walls) == 0:
-        room = _ROOM * (high - low).max()
-        far_low, far_high = bounds(layers.odometry)
-        low = np.minimum(low, np.maximum(far_low, low - room))
-        high = np.maximum(high, np.minimum(far_high, high + room))
-    return style.frame(np.stack([low, high]))
 
 
 def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:

@@ -63,10 +63,11 @@ def _map_chart(report: RunReport) -> Any:
     from plotly import graph_objects
 
     layers, traces = report.layers, []
+    corners = wall_corners(report.walls, layers.to_map)
     if report.grid is not None:
         traces.append(_grid_trace(report.grid))
     if len(report.walls):
-        x, y = _columns(_gapped(wall_corners(report.walls, layers.to_map)))
+        x, y = _columns(_gapped(corners))
         wall = graph_objects.Scatter(x=x, y=y, fill="toself", mode="lines", line_width=0)
         traces.append(wall.update(name="wall", meta="wall", hoverinfo="skip"))
     if len(report.truth_lines):
@@ -82,7 +83,13 @@ def _map_chart(report: RunReport) -> Any:
     run = report.run
     main = f"piece {run.main + 1}," if run.has_pieces and not len(run.state) else "the map,"
     traces = [*traces, *_place_traces(report), *_closure_traces(report)]
-    figure = _map_figure(traces, _frame(report), main)
+    # The frame around the map, and around odometry near it.
+    points = [layers.final, layers.nodes] + ([] if layers.truth is None else [layers.truth])
+    low, high = bounds(*points, corners, report.truth_lines.reshape(-1, 2))
+    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
+    low = np.minimum(low, np.maximum(far_low, low - room))
+    high = np.maximum(high, np.minimum(far_high, high + room))
+    figure = _map_figure(traces, _around(low, high), main)
     # The links, and of each verdict the lines between the two places, in the order of its marks.
     links = layers.nodes[run.links]
     shapes = [_line_shape(links, "link", "solid", "experience")] if len(links) else []
@@ -234,17 +241,6 @@ def _map_figure(traces: list[Any], frame: np.ndarray, of: str = "the map,") -> A
     figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
     figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
     return figure
-
-
-def _frame(report: RunReport) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] (m) around the map, and around odometry near it."""
-    layers, lines = report.layers, report.truth_lines.reshape(-1, 2)
-    truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(report.walls, layers.to_map), lines, *truth)
-    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
-    low = np.minimum(low, np.maximum(far_low, low - room))
-    high = np.maximum(high, np.minimum(far_high, high + room))
-    return _around(low, high)
 
 
 def _around(low: np.ndarray, high: np.ndarray) -> np.ndarray:

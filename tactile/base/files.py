@@ -183,7 +183,14 @@ def make_new_file(path: Path, write: Callable[[Path], Any]) -> None:
     try:
         with errors_of(path, temporary):
             write(temporary)
-            _put_file(temporary, path)
+            try:
+                os.link(temporary, path)
+            except FileExistsError:
+                raise _appeared(path) from None
+            except OSError:  # a file system without hard links
+                if os.path.lexists(path):
+                    raise _appeared(path) from None
+                os.rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -203,31 +210,16 @@ def new_folder(path: Path) -> Iterator[Path]:
         with errors_of(path, folder):
             yield folder
             folder.chmod(0o755)
-            _put_folder(folder, path)
+            if os.path.lexists(path):
+                raise _appeared(path)
+            try:
+                os.rename(folder, path)
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                    raise _appeared(path) from None
+                raise
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _put_file(temporary: Path, path: Path) -> None:
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise _appeared(path) from None
-    except OSError:  # a file system without hard links
-        if os.path.lexists(path):
-            raise _appeared(path) from None
-        os.rename(temporary, path)
-
-
-def _put_folder(folder: Path, path: Path) -> None:
-    if os.path.lexists(path):
-        raise _appeared(path)
-    try:
-        os.rename(folder, path)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-            raise _appeared(path) from None
-        raise
 
 
 def _appeared(path: Path) -> InputError:
@@ -399,17 +391,16 @@ def read_arrays(archive: zipfile.ZipFile, members: Sequence[str], where: str) ->
     """
     infos = [archive.getinfo(member) for member in members]
     check_size(where, sum(info.file_size for info in infos), archive.start_dir)
-    return [_array(archive, info) for info in infos]
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = io.BytesIO(archive.read(info))
-    version = np.lib.format.read_magic(content)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(content)
-    # Compared as Python's integers, because NumPy's may overflow.
-    left = info.file_size - content.tell()
-    if not dtype.hasobject and (min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != left):
-        raise ValueError(f"{info.filename} is not a plain array")
-    content.seek(0)
-    return np.lib.format.read_array(content, allow_pickle=False)
+    arrays = []
+    for info in infos:
+        content = io.BytesIO(archive.read(info))
+        version, form = np.lib.format.read_magic(content), np.lib.format
+        read = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+        shape, _, dtype = read(content)
+        # Compared as Python's integers, because NumPy's may overflow.
+        left = info.file_size - content.tell()
+        if not dtype.hasobject and (min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != left):
+            raise ValueError(f"{info.filename} is not a plain array")
+        content.seek(0)
+        arrays.append(form.read_array(content, allow_pickle=False))
+    return arrays

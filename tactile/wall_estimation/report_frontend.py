@@ -180,7 +180,13 @@ class ReportFrontend:
             return Wall()
         first, before, strain = slow
         travel = compose(before, np.array(report.odometry[:3], np.float64))
-        strain = (*strain, self._check_strain(report))
+        rate = strain_sample_rate(report)
+        if self.templates is not None and rate:
+            usual = self.templates.training.rate
+            if abs(rate - usual) > RATE_TOLERANCE * usual:
+                found, cure = f"{rate:.5g} samples per second", "train templates at this rate"
+                raise InputError("strain", found, f"{usual:g}, as in the templates", cure)
+        strain = (*strain, np.asarray(report.strain, np.float64))
         if report.moment == StepEnd.FREE:
             self._slow = first, travel, strain
             return Wall()
@@ -189,16 +195,6 @@ class ReportFrontend:
         raw = np.where(alive[:, None], raw, 0.0)
         filtered = filter_strain(self.templates.training, raw) if self.templates else raw
         return self._wall(WallContact(first, contact, travel, StepEnd(report.moment), filtered, alive))
-
-    def _check_strain(self, report: Report) -> np.ndarray:
-        """The strain [T, W, 2] of a step, checked against the sample rate of the templates."""
-        rate = strain_sample_rate(report)
-        if self.templates is not None and rate:
-            usual = self.templates.training.rate
-            if abs(rate - usual) > RATE_TOLERANCE * usual:
-                found, cure = f"{rate:.5g} samples per second", "train templates at this rate"
-                raise InputError("strain", found, f"{usual:g}, as in the templates", cure)
-        return np.asarray(report.strain, np.float64)
 
     def _wall(self, meeting: WallContact) -> Wall:
         """The wall of a contact, by the configured estimator."""
