@@ -1,9 +1,7 @@
-"""Live progress of a run in another process: an image and a status line.
+"""Live progress of a run in another process: an image and a status line (command `watch`).
 
 It only reads the run directory, so it does not slow the run (Fox et al. 2012, II-D: monitors are separate
 processes).
-
-Progress of a run in another process, read from its run directory.
 """
 
 from __future__ import annotations
@@ -68,10 +66,27 @@ class RunProgress(NamedTuple):
     doubt: float | None = None
     warnings: tuple[str, ...] = ()
 
+    @property
+    def step_count(self) -> str:
+        """Number of steps as text."""
+        count = len(self.path)
+        return f"{count} steps" if self.total is None else f"{count} of {self.total} steps"
 
-def step_count(seen: RunProgress) -> str:
-    """Number of steps as text."""
-    return f"{len(seen.path)} steps" if seen.total is None else f"{len(seen.path)} of {seen.total} steps"
+    def status_line(self, pace: float | None) -> str:
+        """The state of a run in one line; `pace` is in steps per second."""
+        parts = [f"{self.name}: {self.status}", self.step_count, f"{path_length(self.odometry):.1f} m"]
+        parts += [] if pace is None else [f"{pace:.0f} steps/s"]
+        parts += [] if self.online_error is None else [f"error {self.online_error:.3g} m"]
+        parts += [
+            f"{count} {name}" for name, count in sorted(self.outcomes.items(), key=lambda item: -item[1])
+        ]
+        parts += [f"{self.lost} lost"] if self.lost else []
+        parts += [f"map_doubted ({self.doubt:.0%})"] if (self.doubt or 0.0) > DOUBTED else []
+        parts += [f"input warned ({len(self.warnings)})"] if self.warnings else []
+        parts += [f"checkpoint at {self.checkpoint}"] if self.checkpoint else []
+        if self.status == RUNNING and self.silence > SILENCE_SHOWN:
+            parts.append(f"silent for {self.silence:.0f} s")
+        return ", ".join(parts)
 
 
 class RunMonitor:
@@ -107,8 +122,11 @@ class RunMonitor:
         self._read()
         count = min(len(self._rows), len(self._reckoned))  # the lines of a chunk are written file by file
         rows = self._rows.first(count)
-        self._count(count)
+        self._counted.update(self._outcomes[self._counted.total() : count])  # those not counted yet
         began, last = self._date("config.yaml"), self._date("steps.csv")
+        checkpoint = checkpoint_steps(self.directory)
+        with os_errors_of(self.directory, "cannot be read", "the directory of a run"):
+            files = [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
         return RunProgress(
             name=self.directory.resolve().name,
             status=KILLED if manifest.killed and manifest.status == RUNNING else manifest.status,
@@ -122,9 +140,9 @@ class RunMonitor:
             online_error=self._online_error,
             doubt=self._doubt,
             warnings=manifest.warnings,
-            checkpoint=checkpoint_steps(self.directory),
+            checkpoint=checkpoint,
             rate=count / (last - began) if 0 < began < last else None,
-            silence=max(0.0, time.time() - self._date(*self._files())),
+            silence=max(0.0, time.time() - self._date(*files)),
         )
 
     def _read(self) -> None:
@@ -155,15 +173,6 @@ class RunMonitor:
         for where, line in self._errors.read_new():
             if not line.startswith("t,"):
                 self._online_error = _numbers(where, line.split(","), 2)[1]
-
-    def _count(self, count: int) -> None:
-        """Counts the outcomes of the first steps that are not counted yet."""
-        self._counted.update(self._outcomes[self._counted.total() : count])
-
-    def _files(self) -> list[str]:
-        """All files except the monitor's own."""
-        with os_errors_of(self.directory, "cannot be read", "the directory of a run"):
-            return [path.name for path in self.directory.iterdir() if not path.name.endswith(WATCH_IMAGE)]
 
     def _date(self, *names: str) -> float:
         """Time of the last write to these files, s; 0 without any."""
@@ -266,26 +275,11 @@ def watch_run(
             figure, file = draw_watch(seen, read_walls(directory)), directory / WATCH_IMAGE
             with os_errors_of(file, "cannot be written", "a run directory that can be written to"):
                 write_atomically(file, figure.savefig)
-        report(status_line(seen, pace))
+        report(seen.status_line(pace))
         if once or seen.status != RUNNING or seen.silence > patience:
             return seen
         before, last = seen, began
         time.sleep(max(every, REST_FACTOR * (time.monotonic() - began)))
-
-
-def status_line(seen: RunProgress, pace: float | None) -> str:
-    """The state of a run in one line; `pace` is in steps per second."""
-    parts = [f"{seen.name}: {seen.status}", step_count(seen), f"{path_length(seen.odometry):.1f} m"]
-    parts += [] if pace is None else [f"{pace:.0f} steps/s"]
-    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
-    parts += [f"{count} {name}" for name, count in sorted(seen.outcomes.items(), key=lambda item: -item[1])]
-    parts += [f"{seen.lost} lost"] if seen.lost else []
-    parts += [f"map_doubted ({seen.doubt:.0%})"] if (seen.doubt or 0.0) > DOUBTED else []
-    parts += [f"input warned ({len(seen.warnings)})"] if seen.warnings else []
-    parts += [f"checkpoint at {seen.checkpoint}"] if seen.checkpoint else []
-    if seen.status == RUNNING and seen.silence > SILENCE_SHOWN:
-        parts.append(f"silent for {seen.silence:.0f} s")
-    return ", ".join(parts)
 
 
 def path_length(odometry: np.ndarray) -> float:
@@ -307,7 +301,12 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     Args:
         walls: [B, 5] west, south, east, north, height in m; drawn with truth.
     """
-    figure = style.new_figure(_HEIGHT, seen.name, _line(seen))
+    parts = [seen.status, seen.step_count]
+    if len(seen.path):
+        x, y, turn = seen.sd
+        parts.append(f"last pose ± {x:.2g} m, {y:.2g} m, {np.degrees(turn):.2g} degrees")
+    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
+    figure = style.new_figure(_HEIGHT, seen.name, "  ·  ".join(parts))
     inner = WIDTH - style.LEFT - style.RIGHT - _COUNTS
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     axes.set_aspect("equal", adjustable="datalim")
@@ -321,15 +320,6 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     return figure
 
 
-def _line(seen: RunProgress) -> str:
-    parts = [seen.status, step_count(seen)]
-    if len(seen.path):
-        x, y, turn = seen.sd
-        parts.append(f"last pose ± {x:.2g} m, {y:.2g} m, {np.degrees(turn):.2g} degrees")
-    parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
-    return "  ·  ".join(parts)
-
-
 def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:
     """Draws the layers in the order of the legend."""
     known = np.isfinite(seen.truth).all(axis=1)
@@ -341,23 +331,19 @@ def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:
             draw_walls(axes, walls)
         axes.plot(*split_at_jumps(truth, truth).T, color=YELLOW, lw=3.5, zorder=2, label="truth")
     axes.plot(*split_at_jumps(path[rows, :2], truth).T, color=BLUE, lw=0.9, zorder=4, label="online path")
-    _paint_now(axes, seen, to_truth)
+    # The current pose: an ellipse of two standard deviations, and a triangle that points ahead.
+    around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.sd[:2]
+    ellipse = compose(to_truth, np.column_stack([seen.path[-1, :2] + around, np.zeros(len(_ROUND))]))
+    label, (x, y, heading) = "current pose, 2 standard deviations", compose(to_truth, seen.path[-1])
+    axes.plot(*ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label=label)
+    ahead = (3, 0, float(np.degrees(heading)) - 90.0)
+    axes.plot(x, y, color=VERMILLION, ls="", marker=ahead, ms=11, mec="white", mew=0.8, zorder=7)
     axes.margins(0.08)
     axes.apply_aspect()
     axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim(), adjustable="box")  # odometry may leave the plot
     reckoned = compose(compose(path[0], between(seen.odometry[0], np.zeros(3))), seen.odometry[rows])
     dashed = (0, (5, 3))
     axes.plot(*reckoned[:, :2].T, color=GREY, lw=0.8, ls=dashed, zorder=1, label="odometry")
-
-
-def _paint_now(axes: style.Axes, seen: RunProgress, to_truth: np.ndarray) -> None:
-    x, y, heading = compose(to_truth, seen.path[-1])
-    around = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) * 2 * seen.sd[:2]
-    ellipse = compose(to_truth, np.column_stack([seen.path[-1, :2] + around, np.zeros(len(_ROUND))]))
-    label = "current pose, 2 standard deviations"
-    axes.plot(*ellipse[:, :2].T, color=VERMILLION, lw=1.2, zorder=6, label=label)
-    ahead = (3, 0, float(np.degrees(heading)) - 90.0)
-    axes.plot(x, y, color=VERMILLION, ls="", marker=ahead, ms=11, mec="white", mew=0.8, zorder=7)
 
 
 def _paint_counts(figure: style.Figure, seen: RunProgress, left: float) -> None:

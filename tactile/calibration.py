@@ -1,25 +1,14 @@
-"""Calibration of a whisker head from a record of free whisking (whiskers touch nothing).
+"""Calibration of whiskers: noise and drift of their channels, contact thresholds, baselines that drift.
 
-The record gives mean and standard deviation of each deflection; the contact threshold is a multiple of the
-standard deviation (20 in Salman & Pearson 2016, III-E).
+From a record of free whisking (whiskers touch nothing) follow mean and standard deviation of each deflection;
+the contact threshold is a multiple of the standard deviation (20 in Salman & Pearson 2016, III-E). A whisker
+that touched something in it would be silenced, because its contact counts as noise; it is named with its
+reason, and refused or repaired.
 
-Noise and drift of sensor channels, from a record that may hold contacts.
-
-Two figures of a record mislead. The standard deviation of the whole record counts a contact and a drift as
-noise. The standard deviation of neighbouring samples' differences counts only a part of coloured noise: of
-first-order autoregressive noise with coefficient c it gives sqrt(1 - c) of the standard deviation (0.74 at
-c = 0.45, as measured on magnetic whiskers). Here the differences are between samples far enough apart to be
-independent, and they are taken in short windows, of which only the quiet ones count.
-
-Baseline and noise of whiskers from a record in which they should touch nothing, and the whiskers that did.
-
-A free record with a contact in it silences its whisker: the contact counts as noise, and nothing later stands
-out of it. Such a whisker is named with a reason, and refused or repaired.
-
-The baseline of whisking whiskers, followed from cycle to cycle.
-
-At the beginning of a cycle a whisker is at rest, before its protraction touches anything. These samples show
-how far the baseline has drifted since the calibration.
+Two figures of a record mislead. Its standard deviation counts a contact and a drift as noise. That of the
+differences of neighbouring samples counts only sqrt(1 - c) of first-order autoregressive noise with
+coefficient c (0.74 at c = 0.45, as measured on magnetic whiskers). So noise is taken from differences between
+samples that are far enough apart to be independent, in short windows of which only the quiet ones count.
 """
 
 from __future__ import annotations
@@ -171,7 +160,7 @@ class FreeBaseline(NamedTuple):
     dirty: tuple[DirtyWhisker, ...]
 
 
-def find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) -> list[DirtyWhisker]:
+def _find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) -> list[DirtyWhisker]:
     """Whiskers whose record holds more than noise, or more noise than the others'.
 
     Whisking itself deflects whiskers, so the ratio of standard deviation to noise is compared with that of
@@ -179,7 +168,7 @@ def find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) -> 
 
     Args:
         sd: [W, K] standard deviations of the whole record. noise: [W, K] of its quiet windows
-            (`signal_noise`); whiskers without a signal have 0 and are left out.
+            (`estimate_noise`); whiskers without a signal have 0 and are left out.
     """
     live = (noise > 0).all(axis=1)
     if not live.any():
@@ -209,15 +198,15 @@ def calibrate_free(config: DirtyRecordConfig, record: np.ndarray, where: str = "
             has no clean stretch.
     """
     noise, mean = estimate_noise(record), record.mean(axis=0)
-    dirty = find_dirty_whiskers(record.std(axis=0), noise, config.max_ratio)
+    dirty = _find_dirty_whiskers(record.std(axis=0), noise, config.max_ratio)
     if dirty and config.on_dirty == "refuse":
-        raise dirty_error(where, dirty, "record again with nothing within reach, or set on_dirty: repair")
+        raise _dirty_error(where, dirty, "record again with nothing within reach, or set on_dirty: repair")
     usual = np.median(noise, axis=0)
     for whisker, reason in dirty:
         rows = clean_stretch(record[:, whisker], config.max_ratio * usual)
         if rows is None:
             hopeless = [DirtyWhisker(whisker, f"{reason}, and it has no clean stretch")]
-            raise dirty_error(where, hopeless, "record again with nothing within reach")
+            raise _dirty_error(where, hopeless, "record again with nothing within reach")
         mean[whisker] = record[rows, whisker].mean(axis=0)
         noise[whisker] = estimate_noise(record[rows, whisker])
     return FreeBaseline(mean, noise, tuple(dirty))
@@ -243,7 +232,7 @@ def clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
     return slice(run.start * (WINDOW // 2), (run.stop - 1) * (WINDOW // 2) + WINDOW + LAG)
 
 
-def dirty_error(where: str, dirty: list[DirtyWhisker], cure: str) -> InputError:
+def _dirty_error(where: str, dirty: list[DirtyWhisker], cure: str) -> InputError:
     """The error that names each dirty whisker with its reason."""
     found = "; ".join(f"contacts of whisker {whisker}: {reason}" for whisker, reason in dirty)
     return InputError(where, found, "free whiskers", cure)
@@ -286,6 +275,33 @@ class Calibration(NamedTuple):
     alive: np.ndarray
     rate: float
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The fields as arrays by name, for storage with a session; `from_arrays` reads them."""
+        return {name: np.asarray(value) for name, value in self._asdict().items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """The calibration as a JSON object; infinite values are strings."""
+        return {name: _plain(array.tolist()) for name, array in self.arrays().items()}
+
+    @classmethod
+    def from_arrays(cls, stored: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
+        """The inverse of `arrays`.
+
+        Raises:
+            InputError: an array is missing or has the wrong shape.
+        """
+        lacking = [name for name in cls._fields if name not in stored]
+        if lacking:
+            raise InputError(where, f"{', '.join(lacking)} missing", "all arrays of a calibration")
+        whiskers = len(np.atleast_1d(stored["alive"]))
+        shapes: dict[str, tuple[int, ...]] = {name: (whiskers, 2) for name in ("mean", "sd", "threshold")}
+        shapes |= {"free": (whiskers,), "alive": (whiskers,), "rate": ()}
+        for name, shape in shapes.items():
+            if np.shape(stored[name]) != shape:
+                raise InputError(f"{where}.{name}", f"shape {np.shape(stored[name])}", str(shape))
+        values = {name: np.asarray(stored[name], float) for name in cls._fields[:4]}
+        return cls(**values, alive=np.asarray(stored["alive"], bool), rate=float(stored["rate"]))
+
 
 def calibrate(
     config: CalibrationConfig, record: Sequence[Cycle], slope_window: float = 0.01, where: str = "calibration"
@@ -303,7 +319,12 @@ def calibrate(
             limits; a whisker has contacts that are to be refused, or in half of the cycles; or no whisker is
             alive.
     """
-    rate = _rate(config, record, slope_window, where)
+    if not record:
+        raise InputError(where, "an empty record", f"at least {config.min_duration:g} s of free whisking")
+    rates = [sample_rate(cycle.time, slope_window, where) for cycle in record]
+    duration = sum(len(cycle.time) / rate for cycle, rate in zip(record, rates, strict=True))
+    if duration < config.min_duration - 1e-6:
+        raise InputError(where, f"{duration:.2g} s", f"at least {config.min_duration:g} s of free whisking")
     angle = np.concatenate([cycle.angle for cycle in record])
     deflection = np.concatenate([cycle.deflection for cycle in record])
     missing = ~(np.isfinite(angle).all(axis=0) & np.isfinite(deflection).all(axis=(0, 2)))
@@ -315,7 +336,11 @@ def calibrate(
     if not alive.any():
         cure = "whisk while recording; a simulated head needs sensor noise above 0 (`mechanics.noise`)"
         raise InputError(where, "no whisker has a signal", "at least one live whisker", cure)
-    if (bad := _is_saturated(config, deflection) & alive).any():
+    # A clipped channel is often at one of its extremes.
+    high, low = (deflection == end for end in (deflection.max(axis=0), deflection.min(axis=0)))
+    at_end = np.maximum(high.mean(axis=0), low.mean(axis=0))
+    clipped = (at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)
+    if (bad := clipped.any(axis=1) & alive).any():
         found = f"deflections of {_list_whiskers(bad)} are constant or at their limits"
         raise InputError(where, found, "unclipped samples", "check the sensors or list the whiskers as dead")
 
@@ -323,7 +348,7 @@ def calibrate(
     dirty = _find_touched(config, deflection, alive)
     if dirty and config.on_dirty == "refuse":
         cure = "record again with nothing within reach, or set on_dirty: repair"
-        raise dirty_error(where, dirty, cure)
+        raise _dirty_error(where, dirty, cure)
     for whisker, reason in dirty:
         mean[whisker], sd[whisker] = _repair(config, record, whisker, reason, where)
     return Calibration(
@@ -332,7 +357,7 @@ def calibrate(
         threshold=np.where(alive[:, None], config.threshold_sds * sd, np.inf),
         free=np.where(alive, np.mean([cycle.angle.max(axis=0) for cycle in record], axis=0), 0.0),
         alive=alive,
-        rate=rate,
+        rate=float(np.median(rates)),
     )
 
 
@@ -341,7 +366,7 @@ def _find_touched(config: CalibrationConfig, deflection: np.ndarray, alive: np.n
     outside = _outliers(config, deflection, deflection).mean(axis=0).max(axis=1)
     sd, noise = deflection.std(axis=0), np.where(alive[:, None], estimate_noise(deflection), 0.0)
     louder = (sd / np.maximum(np.median(sd[alive], axis=0), 1e-300)).max(axis=1)
-    found = {whisker: reason for whisker, reason in find_dirty_whiskers(sd, noise, config.max_ratio)}
+    found = {whisker: reason for whisker, reason in _find_dirty_whiskers(sd, noise, config.max_ratio)}
     for whisker in np.flatnonzero(alive & (louder > config.max_sd_ratio)).tolist():
         found[whisker] = f"its standard deviation is {louder[whisker]:.2g} times the median whisker's"
     for whisker in np.flatnonzero(alive & (outside > config.max_outlier_share)).tolist():
@@ -371,7 +396,7 @@ def _repair(
     ]
     if 2 * len(clean) <= len(parts):
         found = [DirtyWhisker(whisker, f"{reason}, and most of its cycles are alike")]
-        raise dirty_error(where, found, "record again with nothing within reach")
+        raise _dirty_error(where, found, "record again with nothing within reach")
     return np.concatenate(clean).mean(axis=0), np.concatenate(clean).std(axis=0)
 
 
@@ -395,56 +420,10 @@ def sample_rate(time: np.ndarray, slope_window: float, where: str) -> float:
     return 1 / usual
 
 
-def calibration_arrays(calibration: Calibration) -> dict[str, np.ndarray]:
-    """The fields as arrays by name, for storage with a session; `calibration_from_arrays` reads them."""
-    return {name: np.asarray(value) for name, value in calibration._asdict().items()}
-
-
-def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """The calibration as a JSON object; infinite values are strings."""
-    return {name: _plain(array.tolist()) for name, array in calibration_arrays(calibration).items()}
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return [_plain(part) for part in value]
     return value if isinstance(value, bool) or np.isfinite(value) else str(value)
-
-
-def calibration_from_arrays(stored: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
-    """The inverse of `calibration_arrays`.
-
-    Raises:
-        InputError: an array is missing or has the wrong shape.
-    """
-    lacking = [name for name in Calibration._fields if name not in stored]
-    if lacking:
-        raise InputError(where, f"{', '.join(lacking)} missing", "all arrays of a calibration")
-    whiskers = len(np.atleast_1d(stored["alive"]))
-    shapes: dict[str, tuple[int, ...]] = {name: (whiskers, 2) for name in ("mean", "sd", "threshold")}
-    shapes |= {"free": (whiskers,), "alive": (whiskers,), "rate": ()}
-    for name, shape in shapes.items():
-        if np.shape(stored[name]) != shape:
-            raise InputError(f"{where}.{name}", f"shape {np.shape(stored[name])}", str(shape))
-    values = {name: np.asarray(stored[name], float) for name in Calibration._fields[:4]}
-    return Calibration(**values, alive=np.asarray(stored["alive"], bool), rate=float(stored["rate"]))
-
-
-def _rate(config: CalibrationConfig, record: Sequence[Cycle], slope_window: float, where: str) -> float:
-    if not record:
-        raise InputError(where, "an empty record", f"at least {config.min_duration:g} s of free whisking")
-    rates = [sample_rate(cycle.time, slope_window, where) for cycle in record]
-    duration = sum(len(cycle.time) / rate for cycle, rate in zip(record, rates, strict=True))
-    if duration < config.min_duration - 1e-6:
-        raise InputError(where, f"{duration:.2g} s", f"at least {config.min_duration:g} s of free whisking")
-    return float(np.median(rates))
-
-
-def _is_saturated(config: CalibrationConfig, deflection: np.ndarray) -> np.ndarray:
-    """[W] bool, whether a whisker has a clipped channel, which is often at one of its extremes."""
-    high, low = (deflection == end for end in (deflection.max(axis=0), deflection.min(axis=0)))
-    at_end = np.maximum(high.mean(axis=0), low.mean(axis=0))
-    return ((at_end > 0.05) | (np.abs(deflection) >= config.full_scale).any(axis=0)).any(axis=1)
 
 
 def _list_whiskers(which: np.ndarray) -> str:
@@ -479,10 +458,14 @@ class RestBaseline(NamedTuple):
     offset: np.ndarray
     away: np.ndarray
 
+    @classmethod
+    def start(cls, whiskers: int) -> RestBaseline:
+        """Baselines as calibrated."""
+        return cls(np.zeros((whiskers, 2)), np.zeros(whiskers, int))
 
-def start_baseline(whiskers: int) -> RestBaseline:
-    """Baselines as calibrated."""
-    return RestBaseline(np.zeros((whiskers, 2)), np.zeros(whiskers, int))
+    def bent(self, config: RestBaselineConfig) -> np.ndarray:
+        """[W] bool, whiskers that stayed away from their baselines."""
+        return self.away >= config.bent_cycles
 
 
 def follow_baseline(
@@ -490,7 +473,8 @@ def follow_baseline(
 ) -> RestBaseline:
     """The baselines after the rest at the beginning of a cycle; whiskers with NaN samples keep theirs.
 
-    A cycle without samples changes nothing.
+    At the beginning of a cycle a whisker is at rest, before its protraction touches anything, so these
+    samples show how far the baseline has drifted. A cycle without samples changes nothing.
     """
     count = round(config.rest_time * calibration.rate)
     if not len(cycle.time) or not count:
@@ -503,8 +487,3 @@ def follow_baseline(
         offset=baseline.offset + np.where(free[:, None], config.gain * rest, 0.0),
         away=np.where(known, np.where(free, 0, baseline.away + 1), baseline.away),
     )
-
-
-def bent_whiskers(config: RestBaselineConfig, baseline: RestBaseline) -> np.ndarray:
-    """[W] bool, whiskers that stayed away from their baselines."""
-    return baseline.away >= config.bent_cycles

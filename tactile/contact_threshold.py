@@ -99,7 +99,11 @@ def detect_contacts(
     beyond = (level > config.contact_sds * sd) & (np.arange(len(level))[:, None] <= last)
     # At rest the deflection is within its noise, which is steep too.
     steep = (slope > config.onset_sds * sd / config.rise_time) & (level > sd)
-    contact, onset = beyond.any(axis=0), _onset(beyond, steep, config.rise_time * rate)
+    # A contact began at the first steep row at most `rise_time` before it is detected, or at the row of
+    # detection if the deflection rises slowly.
+    row, detected = np.arange(len(beyond))[:, None], np.argmax(beyond, axis=0)
+    steep = steep & (row <= detected) & (row >= detected - config.rise_time * rate)
+    contact, onset = beyond.any(axis=0), np.where(steep.any(axis=0), np.argmax(steep, axis=0), detected)
     held, column = contact & beyond[last], np.arange(len(alive))
     reach = _reach(config.shaft, angle[window - 1 :], deflection[window - 1 :, :, 1], level, onset, last)
     return Whisk(
@@ -111,17 +115,6 @@ def detect_contacts(
         highest=np.where(alive, np.where(held, smooth[last], smooth.max(axis=0)), 0.0),
         reach=np.where(contact, reach, 0.0),
     )
-
-
-def _onset(beyond: np.ndarray, steep: np.ndarray, rise: float) -> np.ndarray:
-    """[W] the row at which each contact began.
-
-    That is the first steep row at most `rise` rows before the contact is detected, or the row of detection
-    if the deflection rises slowly.
-    """
-    row, detected = np.arange(len(beyond))[:, None], np.argmax(beyond, axis=0)
-    steep = steep & (row <= detected) & (row >= detected - rise)
-    return np.where(steep.any(axis=0), np.argmax(steep, axis=0), detected)
 
 
 def _line(value: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:

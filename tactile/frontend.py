@@ -8,14 +8,7 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Observation, Report, Whisk
-from tactile.calibration import (
-    Calibration,
-    RestBaseline,
-    RestBaselineConfig,
-    bent_whiskers,
-    follow_baseline,
-    start_baseline,
-)
+from tactile.calibration import Calibration, RestBaseline, RestBaselineConfig, follow_baseline
 from tactile.contact_threshold import ContactConfig, detect_contacts
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 from tactile.whisker_geometry import HeadConfig, ur10_head
@@ -56,7 +49,7 @@ class Frontend:
         self.head = ur10_head(config.head)
         self.view_shape = view_shape(config.image, self.head)
         self.whiskers = len(self.head.length)
-        self.baseline = start_baseline(self.whiskers)
+        self.baseline = RestBaseline.start(self.whiskers)
 
     def features(self, reading: Cycle | Whisk) -> Whisk:
         """The contact features of a reading; whiskers configured as dead or found bent are not alive.
@@ -80,7 +73,7 @@ class Frontend:
         self.baseline = follow_baseline(config, calibration, self.baseline, cycle)
         here = calibration._replace(
             mean=calibration.mean + self.baseline.offset,
-            alive=calibration.alive & ~bent_whiskers(config, self.baseline),
+            alive=calibration.alive & ~self.baseline.bent(config),
         )
         return detect_contacts(self.config.contact, here, cycle)
 

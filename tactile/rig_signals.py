@@ -1,12 +1,11 @@
-"""Rest angle and base radii of a whisker head, from whisks at known poses among known walls.
+"""A whisker head measured from its record: geometry, and noise, drift, baseline and faults of each channel.
 
-Each contact says that the whisker met a wall at a protraction. A head of another rest angle or radius would
-have met it at another one: the geometry is that whose predicted protractions are the measured ones, by robust
-least squares. A tip on top of a wall tells the rest angle, a shaft against a wall's edge the radius too.
-Lengths and heights of the bases are taken as they are, because they trade against the rest angle; and so does
-the delay of the detection, which is part of the rest angle found.
-
-Noise, drift, baseline and faults of each channel of each whisker, from a record with free whiskers.
+The geometry (rest angle, base radii) comes from whisks at known poses among known walls. Each contact says
+that the whisker met a wall at a protraction; a head of another rest angle or radius would have met it at
+another one. The geometry is that whose predicted protractions are the measured ones, by robust least squares.
+A tip on top of a wall tells the rest angle, a shaft against a wall's edge the radius too. Lengths and heights
+of the bases are taken as they are, because they trade against the rest angle; and so does the delay of the
+detection, which is part of the rest angle found.
 """
 
 from __future__ import annotations
@@ -101,8 +100,13 @@ def fit_head(assumed: HeadConfig, contact: np.ndarray, angle: np.ndarray, predic
         )  # fmt: skip
         values = found.x
     plain = least_squares(errors, values, diff_step=STEP, max_nfev=1)  # the derivatives without the loss
-    spread = tuple(float(robust_sd(errors(at))) for at in (values, before))
-    return _summarise(values, _uncertainties(plain.jac, errors(values), scale), len(row), spread)
+    after, assumed_error = (float(robust_sd(errors(at))) for at in (values, before))
+    sd = _uncertainties(plain.jac, errors(values), scale)
+    radii = tuple(  # a radius that is not known to its own size is unknown
+        (float(value), float(one)) if one < value else None
+        for value, one in zip(values[1:], sd[1:], strict=True)
+    )
+    return HeadFit((float(values[0]), float(sd[0])), radii, len(row), (after, assumed_error))
 
 
 def head_with(assumed: HeadConfig, values: np.ndarray) -> HeadConfig:
@@ -112,15 +116,6 @@ def head_with(assumed: HeadConfig, values: np.ndarray) -> HeadConfig:
         for ring, radius in zip(assumed.rings, values[1:], strict=True)
     )
     return assumed.model_copy(update={"rest_deg": float(values[0]), "rings": rings})
-
-
-def _summarise(values: np.ndarray, sd: np.ndarray, contacts: int, error: tuple[float, ...]) -> HeadFit:
-    """The fit; a radius that is not known to its own size is unknown."""
-    radii = tuple(
-        (float(value), float(one)) if one < value else None
-        for value, one in zip(values[1:], sd[1:], strict=True)
-    )
-    return HeadFit((float(values[0]), float(sd[0])), radii, contacts, (error[0], error[1]))
 
 
 def _uncertainties(slope: np.ndarray, error: np.ndarray, scale: float) -> np.ndarray:

@@ -1,9 +1,8 @@
 """Geometry of whisker arrays: mounts, rest directions, swing planes and forward kinematics.
 
 A whisker turns in a plane: at angle 0 it points along `rest`; a protraction turns it towards `swing`.
-Coordinates are those of base_link, with z = 0 on the floor.
-
-Whiskers as straight lines in the plane of the floor, as grid maps use them.
+Coordinates are those of base_link, with z = 0 on the floor. Grid maps use whiskers as straight lines in the
+plane of the floor (`PlanarWhiskers`).
 """
 
 from __future__ import annotations

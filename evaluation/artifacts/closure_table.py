@@ -1,6 +1,7 @@
-"""File `closures.csv`: all loop closures that a map considered, with their evidence and verdicts.
+"""Two tables of a run directory.
 
-File `changes.csv`: places at which a localised session does not agree with the map.
+`closures.csv`: all loop closures that a map considered, with their evidence and verdicts.
+`changes.csv`: places at which a session localised in a map does not agree with it.
 """
 
 from __future__ import annotations
@@ -50,17 +51,20 @@ def read_closure_table(directory: Path) -> ClosureTable:
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
     expected = "the columns step, match_step, verdict, and numbers in all others"
-    rows = read_rows(file, expected, _parse)
+    rows = read_rows(
+        file,
+        expected,
+        lambda row: (
+            [int(np.int32(row[name])) for name in ("match_step", "step")],
+            str(row["verdict"]),
+            {name: float(row[name]) for name in row if name not in KEYS},
+        ),
+    )
     names = list(rows[0][2]) if rows else []
     steps, verdicts, evidence = zip(*rows, strict=True) if rows else ((), (), ())
     columns = np.array([list(cells.values()) for cells in evidence], float).reshape(len(rows), len(names)).T
     counted = np.array(steps, int).reshape(-1, 2) - first_step(directory)
     return ClosureTable(counted, list(verdicts), dict(zip(names, columns, strict=True)))
-
-
-def _parse(row: Mapping[str, str]) -> tuple[list[int], str, dict[str, float]]:
-    steps = [int(np.int32(row[name])) for name in ("match_step", "step")]
-    return steps, str(row["verdict"]), {name: float(row[name]) for name in row if name not in KEYS}
 
 
 def read_closures(directory: Path) -> np.ndarray:
@@ -100,12 +104,10 @@ def count_closures(path: Path) -> Closures | None:
     )
 
 
-NAME = "changes.csv"
+CHANGES = "changes.csv"
 COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
 """m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the
 session that contradict."""
-
-NUMBERS = ("x", "y", "extent", "evidence", "alarms")
 
 
 class ChangeRow(NamedTuple):
@@ -120,6 +122,17 @@ class ChangeRow(NamedTuple):
     passes: int
     first_step: int
     last_step: int
+
+    @classmethod
+    def parse(cls, line: Mapping[str, str]) -> ChangeRow:
+        """The place of a line of the file; a ValueError for a line that is malformed."""
+        x, y, extent, evidence, alarms = (
+            float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")
+        )
+        if not np.isfinite([x, y, extent, evidence, alarms]).all():
+            raise ValueError("a number that is not finite")
+        passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
+        return cls(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)
 
     def describe(self) -> str:
         """The place in one line."""
@@ -145,12 +158,4 @@ def read_changes(path: Path) -> list[ChangeRow]:
     Raises:
         InputError: a line is malformed.
     """
-    return read_rows(path, f"the columns {', '.join(COLUMNS)}", _parse_of_change_table)
-
-
-def _parse_of_change_table(line: Mapping[str, str]) -> ChangeRow:
-    x, y, extent, evidence, alarms = (float(line[name]) for name in NUMBERS)
-    if not np.isfinite([x, y, extent, evidence, alarms]).all():
-        raise ValueError("a number that is not finite")
-    passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
-    return ChangeRow(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)
+    return read_rows(path, f"the columns {', '.join(COLUMNS)}", ChangeRow.parse)

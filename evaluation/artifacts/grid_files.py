@@ -1,11 +1,9 @@
-"""Files `grid.npz` (occupancy map) and `arena.npz` (its ground truth).
+"""Occupancy maps as files: `grid.npz` and its ground truth `arena.npz`; `map.yaml` with `map.pgm` for nav2.
 
-Occupancy maps for nav2: `map.yaml` and `map.pgm`, as its map_server reads them.
-
-For map_server (with `negate: 0`) bright pixels are free, the first row of the image has the largest y, and
-`origin` is the lower left corner. In mode `trinary` a cell is occupied above one threshold, free below the
-other and unknown between. Unknown cells are customarily 205, an occupancy of 0.196, so the usual free_thresh
-of 0.25 turns them into free ones.
+As nav2's map_server reads them (with `negate: 0`), bright pixels are free, the first row of the image has the
+largest y, and `origin` is the lower left corner. In mode `trinary` a cell is occupied above one threshold,
+free below the other and unknown between. Unknown cells are customarily 205, an occupancy of 0.196, so the
+usual free_thresh of 0.25 turns them into free ones.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, check_grid
+from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid
 from tactile.base.errors import InputError, os_errors_of
 from tactile.base.files import read_npz, read_plain_yaml, write_atomically, write_text_atomically
 
@@ -31,7 +29,7 @@ def read_grid(path: str | Path) -> OccupancyGrid:
 
     def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
         grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
-        check_grid(grid)
+        grid.check()
         return grid
 
     expected = "an occupancy map: probability [H, W], origin [2] and cell"
@@ -81,14 +79,15 @@ class Nav2Map(NamedTuple):
 
 def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
     """Writes NAME.pgm (binary, 8 bits, dark is occupied) and NAME.yaml into a folder, each atomically."""
-    check_grid(grid)
+    grid.check()
     free, occupied = grid.probability < FREE_THRESH, grid.probability > OCCUPIED_THRESH
     pixel = np.where(occupied, _BLACK, np.where(free, _WHITE, _UNKNOWN)).astype(np.uint8)
     height, width = pixel.shape
     image = f"P5\n{width} {height}\n255\n".encode() + pixel[::-1].tobytes()
     write_atomically(folder / f"{name}.pgm", lambda path: path.write_bytes(image))
     file = yaml.safe_dump(f"{name}.pgm", width=1 << 30).splitlines()[0]
-    x, y, cell = (_number(value) for value in (*grid.origin, grid.cell))
+    # All digits without an exponent, since some YAML readers take 1e-05 as a string.
+    x, y, cell = (np.format_float_positional(float(value), trim="0") for value in (*grid.origin, grid.cell))
     write_text_atomically(
         folder / f"{name}.yaml",
         f"image: {file}\nmode: trinary\nresolution: {cell}\norigin: [{x}, {y}, 0.0]\n"
@@ -125,11 +124,6 @@ def read_nav2(path: str | Path) -> Nav2Map:
     else:
         raise InputError(f"{path}: mode", repr(mode), "trinary, scale or raw")
     return Nav2Map(cell.astype(int), place, resolution)
-
-
-def _number(value: float) -> str:
-    """All digits without an exponent, since some YAML readers take 1e-05 as a string."""
-    return np.format_float_positional(float(value), trim="0")
 
 
 def _value(path: Path, given: dict[str, Any], key: str) -> float:

@@ -1,6 +1,7 @@
-"""File `closure_views.npz`: the views of all steps that a loop closure joins, as 8-bit images.
+"""Views as files of a run directory.
 
-File `views.npz`: the whisker images of a session, for plots.
+`closure_views.npz`: the views of all steps that a loop closure joins, as 8-bit images.
+`views.npz`: the whisker images of a session, for plots.
 """
 
 from __future__ import annotations

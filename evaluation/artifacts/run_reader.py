@@ -1,8 +1,7 @@
-"""Reads a run directory, also the incomplete one of an interrupted run.
+"""Reads a run directory as arrays, also the incomplete one of an interrupted run.
 
-pieces.csv: the piece of the map in which each step is; only of a map of several pieces.
-
-merge.json: the report of a merged folder, which holds a map of several sessions and is no run.
+`pieces.csv` gives the piece of the map in which each step is; only a map of several pieces has it. A folder
+with `merge.json` holds a map merged of several sessions and is no run.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from evaluation.metrics.trajectory import read_tum
 from tactile.base.errors import InputError
 from tactile.base.files import read_json, read_npz, read_text
 
-COLUMNS = ("t", "piece")
-NAME = "pieces.csv"
+PIECES = "pieces.csv"
+PIECE_COLUMNS = ("t", "piece")
 
 
 def write_pieces(path: Path, time: np.ndarray, piece: np.ndarray) -> None:
     """Writes the piece [N] of steps at times [N], s."""
     lines = [f"{t!r},{one}" for t, one in zip(time.tolist(), piece.tolist(), strict=True)]
-    Path(path).write_text("\n".join([",".join(COLUMNS), *lines]) + "\n", encoding="utf-8")
+    Path(path).write_text("\n".join([",".join(PIECE_COLUMNS), *lines]) + "\n", encoding="utf-8")
 
 
 def read_pieces(path: Path, steps: int) -> np.ndarray:
@@ -39,7 +38,7 @@ def read_pieces(path: Path, steps: int) -> np.ndarray:
     """
     if not path.exists():
         return np.zeros(steps, int)
-    piece = read_text_table(path, dict.fromkeys(COLUMNS, ())).values[:, 1]
+    piece = read_text_table(path, dict.fromkeys(PIECE_COLUMNS, ()))[0][:, 1]
     if len(piece) < steps:
         raise InputError(str(path), f"{len(piece)} lines", f"{steps}, one for each step")
     if not ((piece >= 0) & (piece < 2**31) & (piece == np.round(piece))).all():
@@ -47,18 +46,18 @@ def read_pieces(path: Path, steps: int) -> np.ndarray:
     return piece[:steps].astype(int)
 
 
-MERGED_MAP_NAME = "merge.json"
+MERGE_REPORT = "merge.json"
 
 
 def is_merged(folder: Path) -> bool:
     """Whether a folder holds a merged map."""
-    return (folder / MERGED_MAP_NAME).exists()
+    return (folder / MERGE_REPORT).exists()
 
 
-def refuse_merged(folder: Path) -> None:
+def _refuse_merged(folder: Path) -> None:
     """Raises `InputError` if a folder holds a merged map, which has no steps of a run."""
     if is_merged(folder):
-        cure = f"{folder}/map.png shows it, {NAME} says what joined it, and `map info` what is in it"
+        cure = f"{folder}/map.png shows it, {MERGE_REPORT} says what joined it, and `map info` what is in it"
         raise InputError(str(folder), "a merged map, which has no steps", "the directory of a run", cure)
 
 
@@ -68,9 +67,9 @@ def read_session_steps(folder: Path) -> list[int]:
     Raises:
         InputError: merge.json is missing or malformed.
     """
-    expected = f"the {NAME} of a merged map"
+    expected = f"the {MERGE_REPORT} of a merged map"
     return read_json(
-        folder / MERGED_MAP_NAME, expected, lambda content: [int(count) for count in content["steps"]]
+        folder / MERGE_REPORT, expected, lambda content: [int(count) for count in content["steps"]]
     )
 
 
@@ -82,7 +81,7 @@ def check_run_directory(path: Path) -> None:
     """
     if not path.is_dir():
         raise InputError(str(path), "no such folder", "the directory of a run")
-    refuse_merged(path)
+    _refuse_merged(path)
     if not any((path / name).exists() for name in ("manifest.json", "steps.csv")):
         raise InputError(str(path), "no run in this folder", "the directory of a run")
 
@@ -93,7 +92,7 @@ def read_run(path: Path) -> RunArrays:
     Raises:
         InputError: a file is missing or malformed, or it is a merged map.
     """
-    refuse_merged(path)
+    _refuse_merged(path)
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
     place = read_column(path / "steps.csv", "place").astype(int)
@@ -107,9 +106,24 @@ def read_run(path: Path) -> RunArrays:
     true[known] = truth[row[known]]
     final = _tum(path / "trajectory.tum")[1] if (path / "trajectory.tum").exists() else online
     errors = path / "online_error.csv"
-    nodes, links, node_piece = _map(path / "map.json")
+    nodes, links, node_piece = np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0, int)
+    if (path / "map.json").exists():
+        nodes, links, node_piece = read_json(path / "map.json", "the map.json of a run directory", _graph)
     place = np.where(place[:steps] < len(nodes), place[:steps], -1)
-    doubt, unjudged = _doubt(path)
+    created = np.full(len(nodes), -1)  # the first step at each node
+    visited, step = np.unique(place, return_index=True)
+    created[visited[visited >= 0]] = step[visited >= 0]
+    doubt, unjudged = np.nan, NOT_JUDGED if (path / "trajectory.tum").exists() else UNFINISHED
+    if (path / "health.json").exists():
+        doubt, unjudged = read_json(
+            path / "health.json",
+            "the health.json of a run directory",
+            lambda content: (
+                (np.nan, str(content["reason"]))
+                if content["worse_than_odometry"] is None
+                else (float(content["worse_than_odometry"]), "")
+            ),
+        )
     run = RunArrays(
         time=time,
         truth=true if known.any() else None,
@@ -117,41 +131,33 @@ def read_run(path: Path) -> RunArrays:
         final=final[:steps],
         odometry=odometry[:steps],
         experience=place,
-        created=first_visits(place, len(nodes)),
+        created=created,
         nodes=nodes,
         links=links,
         online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
         doubt=doubt,
         unjudged=unjudged,
         warnings=read_manifest(path).warnings,
-        piece=read_pieces(path / NAME, steps),
+        piece=read_pieces(path / PIECES, steps),
         node_piece=node_piece,
         state=_states(path / "localisation.csv", steps),
     )
-    return run._replace(node_piece=_localised_nodes(run)) if len(run.state) else run
+    found = np.flatnonzero(run.found)
+    if not len(run.state):
+        return run
+    # The map is older than a localised session, so its pieces have numbers of their own, below 0. That of the
+    # experience nearest to where the session was last found is the piece of the session.
+    in_map = -1 - run.node_piece
+    if len(found) and len(nodes):
+        nearest = np.hypot(*(nodes - run.final[found[-1]])[:, :2].T).argmin()
+        in_map = np.where(in_map == in_map[nearest], run.main, in_map)
+    return run._replace(node_piece=in_map)
 
 
 def has_steps(path: Path) -> bool:
     """Whether a run directory has a step."""
     online = path / "online.tum"
     return online.exists() and online.stat().st_size > 0
-
-
-def first_visits(place: np.ndarray, nodes: int) -> np.ndarray:
-    """[nodes] the first step at each node by the node of each step [T]; -1 without one."""
-    first = np.full(nodes, -1)
-    known, step = np.unique(place, return_index=True)
-    first[known[known >= 0]] = step[known >= 0]
-    return first
-
-
-def _localised_nodes(run: RunArrays) -> np.ndarray:
-    """[M] the piece of the session in which each experience of its map is; below 0: in none."""
-    in_map, found = -1 - run.node_piece, np.flatnonzero(run.found)
-    if not len(found) or not len(run.nodes):
-        return in_map
-    nearest = np.hypot(*(run.nodes - run.final[found[-1]])[:, :2].T).argmin()
-    return np.where(in_map == in_map[nearest], run.main, in_map)
 
 
 def read_scorecard(path: Path) -> Scorecard:
@@ -183,7 +189,7 @@ def read_walls(path: Path) -> np.ndarray:
     file = path / "walls.csv"
     if not file.exists():
         return np.zeros((0, len(WALL_COLUMNS)))
-    return read_text_table(file, dict.fromkeys(WALL_COLUMNS, ())).values
+    return read_text_table(file, dict.fromkeys(WALL_COLUMNS, ()))[0]
 
 
 def first_step(path: Path) -> int:
@@ -236,19 +242,6 @@ def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return time, pose
 
 
-def _doubt(folder: Path) -> tuple[float, str]:
-    """Probability that the map of a run is worse than odometry; or NaN, and why there is none."""
-    path = folder / "health.json"
-    if not path.exists():
-        return np.nan, NOT_JUDGED if (folder / "trajectory.tum").exists() else UNFINISHED
-    return read_json(path, "the health.json of a run directory", _health)
-
-
-def _health(content: Any) -> tuple[float, str]:
-    doubt = content["worse_than_odometry"]
-    return (np.nan, str(content["reason"])) if doubt is None else (float(doubt), "")
-
-
 def _states(path: Path, steps: int) -> np.ndarray:
     """[N] the state of each step of a localised session; empty without the file."""
     if not path.exists():
@@ -260,14 +253,8 @@ def _states(path: Path, steps: int) -> np.ndarray:
     return np.array(states, str)
 
 
-def _map(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes [M, 3], links [L, 2] and pieces [M] of a node-link file; empty without the file."""
-    if not path.exists():
-        return np.zeros((0, 3)), np.zeros((0, 2), int), np.zeros(0, int)
-    return read_json(path, "the map.json of a run directory", _graph)
-
-
 def _graph(content: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes [M, 3], links [L, 2] and pieces [M] of a node-link file."""
     rows = [[node["x"], node["y"], node["heading"]] for node in content["nodes"]]
     piece = np.array([node.get("piece", 0) for node in content["nodes"]], int)
     pairs = [[link["source"], link["target"]] for link in content.get("edges", content.get("links"))]

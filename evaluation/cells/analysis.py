@@ -15,14 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from evaluation.cells.fields import (
-    FieldSettings,
-    bin_area,
-    border_score,
-    count_by_cell,
-    find_fields,
-    largest_by_cell,
-)
+from evaluation.cells.fields import FieldSettings, border_score, find_fields
 from evaluation.cells.head_direction import (
     mean_vector_length,
     peak_rate,
@@ -106,7 +99,7 @@ def analyse_cells(recording: CellRecording, settings: AnalysisSettings | None = 
     sums = bin_activity(
         recording.time, recording.truth, recording.activity, *edges, settings.maps.heading_bins
     )
-    return score_sums(sums, recording.cell, recording, settings)
+    return _score_sums(sums, recording.cell, recording, settings)
 
 
 def analyse_all_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
@@ -118,10 +111,10 @@ def analyse_all_cells(recording: CellRecording, settings: AnalysisSettings | Non
     cells = math.prod(recording.shape)
     if recording.sums is None or len(recording.sums.place) != cells:
         raise InputError("recording.sums", "not of all cells", f"sums of {cells} cells", "record the sums")
-    return score_sums(recording.sums, np.arange(cells), recording, settings or AnalysisSettings())
+    return _score_sums(recording.sums, np.arange(cells), recording, settings or AnalysisSettings())
 
 
-def score_sums(
+def _score_sums(
     sums: BinnedSums, cell: np.ndarray, recording: CellRecording, settings: AnalysisSettings
 ) -> CellScores:
     """Scores of `cell` [n], indices in the network of the recording, from their sums."""
@@ -133,6 +126,7 @@ def score_sums(
     fields = find_fields(rates, settings.fields.share, settings.fields.least_bins)
     about_place, about_heading = information(*place), information(*turn)
     heading, row, column = np.unravel_index(cell, recording.shape)
+    bin_area = float((sums.x_edges[1] - sums.x_edges[0]) * (sums.y_edges[1] - sums.y_edges[0]))
     return CellScores(
         cell=np.asarray(cell),
         sheet_x=column * recording.cell_size,
@@ -145,8 +139,8 @@ def score_sums(
         sparsity=sparsity(*place),
         selectivity=selectivity(*place),
         coherence=coherence(raw, sums.seconds),
-        fields=count_by_cell(fields, len(rates)),
-        field_area=largest_by_cell(fields, len(rates)) * bin_area(sums.x_edges, sums.y_edges),
+        fields=fields.number,
+        field_area=fields.largest * bin_area,
         border=border_score(*place),
         vector_length=mean_vector_length(*turn),
         direction=preferred_direction(*turn),

@@ -1,7 +1,5 @@
-"""Decoding of position from the activity of recorded cells, with the error of the decoded position.
-
-Drift of the packet: decoded pose minus true pose over time.
-"""
+"""Position decoded from the activity of recorded cells (Zhang et al. 1998), with its error; and the drift of
+the activity packet, its decoded pose minus the true pose over time (Burak & Fiete 2009)."""
 
 from __future__ import annotations
 
@@ -164,10 +162,10 @@ def packet_drift(recording: CellRecording) -> Drift:
     """
     moved = truth_in_sheet(recording)
     known = np.flatnonzero(known_poses(moved))
-    wrapped = packet_pose(recording) - moved
+    wrapped = recording.packet_pose - moved
     error = np.full(wrapped.shape, np.nan)
     error[known] = np.stack(
-        [np.unwrap(wrapped[known, i], period=side) for i, side in enumerate(torus_sides(recording))], axis=1
+        [np.unwrap(wrapped[known, i], period=side) for i, side in enumerate(recording.torus_sides)], axis=1
     )
     error[known] -= error[known[0]]
     return Drift(np.asarray(recording.time), error)
@@ -183,16 +181,4 @@ def truth_in_sheet(recording: CellRecording) -> np.ndarray:
     check_lengths(recording.time, recording.truth, recording.packet)
     first = np.flatnonzero(known_poses(recording.truth))[0]
     truth = np.asarray(recording.truth, np.float64)
-    return compose(packet_pose(recording)[first], between(truth[first], truth))
-
-
-def packet_pose(recording: CellRecording) -> np.ndarray:
-    """[T, 3] decoded poses on the torus, cells to m, m, rad."""
-    scale = [recording.cell_size, recording.cell_size, 2 * np.pi / recording.shape[0]]
-    return np.asarray(recording.packet, np.float64) * scale
-
-
-def torus_sides(recording: CellRecording) -> tuple[float, float, float]:
-    """Periods of the torus over x, y (m) and heading (rad)."""
-    _, height, width = recording.shape
-    return width * recording.cell_size, height * recording.cell_size, 2 * np.pi
+    return compose(recording.packet_pose[first], between(truth[first], truth))

@@ -1,7 +1,4 @@
-"""Firing fields of rate maps: number, size and peak.
-
-Border score of rate maps in a rectangular box.
-"""
+"""Firing fields of rate maps (number, size, peak) and the border score of maps in a rectangular box."""
 
 from __future__ import annotations
 
@@ -37,6 +34,18 @@ class Fields(NamedTuple):
     bins: np.ndarray
     peak: np.ndarray
 
+    @property
+    def number(self) -> np.ndarray:
+        """[n] number of fields."""
+        return np.bincount(self.cell, minlength=len(self.label))
+
+    @property
+    def largest(self) -> np.ndarray:
+        """[n] size of the largest field, bins, 0 without."""
+        largest = np.zeros(len(self.label), int)
+        np.maximum.at(largest, self.cell, self.bins)
+        return largest
+
 
 def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> Fields:
     """Finds the fields of each map: bins joined by their sides whose rate is at least `share` of the peak.
@@ -71,24 +80,7 @@ def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> F
 
 def largest_field(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] size of the largest field, bins, 0 without; `seconds` [H, W] is not used."""
-    return largest_by_cell(find_fields(rates), len(rates)).astype(float)
-
-
-def count_by_cell(fields: Fields, cells: int) -> np.ndarray:
-    """[cells] number of fields."""
-    return np.bincount(fields.cell, minlength=cells)
-
-
-def largest_by_cell(fields: Fields, cells: int) -> np.ndarray:
-    """[cells] size of the largest field, bins, 0 without."""
-    largest = np.zeros(cells, int)
-    np.maximum.at(largest, fields.cell, fields.bins)
-    return largest
-
-
-def bin_area(x_edges: np.ndarray, y_edges: np.ndarray) -> float:
-    """Area of a bin of equal bins, m^2."""
-    return float((x_edges[1] - x_edges[0]) * (y_edges[1] - y_edges[0]))
+    return find_fields(rates).largest.astype(float)
 
 
 def border_score(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

@@ -1,40 +1,14 @@
-"""Lattice scores of autocorrelograms: hexagonal (the grid score) and square.
+"""Grid scores of rate maps: autocorrelogram, radius of its central field, score and shape of a lattice.
 
 An annulus of the autocorrelogram is correlated with itself after a rotation. The score is the lowest
 correlation at the angles that map the lattice onto itself, less the highest at the angles between (Sargolini
 et al. 2006, Science 312:758). The annulus starts outside the central field and its outer radius grows; the
 score is the best mean over three successive radii (Langston et al. 2010, Science 328:1576; Stensola et al.
-2012, Nature 492:72; the definition of opexebo, `analysis.grid_score`, MIT).
-
-The rotated maps of a batch are one product with a sparse matrix, and the sums over all annuli are cumulative
-sums over bins in the order of their radius. An autocorrelogram is symmetric about its centre: half of it
-suffices.
-
-Spacing and orientation of a lattice, from the peaks of its autocorrelogram.
-
-The peaks nearest to the centre, three for a hexagonal and two for a square lattice in each half, give the
-spacing (their mean distance) and the orientation (their mean direction, folded by the symmetry): Hafting et
-al. 2005, Nature 436:801; Sargolini et al. 2006, Science 312:758.
-
-Spatial autocorrelograms of rate maps: the Pearson correlation of a map with its shifted self.
-
-    r(lag) = (n Σ f g - Σ f Σ g) / sqrt((n Σ f² - (Σ f)²) (n Σ g² - (Σ g)²)),   g(x) = f(x + lag)
-
-over the n bins that both maps have at that lag (Sargolini et al. 2006, Science 312:758, supplement). Large
-lags have few common bins and are noise; they are cut as in opexebo (`analysis.autocorrelation`).
-
-The radius of the central field of autocorrelograms, by the adaptive threshold of opexebo.
-
-opexebo (`analysis.place_field`, MIT) grows a field round the centre: the threshold falls from 0.95 to 0.2 of
-the peak, and the growth ends where the connected region has a hole, jumps in area, shrinks three times or
-keeps its area for ten steps. Here the same rule runs on a batch of maps: each map is reduced to its levels
-between all thresholds in use, one flood from the centre gives every region, one flood from the border every
-hole (grey-scale reconstruction, Vincent 1993, IEEE Trans. Image Processing 2:176).
+2012, Nature 492:72). It is the definition of opexebo (`analysis.grid_score`, MIT), here for batches of maps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -46,13 +20,17 @@ from tactile.base.errors import InputError
 
 _OVERLAP = 0.8
 """Kept lags reach this share of the side of the map, as in opexebo."""
-"""A variance below this share of the variance of the map is rounding: the map is flat there."""
 _AUTOCORRELOGRAM_BATCH = 64
 """Maps of one batch: its arrays fit the cache."""
 
 
 def autocorrelogram(rates: np.ndarray) -> np.ndarray:
-    """Spatial autocorrelograms of maps, by FFT.
+    """Spatial autocorrelograms of maps, by FFT: the Pearson correlation of a map with its shifted self.
+
+        r(lag) = (n Σ f g - Σ f Σ g) / sqrt((n Σ f² - (Σ f)²) (n Σ g² - (Σ g)²)),   g(x) = f(x + lag)
+
+    over the n bins that both maps have at that lag (Sargolini et al. 2006, supplement). Large lags have few
+    common bins and are noise; they are cut as in opexebo (`analysis.autocorrelation`).
 
     Args:
         rates: [n, H, W] any unit, NaN in bins without visits. These bins take no part; opexebo takes them as
@@ -70,30 +48,22 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
     rates = np.asarray(rates, float)
     if rates.ndim != 3 or 0 in rates.shape[1:]:
         raise InputError("rates", f"array of shape {list(rates.shape)}", "maps [n, H, W] with bins")
-    reach = [_reach(side) for side in rates.shape[1:]]
+    reach = [
+        (int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:]
+    ]  # largest kept lags
     maps = np.empty((len(rates), 2 * reach[0] + 1, 2 * reach[1] + 1))
     for start in range(0, len(rates), _AUTOCORRELOGRAM_BATCH):
         batch = slice(start, start + _AUTOCORRELOGRAM_BATCH)
         visited = np.isfinite(rates[batch])
-        values, flat = _standardise(rates[batch], visited)
-        maps[batch] = _correlate(values, visited, reach)
-        maps[batch][flat] = np.nan
+        # Maps of mean 0 and mean square 1, 0 without visits.
+        count = np.maximum(visited.sum(axis=(1, 2)), 1)[:, None, None]
+        filled = np.where(visited, rates[batch], 0.0)
+        values = np.where(visited, filled - filled.sum(axis=(1, 2), keepdims=True) / count, 0.0)
+        scale = np.sqrt((values**2).sum(axis=(1, 2), keepdims=True) / count)
+        flat = scale <= _FLAT * np.abs(filled).max(axis=(1, 2), keepdims=True)
+        maps[batch] = _correlate(values / np.where(flat, 1.0, scale), visited, reach)
+        maps[batch][flat[:, 0, 0]] = np.nan
     return maps
-
-
-def _standardise(rates: np.ndarray, visited: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maps [n, H, W] of mean 0 and mean square 1, 0 without visits; which of them are flat [n]."""
-    count = np.maximum(visited.sum(axis=(1, 2)), 1)[:, None, None]
-    filled = np.where(visited, rates, 0.0)
-    values = np.where(visited, filled - filled.sum(axis=(1, 2), keepdims=True) / count, 0.0)
-    scale = np.sqrt((values**2).sum(axis=(1, 2), keepdims=True) / count)
-    flat = scale <= _FLAT * np.abs(filled).max(axis=(1, 2), keepdims=True)
-    return values / np.where(flat, 1.0, scale), flat[:, 0, 0]
-
-
-def _reach(side: int) -> int:
-    """Largest kept lag for a side of so many bins; there are at most 1.8 times as many kept lags as bins."""
-    return (int(np.round(side + side * _OVERLAP)) - 1) // 2
 
 
 def _correlate(values: np.ndarray, visited: np.ndarray, reach: list[int]) -> np.ndarray:
@@ -123,62 +93,67 @@ _SMALLEST = 5
 _TOP = np.uint8(255)
 
 
-class _Schedule(NamedTuple):
-    """Thresholds of one growth, shares of the peak.
-
-    Attributes:
-        growth: two thresholds; the ratio of their areas is the ordinary growth. steps: falling thresholds.
-    """
-
-    growth: tuple[float, float]
-    steps: np.ndarray
-
-
 def centre_radii(autocorrelograms: np.ndarray) -> np.ndarray:
     """Radii of the central fields: [n] bins, whole numbers.
 
     The radius is that of a disc of the area of the field, rounded down; 0 where no field of at least 5 bins
-    is found or the centre is no peak.
+    is found or the centre is no peak. The field is that of opexebo (`analysis.place_field`), which grows it
+    round the centre: the threshold falls from 0.95 to 0.2 of the peak, and the growth ends where the
+    connected region has a hole, jumps in area, shrinks three times or keeps its area for ten steps. Here each
+    map is reduced to its levels between all thresholds in use; one flood from the centre gives every region,
+    one flood from the border every hole (grey-scale reconstruction, Vincent 1993, IEEE Trans. Image
+    Processing 2:176).
 
     Args:
         autocorrelograms: [h, w, n] finite, odd sides; maps last, so that the floods run over contiguous maps.
     """
-    opened = _open(autocorrelograms)
+    # Without peaks narrower than a cross of 5 bins: opening by reconstruction.
+    eroded = autocorrelograms.copy()
+    for thin, full in ((eroded, autocorrelograms), (eroded.swapaxes(0, 1), autocorrelograms.swapaxes(0, 1))):
+        np.minimum(thin[1:], full[:-1], out=thin[1:])
+        np.minimum(thin[:-1], full[1:], out=thin[:-1])
+    opened = _flood(eroded, autocorrelograms, diagonal=True)
     height, width, _ = opened.shape
     peak = opened[height // 2, width // 2]
     thresholds, schedules = _schedules()
     share = opened / np.where(peak > 0, peak, np.inf)
     levels = np.searchsorted(thresholds, share, side="right").astype(np.uint8)
-    areas = _areas(_flood_from_centre(levels), len(thresholds))
+    # The highest level at which each bin is connected by sides to the centre.
+    seed = np.zeros_like(levels)
+    seed[height // 2, width // 2] = levels[height // 2, width // 2]
+    areas = _areas(_flood(seed, levels), len(thresholds))
     size = np.zeros(levels.shape[2])
     waiting = np.ones(levels.shape[2], bool)
-    for schedule in schedules:
-        start = np.isfinite(areas[np.searchsorted(thresholds, schedule.growth)]).all(axis=0) & waiting
+    for growth, steps in schedules:
+        first, falling = (np.searchsorted(thresholds, each) for each in (growth, steps))
+        start = np.isfinite(areas[first]).all(axis=0) & waiting
         if start.any():
-            size[start] = _grow(areas[:, start], thresholds, schedule)
+            size[start] = _grow(areas[:, start], first, falling)
         waiting &= ~start
     return np.where(size >= _SMALLEST, np.floor(np.sqrt(size / np.pi)), 0.0).astype(int)
 
 
 @lru_cache(maxsize=1)
-def _schedules() -> tuple[np.ndarray, list[_Schedule]]:
-    """All thresholds in use, rising, and the schedules in the order in which they are tried."""
+def _schedules() -> tuple[np.ndarray, list[tuple[tuple[float, float], np.ndarray]]]:
+    """All thresholds in use, rising, as shares of the peak, and the schedules in the order in which they are
+    tried: two thresholds, of whose areas the ratio is the ordinary growth, and the falling thresholds."""
     growths = [(0.95, 0.95 - 0.02)] + [(high, high - 0.01) for high in np.linspace(0.96, 1.0, 4)]
     schedules = []
     for high, low in growths:
         first = high if high == 0.95 else low
         steps = np.round(np.linspace(first, 0.2, int((first - 0.2) / 0.02) + 1), 2)
-        schedules.append(_Schedule((high, low), steps))
-    return np.unique(np.concatenate([np.r_[plan.growth, plan.steps] for plan in schedules])), schedules
+        schedules.append(((high, low), steps))
+    return np.unique(np.concatenate([np.r_[growth, steps] for growth, steps in schedules])), schedules
 
 
-def _grow(areas: np.ndarray, thresholds: np.ndarray, schedule: _Schedule) -> np.ndarray:
-    """Bins [n] of the fields that grow from areas [K, n] along a schedule; 0 where the first step fails."""
-    high, low = areas[np.searchsorted(thresholds, schedule.growth)]
+def _grow(areas: np.ndarray, growth: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Bins [n] of the fields that grow from areas [K, n] along the rows of a schedule; 0 where the first step
+    fails."""
+    high, low = areas[growth]
     last, field = low.copy(), np.zeros_like(low)
     shrunk, same = np.zeros_like(low), np.zeros_like(low)
     grows = np.ones(len(low), bool)
-    for area in areas[np.searchsorted(thresholds, schedule.steps)]:
+    for area in areas[steps]:
         change = area / last
         shrunk = np.where(change < 1, shrunk + 1, 0)
         same = np.where(change == 1, same + 1, 0)
@@ -197,7 +172,7 @@ def _areas(regions: np.ndarray, count: int) -> np.ndarray:
     depth = _TOP - regions
     seed = depth.copy()
     seed[1:-1, 1:-1] = 0
-    walls = _TOP - _flood(seed, depth, _sweep_four)
+    walls = _TOP - _flood(seed, depth)
     row, column, index = np.nonzero(walls > regions)
     change = np.zeros((count + 1, maps), int)
     np.add.at(change, (regions[row, column, index], index), 1)
@@ -206,53 +181,29 @@ def _areas(regions: np.ndarray, count: int) -> np.ndarray:
     return areas
 
 
-def _open(maps: np.ndarray) -> np.ndarray:
-    """Maps [h, w, n] without peaks narrower than a cross of 5 bins: opening by reconstruction."""
-    eroded = maps.copy()
-    for thin, full in ((eroded, maps), (eroded.swapaxes(0, 1), maps.swapaxes(0, 1))):
-        np.minimum(thin[1:], full[:-1], out=thin[1:])
-        np.minimum(thin[:-1], full[1:], out=thin[:-1])
-    return _flood(eroded, maps, _sweep_eight)
-
-
-def _flood_from_centre(levels: np.ndarray) -> np.ndarray:
-    """The highest level [h, w, n] at which each bin is connected by sides to the centre."""
-    seed = np.zeros_like(levels)
-    centre = levels.shape[0] // 2, levels.shape[1] // 2
-    seed[centre] = levels[centre]
-    return _flood(seed, levels, _sweep_four)
-
-
-def _flood(
-    levels: np.ndarray, ceiling: np.ndarray, sweep: Callable[[np.ndarray, np.ndarray], None]
-) -> np.ndarray:
-    """Raises levels [h, w, n] to those of neighbours, at most to the ceiling, until nothing changes."""
+def _flood(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool = False) -> np.ndarray:
+    """Raises levels [h, w, n] to those of neighbours by sides, or `diagonal` ones as well, at most to the
+    ceiling, until nothing changes."""
     done = np.empty_like(levels)
     active = np.arange(levels.shape[2])
     while len(active):
         before = levels.copy()
         for across, top in ((levels, ceiling), (levels.swapaxes(0, 1), ceiling.swapaxes(0, 1))):
-            sweep(across, top)
-            sweep(across[::-1], top[::-1])
+            _sweep(across, top, diagonal)
+            _sweep(across[::-1], top[::-1], diagonal)
         changed = (levels != before).any(axis=(0, 1))
         done[..., active[~changed]] = levels[..., ~changed]
         active, levels, ceiling = active[changed], levels[..., changed], ceiling[..., changed]
     return done
 
 
-def _sweep_four(levels: np.ndarray, ceiling: np.ndarray) -> None:
+def _sweep(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool) -> None:
     """Raises each row to the row before it, in place."""
     for before, row, top in zip(levels, levels[1:], ceiling[1:], strict=False):
         np.maximum(row, before, out=row)
-        np.minimum(row, top, out=row)
-
-
-def _sweep_eight(levels: np.ndarray, ceiling: np.ndarray) -> None:
-    """Raises each row to the row before it and to its diagonal neighbours there, in place."""
-    for before, row, top in zip(levels, levels[1:], ceiling[1:], strict=False):
-        np.maximum(row, before, out=row)
-        np.maximum(row[1:], before[:-1], out=row[1:])
-        np.maximum(row[:-1], before[1:], out=row[:-1])
+        if diagonal:
+            np.maximum(row[1:], before[:-1], out=row[1:])
+            np.maximum(row[:-1], before[1:], out=row[:-1])
         np.minimum(row, top, out=row)
 
 
@@ -278,7 +229,7 @@ SQUARE = Lattice((90.0,), (45.0, 135.0))
 
 
 class _Annuli(NamedTuple):
-    """Bins of half an autocorrelogram in the order of their radius.
+    """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices.
 
     Attributes:
         half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
@@ -333,7 +284,11 @@ def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
 
 
 def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, width: int) -> np.ndarray:
-    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins; maps [h * w, n]."""
+    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins; maps [h * w, n].
+
+    All rotated maps are one product with a sparse matrix, and sums over annuli are differences of cumulative
+    sums over bins in the order of their radius.
+    """
     annuli = _annuli(lattice, height, width)
     base = maps[annuli.half]
     turned = (annuli.rotation @ maps).reshape(-1, *base.shape)
@@ -341,8 +296,8 @@ def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, 
     def add(values: np.ndarray) -> np.ndarray:
         sums = np.add.reduceat(values, annuli.starts, axis=-2).cumsum(axis=-2)
         sums = np.concatenate([np.zeros_like(sums[..., :1, :]), sums], axis=-2)
-        start = np.take_along_axis(sums, _like(annuli.within[inner], sums), axis=-2)
-        return sums[..., annuli.below, :] - start
+        index = annuli.within[inner].reshape((1,) * (sums.ndim - 1) + (-1,))
+        return sums[..., annuli.below, :] - np.take_along_axis(sums, index, axis=-2)
 
     count = annuli.bins[annuli.below][:, None] - annuli.bins[annuli.within[inner]]
     count = np.maximum(count, 1)
@@ -355,11 +310,6 @@ def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, 
     correlation = np.clip(covariance / np.sqrt(product), -1.0, 1.0)
     onto = len(lattice.onto)
     return correlation[:onto].min(axis=0) - correlation[onto:].max(axis=0)
-
-
-def _like(index: np.ndarray, sums: np.ndarray) -> np.ndarray:
-    """Indices [n] into the second last axis of sums [..., S, n], with as many axes."""
-    return index.reshape((1,) * (sums.ndim - 1) + (-1,))
 
 
 def _best(curves: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -448,10 +398,12 @@ class LatticeShape(NamedTuple):
 def measure_lattice(
     autocorrelograms: np.ndarray, bin_size: float, lattice: Lattice = HEXAGONAL
 ) -> LatticeShape:
-    """Spacing and orientation of lattices.
+    """Spacing and orientation of lattices (Hafting et al. 2005, Nature 436:801; Sargolini et al. 2006).
 
-    Peaks are the bins outside the central field that exceed 0 and their eight neighbours; a parabola through
-    the neighbours places them between bins.
+    The peaks nearest to the centre, three for a hexagonal and two for a square lattice in each half, give the
+    spacing (their mean distance) and the orientation (their mean direction, folded by the symmetry). Peaks
+    are the bins outside the central field that exceed 0 and their eight neighbours; a parabola through the
+    neighbours places them between bins.
 
     Args:
         autocorrelograms: [n, h, w] as from `autocorrelogram`; rows rise with y, columns with x.
@@ -468,12 +420,9 @@ def measure_lattice(
     count = round(np.pi / period)
     vectors = [_nearest_peaks(image, radius, count) for image, radius in zip(maps, inner, strict=True)]
     spacing = [bin_size * np.abs(peaks).mean() for peaks in vectors]
-    turns = [_mean_angle(np.angle(peaks) * 2 * np.pi / period) for peaks in vectors]
+    angles = [np.angle(peaks) * 2 * np.pi / period for peaks in vectors]
+    turns = [float(np.arctan2(np.sin(each).mean(), np.cos(each).mean())) for each in angles]
     return LatticeShape(np.array(spacing), np.array(turns) / (2 * np.pi) * period % period)
-
-
-def _mean_angle(angles: np.ndarray) -> float:
-    return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean()))
 
 
 def _nearest_peaks(image: np.ndarray, inner: int, count: int) -> np.ndarray:

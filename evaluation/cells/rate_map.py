@@ -2,11 +2,9 @@
 
 A rate map [cells, H, W] is the activity summed over time in each bin divided by the time there. Both are
 smoothed first, by the same Gaussian, so a bin visited for a long time weighs more than a short visit beside
-it (as in Skaggs et al. 1996). opexebo smooths the finished map instead:
-`smooth_plane` of the map with 0 for bins without a rate. The map has the unit of the activity: multiply by
-spikes/s per unit of activity for Hz.
-
-Coherence of rate maps: how well the rate in a bin is foretold by its neighbours.
+it (as in Skaggs et al. 1996). opexebo smooths the finished map instead: `smooth_plane` of the map with 0 for
+bins without a rate. The map has the unit of the activity: multiply by spikes/s per unit of activity for Hz.
+The coherence of a map is the correlation of the rate in a bin with that of its neighbours.
 """
 
 from __future__ import annotations

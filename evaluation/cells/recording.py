@@ -57,6 +57,18 @@ class CellRecording(NamedTuple):
     activity: np.ndarray
     sums: BinnedSums | None
 
+    @property
+    def packet_pose(self) -> np.ndarray:
+        """[T, 3] decoded poses on the torus, cells to m, m, rad."""
+        scale = [self.cell_size, self.cell_size, 2 * np.pi / self.shape[0]]
+        return np.asarray(self.packet, np.float64) * scale
+
+    @property
+    def torus_sides(self) -> tuple[float, float, float]:
+        """Periods of the torus over x, y (m) and heading (rad)."""
+        _, height, width = self.shape
+        return width * self.cell_size, height * self.cell_size, 2 * np.pi
+
 
 _SUMS = "sums/"
 _STEPS = ("time", "truth", "packet", "energy", "place", "activity")

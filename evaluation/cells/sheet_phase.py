@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.decoding import torus_sides, truth_in_sheet
+from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.rate_map import (
     check_lengths,
     circle_bin,
@@ -49,7 +49,7 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     """Rates [C, bins, bins] of the chosen cells over y, x of the torus, NaN where the rat was not, and
     seconds [bins, bins].
 
-    The true path is moved into the frame of the sheet (`drift.truth_in_sheet`) and folded, so the box may
+    The true path is moved into the frame of the sheet (`decoding.truth_in_sheet`) and folded, so the box may
     have any heading. Bin b is centred on b / bins of the side.
 
     Raises:
@@ -58,7 +58,7 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     check_lengths(recording.time, recording.activity)
     path = truth_in_sheet(recording)
     known = known_poses(path)
-    width, height, _ = torus_sides(recording)
+    width, height, _ = recording.torus_sides
     column, row = (
         circle_bin(2 * np.pi * path[known, i] / side, bins) for i, side in enumerate((width, height))
     )

@@ -112,7 +112,18 @@ def shuffled_scores(
         InputError: the path has another length, has NaN, is at most 40 s long, or spends no time in a bin.
     """
     _check_path(activity, bins)
-    shifts = _draw_shifts((shuffles, activity.shape[1]), bins, seed)
+    # Shifts in samples, at least 20 s either way round the session; gaps in the path count as no time.
+    samples, seconds = len(bins.flat), float(np.sum(bins.seconds))
+    shortest = int(np.ceil(SHORTEST_SHIFT * samples / seconds))
+    if samples <= 2 * shortest:
+        raise InputError(
+            "bins.seconds",
+            f"a path of {seconds:g} s",
+            f"more than {2 * SHORTEST_SHIFT:g} s",
+            f"record longer: a shuffle shifts by at least {SHORTEST_SHIFT:g} s either way",
+        )
+    shape = shuffles, activity.shape[1]
+    shifts = stream(seed, "cell shuffles").integers(shortest, samples - shortest + 1, shape)
     return _score_shifts(activity, bins, score, shifts)
 
 
@@ -148,20 +159,6 @@ def calibrate(
         high=float(high) / max(cells, 1),
         shuffled_mean=float(known.mean()) if known.size else np.nan,
     )
-
-
-def _draw_shifts(shape: tuple[int, int], bins: PathBins, seed: int) -> np.ndarray:
-    """Shifts in samples, at least 20 s either way round the session; gaps in the path count as no time."""
-    samples, seconds = len(bins.flat), float(np.sum(bins.seconds))
-    shortest = int(np.ceil(SHORTEST_SHIFT * samples / seconds))
-    if samples <= 2 * shortest:
-        raise InputError(
-            "bins.seconds",
-            f"a path of {seconds:g} s",
-            f"more than {2 * SHORTEST_SHIFT:g} s",
-            f"record longer: a shuffle shifts by at least {SHORTEST_SHIFT:g} s either way",
-        )
-    return stream(seed, "cell shuffles").integers(shortest, samples - shortest + 1, shape)
 
 
 def _score_shifts(activity: np.ndarray, bins: PathBins, score: Score, shifts: np.ndarray) -> ShuffledScores:

@@ -51,19 +51,6 @@ class Relations(NamedTuple):
     motion: np.ndarray
 
 
-class RelationErrors(NamedTuple):
-    """Mean absolute errors against a relations file.
-
-    Attributes:
-        translation: m. rotation_deg: degrees. used, dropped: pairs inside and outside the recording.
-    """
-
-    translation: float
-    rotation_deg: float
-    used: int
-    dropped: int
-
-
 def successive_pairs(count: int, step: int = 1) -> np.ndarray:
     """The pairs (i, i + step) of `count` rows: [P, 2]."""
     i = np.arange(max(0, count - step))
@@ -105,7 +92,15 @@ def energy_all_pairs(estimate: np.ndarray, truth: np.ndarray) -> Energy:
     squares = _after(np.abs(z) ** 2 + np.abs(w) ** 2) - 2 * (a * _after(z * w.conj())).real
     cross = (here.conj() * (a * _after(z) - _after(w))).real
     trans2 = np.sum(squares - 2 * cross + np.arange(count)[::-1] * np.abs(here) ** 2)
-    rot2 = _wrapped_differences(wrap(estimate[:, 2] - truth[:, 2]))
+    # The sum over i < j of wrap(angle_j - angle_i)^2 for heading errors within one turn: without wrapping,
+    # plus the correction of the pairs that lie more than half a turn apart.
+    angle = wrap(estimate[:, 2] - truth[:, 2])
+    angle = np.sort(angle - angle.mean())
+    far = np.searchsorted(angle, angle - np.pi)  # for each, how many lie more than half a turn below
+    below = np.concatenate([[0.0], np.cumsum(angle)])[far]
+    plain = len(angle) * np.sum(angle**2) - np.sum(angle) ** 2
+    turn = 2 * np.pi
+    rot2 = float(plain + np.sum(far * turn**2 - 2 * turn * (far * angle - below)))
     # rounding of the running sums may put a perfect estimate below zero
     return Energy(max(0.0, float(trans2)) / pairs, max(0.0, rot2) / pairs, pairs)
 
@@ -116,15 +111,21 @@ def read_relations(path: str | Path) -> Relations:
     Raises:
         InputError: the file cannot be read or a line is malformed.
     """
-    start, end, x, y, _, _, _, yaw = read_text_table(path, _RELATIONS).values.T
+    start, end, x, y, _, _, _, yaw = read_text_table(path, _RELATIONS)[0].T
     return Relations(start, end, np.stack([x, y, yaw], axis=1))
 
 
-def relation_errors(time: np.ndarray, pose: np.ndarray, relations: Relations) -> RelationErrors:
+def relation_errors(
+    time: np.ndarray, pose: np.ndarray, relations: Relations
+) -> tuple[float, float, int, int]:
     """Mean absolute error of a trajectory's motions against true ones (Kuemmerle et al. 2009, unsquared).
 
     Args:
         time: [N] s, increasing. pose: [N, 3]; interpolated at both ends of each relation.
+
+    Returns:
+        Errors of translation, m, and of rotation, degrees; number of relations inside and outside the
+        recording.
 
     Raises:
         InputError: no relation lies inside the recording.
@@ -136,19 +137,9 @@ def relation_errors(time: np.ndarray, pose: np.ndarray, relations: Relations) ->
     error = between(relations.motion[inside], found[inside])
     used, rotation = int(inside.sum()), float(np.degrees(np.mean(np.abs(error[:, 2]))))
     translation = float(np.mean(np.hypot(error[:, 0], error[:, 1])))
-    return RelationErrors(translation, rotation, used, len(inside) - used)
+    return translation, rotation, used, len(inside) - used
 
 
 def _after(values: np.ndarray) -> np.ndarray:
     """For each row, the sum over the rows after it: [N]."""
     return np.cumsum(values[::-1])[::-1] - values
-
-
-def _wrapped_differences(angle: np.ndarray) -> float:
-    """The sum over i < j of wrap(angle_j - angle_i)^2, angles in one turn."""
-    angle = np.sort(angle - angle.mean())
-    far = np.searchsorted(angle, angle - np.pi)  # for each, how many lie more than half a turn below
-    below = np.concatenate([[0.0], np.cumsum(angle)])[far]
-    plain = len(angle) * np.sum(angle**2) - np.sum(angle) ** 2
-    turn = 2 * np.pi
-    return float(plain + np.sum(far * turn**2 - 2 * turn * (far * angle - below)))

@@ -1,17 +1,14 @@
-"""The Experience Metric: the rates of re-localisation (ARR) and of correct re-localisation (ARCR).
+"""The Experience Metric: the rates of re-localisation (ARR) and of correct re-localisation (ARCR), from a log
+of the current experience and the true pose at each step.
 
 Source: Salman & Pearson 2016, Algorithm 1; "line" below is a line of it. As printed, its ARCR is always 0
-(the set of correct re-localisations only grows from its own members), so there are four modes:
+(the set of correct re-localisations only grows from its own members), so there are four modes with one ARR:
 
     strict   the verdict on the first step of a visit holds for the visit; the pose of an experience is the
              one at its creation; a new experience is valid if the last re-localisation was correct
     paper    the printed listing with line 26 corrected in analogy to lines 10 and 11
     or       line 26 with "or": a wrong visit counts as correct from its second step; for comparison only
     literal  the printed listing
-
-ARR is the same in all four.
-
-The experience log: the current experience and the true pose at each step.
 """
 
 from __future__ import annotations
@@ -63,11 +60,11 @@ def read_experience_log(path: str | Path) -> ExperienceLog:
     Raises:
         InputError: a line is malformed, or an id is not a whole number.
     """
-    table = read_text_table(path, _COLUMNS)
-    time, experience, x, y, theta = table.values.T
+    values, line = read_text_table(path, _COLUMNS)
+    time, experience, x, y, theta = values.T
     broken = np.flatnonzero((experience != np.round(experience)) | (np.abs(experience) > 2**53))
     if len(broken):
-        where, found = f"{path}:{table.line[broken[0]]}", f"experience id {experience[broken[0]]:g}"
+        where, found = f"{path}:{line[broken[0]]}", f"experience id {experience[broken[0]]:g}"
         raise InputError(where, found, "a whole number of at most 2^53, -1 for none")
     return ExperienceLog(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
 
@@ -179,21 +176,32 @@ def experience_metric(
         InputError: the logs differ in length, a true pose is not finite, the base set is out of range, or
             none is given and the run never returns to its start.
     """
-    experience, truth = _check_log(experience, truth)
+    experience, truth = np.asarray(experience), np.asarray(truth, float)
+    if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
+        found = f"shapes {experience.shape} and {truth.shape}"
+        raise InputError("experience log", found, "[N] and [N, 3], N at least 1")
+    if not np.isfinite(truth).all():
+        row = int(np.argmin(np.isfinite(truth).all(axis=1)))
+        raise InputError(f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "remove such rows")
     end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
     rows = change_rows(experience) if config.log == "action" else np.flatnonzero(experience != -1)
     base = int(np.searchsorted(rows, _check_base(end, len(experience))))
     reading = _READINGS[config.mode]
     ids, poses = experience[rows], truth[rows]
     counted = relocalisations(ids, base)
-    near = _near(poses, poses[reading.perceived(ids)], reading, config)
+    # Lines 16 to 24 without the valid set.
+    perceived = poses[reading.perceived(ids)]
+    distance = np.hypot(*(poses - perceived)[:, :2].T)
+    turn = np.abs(reading.turn(poses[:, 2] - perceived[:, 2]))
+    near = (distance < config.position) & (turn < np.radians(config.heading_deg))
     right = _correct(ids, base, counted, near, config.mode)
     eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
     notes = [LITERAL_WARNING] if config.mode == "literal" else []
     notes += [] if entries else ["no entry after the base set: ARR is 0/0"]
     note = "; ".join(notes + ([] if eta else [NO_RELOCALISATION]))
-    counts = _ratio(eta, entries), _ratio(eta_c, eta), entries, eta, eta_c, base
-    return ExperienceMetric(*counts, config.mode, config.log, note, counted, right, near)
+    arr, arcr = eta / entries if entries else np.nan, eta_c / eta if eta else np.nan
+    counts = entries, eta, eta_c, base
+    return ExperienceMetric(arr, arcr, *counts, config.mode, config.log, note, counted, right, near)
 
 
 def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
@@ -240,17 +248,6 @@ def base_end(truth: np.ndarray, position: float = 0.1, heading_deg: float = 25.0
     return int(back[0])
 
 
-def _check_log(experience: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    experience, truth = np.asarray(experience), np.asarray(truth, float)
-    if experience.ndim != 1 or len(experience) == 0 or truth.shape != (len(experience), 3):
-        found = f"shapes {experience.shape} and {truth.shape}"
-        raise InputError("experience log", found, "[N] and [N, 3], N at least 1")
-    if not np.isfinite(truth).all():
-        row = int(np.argmin(np.isfinite(truth).all(axis=1)))
-        raise InputError(f"true trajectory, row {row}", f"{truth[row]}", "finite numbers", "remove such rows")
-    return experience, truth
-
-
 def _check_base(base: int, length: int) -> int:
     if not 0 <= base <= length:
         raise InputError("i_base", str(base), f"0 to {length}, the length of the log")
@@ -271,13 +268,6 @@ def _last_entry(experience: np.ndarray) -> np.ndarray:
     return last
 
 
-def _near(true: np.ndarray, perceived: np.ndarray, reading: _Reading, config: ExmConfig) -> np.ndarray:
-    """Lines 16 to 24 without the valid set: [N] bool."""
-    distance = np.hypot(*(true - perceived)[:, :2].T)
-    turn = np.abs(reading.turn(true[:, 2] - perceived[:, 2]))
-    return (distance < config.position) & (turn < np.radians(config.heading_deg))
-
-
 def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, mode: ExmMode) -> np.ndarray:
     """Which re-localisations are correct: [N] bool (lines 15 to 38).
 
@@ -296,10 +286,6 @@ def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, 
         if sound and (i > 0 if reading.back else novel[i]):
             valid.add(ids_[i - reading.back])
     return np.array(right, bool)
-
-
-def _ratio(part: int, whole: int) -> float:
-    return part / whole if whole else np.nan
 
 
 # The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read

@@ -1,8 +1,8 @@
-"""The record of a metric and the types of its results."""
+"""The record of a metric, its computed `Finding`, and the `Quantity` that a scorecard writes of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Any, Literal, NamedTuple
 
@@ -28,6 +28,17 @@ class Quantity(Settings):
     note: str = ""
     """Reason for a missing value, or a remark on the value."""
 
+    @staticmethod
+    def pool(trials: Sequence[Quantity]) -> Quantity:
+        """The mean over trials that have a value; the note tells their spread and how many have none."""
+        values = [trial.value for trial in trials if trial.value is not None]
+        if not values or len(trials) == 1:
+            return trials[0]
+        without = [trial.note for trial in trials if trial.value is None]
+        parts = [f"sd {np.std(values, ddof=1):.2g}"] if len(values) > 1 else []
+        parts += [f"{len(without)} of {len(trials)} trials without: {without[0]}"] if without else []
+        return trials[0].model_copy(update={"value": float(np.mean(values)), "note": "; ".join(parts)})
+
 
 class Finding(NamedTuple):
     """A computed value, the value for odometry and a note; a value may be NaN."""
@@ -46,8 +57,8 @@ class Metric(NamedTuple):
     Attributes:
         name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
         direction: of better values. section: heading in the table.
-        compute: the finding from a `RunData`, or from the `grid_findings` of a map; None without the
-            ground truth that it needs.
+        compute: the finding from a `RunData`, or from the findings of a map by name; None without the ground
+            truth that it needs.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Metrics of other packages, computed for a run besides ours where a configuration names them."""
+"""Metrics of other packages, computed for a run where a configuration names them."""
 
 from __future__ import annotations
 

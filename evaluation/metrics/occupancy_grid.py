@@ -28,6 +28,22 @@ class OccupancyGrid(NamedTuple):
     origin: np.ndarray
     cell: float
 
+    def check(self, truth: GridTruth | None = None) -> None:
+        """Checks a map, and that it has the cells of its truth (ValueError)."""
+        shape = self.probability.shape
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(f"a map of shape {shape}; expected [H, W]")
+        if not (np.isfinite(self.origin).all() and self.cell > 0):
+            raise ValueError(f"origin {self.origin}, cell {self.cell}; expected finite and positive")
+        if not ((self.probability >= 0) & (self.probability <= 1)).all():
+            raise ValueError("a map with a value outside 0..1 or NaN; expected probabilities")
+        if truth is None:
+            return
+        if not shape == truth.occupied.shape == truth.inside.shape:
+            raise ValueError(f"truth of {truth.occupied.shape}, {truth.inside.shape} cells, map of {shape}")
+        if truth.segments.ndim != 2 or truth.segments.shape[1] != 4 or not np.isfinite(truth.segments).all():
+            raise ValueError("walls that are not segments [S, 4] of finite numbers")
+
 
 class GridTruth(NamedTuple):
     """The true world, on the cells of a map and as segments.
@@ -41,6 +57,11 @@ class GridTruth(NamedTuple):
     occupied: np.ndarray
     inside: np.ndarray
     segments: np.ndarray
+
+    def occupancy(self, wall: np.ndarray, outside: float = PRIOR_OCCUPANCY) -> np.ndarray:
+        """The truth as occupancy [H, W] (Fox et al. 2012, Fig. 3): 1 in objects and `wall`, 0 in free space,
+        `outside` beyond."""
+        return np.where(wall | (self.inside & self.occupied), 1.0, np.where(self.inside, 0.0, outside))
 
 
 class TouchableSurface(NamedTuple):
@@ -65,23 +86,6 @@ def cell_centres(grid: OccupancyGrid) -> np.ndarray:
     return np.asarray(grid.origin) + grid.cell * np.stack([x, y], axis=-1)
 
 
-def check_grid(grid: OccupancyGrid, truth: GridTruth | None = None) -> None:
-    """Checks a map, and that it has the cells of its truth (ValueError)."""
-    shape = grid.probability.shape
-    if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"a map of shape {shape}; expected [H, W]")
-    if not (np.isfinite(grid.origin).all() and grid.cell > 0):
-        raise ValueError(f"origin {grid.origin}, cell {grid.cell}; expected finite and positive")
-    if not ((grid.probability >= 0) & (grid.probability <= 1)).all():
-        raise ValueError("a map with a value outside 0..1 or NaN; expected probabilities")
-    if truth is None:
-        return
-    if not shape == truth.occupied.shape == truth.inside.shape:
-        raise ValueError(f"truth of {truth.occupied.shape}, {truth.inside.shape} cells, map of {shape}")
-    if truth.segments.ndim != 2 or truth.segments.shape[1] != 4 or not np.isfinite(truth.segments).all():
-        raise ValueError("walls that are not segments [S, 4] of finite numbers")
-
-
 def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface:
     """The touchable part of the truth, on the cells of the map.
 
@@ -92,9 +96,12 @@ def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface
 
     free = truth.inside & ~truth.occupied
     points, normals = _points(truth.segments)
-    faces = np.zeros(len(points), bool)
+    faces, (height, width) = np.zeros(len(points), bool), free.shape
     for step in (-_FAR, -_NEAR, _NEAR, _FAR):
-        faces |= _at(free, grid, points + step * grid.cell * normals)
+        beside = points + step * grid.cell * normals
+        column, row = np.floor((beside - grid.origin) / grid.cell).astype(int).T
+        known = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        faces[known] |= free[row[known], column[known]]
     points = points[faces]
     if len(points) == 0:
         return TouchableSurface(free, np.zeros_like(free), points)
@@ -102,17 +109,11 @@ def touchable_surface(grid: OccupancyGrid, truth: GridTruth) -> TouchableSurface
     return TouchableSurface(free, ~free & (away < _SKIN * grid.cell), points)
 
 
-def truth_occupancy(truth: GridTruth, wall: np.ndarray, outside: float = PRIOR_OCCUPANCY) -> np.ndarray:
-    """The truth as occupancy [H, W]: 1 in objects and walls, 0 in free space, `outside` beyond (Fox et al.
-    2012, Fig. 3)."""
-    return np.where(wall | (truth.inside & truth.occupied), 1.0, np.where(truth.inside, 0.0, outside))
-
-
 def mean_grid(grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
     """The mean of maps on the same cells (Fox et al. 2012, Fig. 4)."""
     first = grids[0]
     for grid in grids:
-        check_grid(grid)
+        grid.check()
         same = grid.probability.shape == first.probability.shape and grid.cell == first.cell
         if not same or not np.array_equal(grid.origin, first.origin):
             raise ValueError("maps with different cells; expected the same shape, cell size and origin")
@@ -129,12 +130,3 @@ def _points(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = (np.arange(len(row)) - first + 0.5) / count[row]
     normal = np.stack([-along[row, 1], along[row, 0]], axis=1) / length[row, None]
     return start[row] + share[:, None] * along[row], normal
-
-
-def _at(cells: np.ndarray, grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
-    """The value [K] of the cells [H, W] bool at points [K, 2]; False outside."""
-    column, row = np.floor((points - grid.origin) / grid.cell).astype(int).T
-    known = (row >= 0) & (row < cells.shape[0]) & (column >= 0) & (column < cells.shape[1])
-    found = np.zeros(len(points), bool)
-    found[known] = cells[row[known], column[known]]
-    return found

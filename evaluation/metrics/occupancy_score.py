@@ -1,16 +1,12 @@
-"""The score of an occupancy map: equation 6 of Fox et al. 2012 and `grid_metrics`, as a record and a table.
+"""The score of an occupancy map: equation 6 of Fox et al. 2012 and `GRID_METRICS`, as a record and a table.
 
-Other than equation 6, the metrics use only cells that a whisker can observe: free space and the surfaces that
-bound it. The inside of objects and the space behind walls cannot be touched; including them would
-reward guessing. Chamfer distances measure occupied cells that the map shows there.
+Equation 6 is the mean of |map - truth| over cells. The paper does not specify the truth outside the arena or
+the cells of the mean, and it smooths the truth; its values depend on all three. So the error is computed
+under every convention and compared with constant maps, some of which have smaller errors.
 
-Equation 6 of Fox et al. 2012: the mean of |map - truth| over cells, under all of its conventions.
-
-The paper does not specify the truth outside the arena or the cells of the mean, and it smooths the truth; its
-values depend on all three. So the error is computed under every convention and compared with constant maps,
-some of which have smaller errors.
-
-Metrics of an occupancy map on the cells that whiskers can observe: free space and reachable surfaces.
+The other metrics use only cells that a whisker can observe: free space and the surfaces that bound it. The
+inside of objects and the space behind walls cannot be touched; including them would reward guessing. Chamfer
+distances measure occupied cells that the map shows there.
 """
 
 from __future__ import annotations
@@ -28,9 +24,7 @@ from evaluation.metrics.occupancy_grid import (
     OccupancyGrid,
     TouchableSurface,
     cell_centres,
-    check_grid,
     touchable_surface,
-    truth_occupancy,
 )
 from evaluation.metrics.statistics import auc
 from tactile.base.settings import Settings
@@ -104,7 +98,7 @@ def grid_error(
     grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface, convention: Convention
 ) -> GridError:
     """The error of one map. `surface` is `occupancy_grid.touchable_surface(grid, truth)`."""
-    true = truth_occupancy(truth, surface.wall, convention.outside)
+    true = truth.occupancy(surface.wall, convention.outside)
     true = smooth_truth(true) if convention.smooth else true
     cells = truth.inside | surface.wall if convention.mask == "arena" else np.ones_like(truth.inside)
     if not cells.any():
@@ -162,11 +156,6 @@ CLAMP = 1e-3
 """Probabilities are clipped to this distance from 0 and 1 before the logarithm."""
 
 _ROUNDING = 6  # decimals; closer probabilities tie
-
-
-def grid_findings(grid: OccupancyGrid, truth: GridTruth, surface: TouchableSurface) -> dict[str, Finding]:
-    """The findings of `GRID_METRICS` by name."""
-    return _cells(grid, surface) | _chamfer(grid, truth, surface)
 
 
 def _metric(name: str, label: str, unit: str, direction: Direction) -> Metric:
@@ -281,9 +270,9 @@ def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> Grid
     Raises:
         ValueError: the map is invalid or not on the cells of the truth.
     """
-    check_grid(grid, truth)
+    grid.check(truth)
     surface = touchable_surface(grid, truth)
-    findings = grid_findings(grid, truth, surface)
+    findings = _cells(grid, surface) | _chamfer(grid, truth, surface)
     return GridScore(
         name=name,
         errors=tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS),
@@ -297,7 +286,10 @@ def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
         name=name,
         trials=len(scores),
         errors=tuple(pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
-        quantities={m.name: _pool([score.quantities[m.name] for score in scores]) for m in GRID_METRICS},
+        quantities={
+            metric.name: Quantity.pool([score.quantities[metric.name] for score in scores])
+            for metric in GRID_METRICS
+        },
     )
 
 
@@ -333,16 +325,6 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
         cells = "".join(f"{value:>{max(width, 7) + 2}}" for value in values)
         lines.append(f"{metric.label:<36}{cells}  {metric.unit}")
     return "\n".join(line.rstrip() for line in lines)
-
-
-def _pool(quantities: Sequence[Quantity]) -> Quantity:
-    values = [quantity.value for quantity in quantities if quantity.value is not None]
-    if not values or len(quantities) == 1:
-        return quantities[0]
-    without = [quantity.note for quantity in quantities if quantity.value is None]
-    parts = [f"sd {np.std(values, ddof=1):.2g}"] if len(values) > 1 else []
-    parts += [f"{len(without)} of {len(quantities)} trials without: {without[0]}"] if without else []
-    return quantities[0].model_copy(update={"value": float(np.mean(values)), "note": "; ".join(parts)})
 
 
 def _order(scores: Sequence[GridScore], convention: Convention) -> list[str]:

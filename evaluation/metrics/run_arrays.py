@@ -72,6 +72,13 @@ class RunArrays(NamedTuple):
         numbers, steps = np.unique(self.piece[self.found], return_counts=True)
         return int(numbers[steps.argmax()]) if len(numbers) else -1
 
+    @property
+    def truth_rows(self) -> np.ndarray:
+        """The steps [K] with a true pose."""
+        if self.truth is None:
+            return np.zeros(0, int)
+        return np.flatnonzero(np.isfinite(self.truth).all(axis=1))
+
     def ranked_pieces(self) -> list[tuple[int, int]]:
         """Rank and number of each piece: `main` first, with rank 0, then by the number of their steps."""
         numbers, sizes = np.unique(self.piece, return_counts=True)
@@ -85,39 +92,27 @@ class RunArrays(NamedTuple):
             return f"{self.state[rows[-1]].replace('_', ' ')}, {len(rows):,} steps"
         return f"piece {number + 1}, {len(rows):,} steps"
 
-
-def check_run(run: RunArrays) -> None:
-    """Checks shapes, finite values and indices.
-
-    Raises:
-        InputError: an array is malformed.
-    """
-    steps, nodes = len(run.time), len(run.nodes)
-    shapes: dict[str, tuple[int, ...]] = {
-        **dict.fromkeys(("time", "experience"), (steps,)),
-        **dict.fromkeys(("online", "final", "odometry"), (steps, 3)),
-        "created": (nodes,),
-        "nodes": (nodes, 3),
-        "links": (len(run.links), 2),
-    }
-    if run.truth is not None:
-        shapes["truth"] = (steps, 3)
-    for name, shape in shapes.items():
-        array = np.asarray(getattr(run, name))
-        if array.shape != shape:
-            raise InputError(f"run.{name}", f"shape {array.shape}", str(shape))
-        if name != "truth" and not np.isfinite(array).all():
-            raise InputError(f"run.{name}", "a NaN or infinite value", "finite numbers")
-    if steps == 0:
-        raise InputError("run.time", "no steps", "at least one")
-    for name, low, high in (("experience", -1, nodes), ("created", -1, steps), ("links", 0, nodes)):
-        index = np.asarray(getattr(run, name))
-        if index.size and not (low <= index.min() and index.max() < high):
-            raise InputError(f"run.{name}", f"{index.min()} to {index.max()}", f"{low} to {high - 1}")
-
-
-def truth_rows(run: RunArrays) -> np.ndarray:
-    """The steps [K] with a true pose."""
-    if run.truth is None:
-        return np.zeros(0, int)
-    return np.flatnonzero(np.isfinite(run.truth).all(axis=1))
+    def check(self) -> None:
+        """Raises `InputError` if an array has a wrong shape, an unknown value or an index out of range."""
+        steps, nodes = len(self.time), len(self.nodes)
+        shapes: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(("time", "experience"), (steps,)),
+            **dict.fromkeys(("online", "final", "odometry"), (steps, 3)),
+            "created": (nodes,),
+            "nodes": (nodes, 3),
+            "links": (len(self.links), 2),
+        }
+        if self.truth is not None:
+            shapes["truth"] = (steps, 3)
+        for name, shape in shapes.items():
+            array = np.asarray(getattr(self, name))
+            if array.shape != shape:
+                raise InputError(f"run.{name}", f"shape {array.shape}", str(shape))
+            if name != "truth" and not np.isfinite(array).all():
+                raise InputError(f"run.{name}", "a NaN or infinite value", "finite numbers")
+        if steps == 0:
+            raise InputError("run.time", "no steps", "at least one")
+        for name, low, high in (("experience", -1, nodes), ("created", -1, steps), ("links", 0, nodes)):
+            index = np.asarray(getattr(self, name))
+            if index.size and not (low <= index.min() and index.max() < high):
+                raise InputError(f"run.{name}", f"{index.min()} to {index.max()}", f"{low} to {high - 1}")

@@ -1,9 +1,8 @@
-"""Metrics of a run: extent, trajectory errors, Energy Metric and Experience Metric.
+"""Metrics of a run (`RUN_METRICS`): extent, trajectory errors, Energy Metric and Experience Metric.
 
-Metrics of a map in pieces, whose relative poses nothing in the map determines.
-
-A robot that was carried away begins a new piece; a loop closure with an older piece joins the two. The map
-defines no motion between steps in different pieces, so an error of such a pair says nothing about it.
+Some are of maps in several pieces. A robot that was carried away begins a new piece; a loop closure with an
+older piece joins the two. The map defines no motion between steps in different pieces, so an error of such a
+pair says nothing about it.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from evaluation.metrics.energy_metric import (
 )
 from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import (
     align,
     ate,
@@ -84,7 +83,7 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
     if len(pieces) < 2:
         return run
     final, online, nodes = run.final.copy(), run.online.copy(), run.nodes.copy()
-    rows, to_map, shown = truth_rows(run), None, list[np.ndarray]()
+    rows, to_map, shown = run.truth_rows, None, list[np.ndarray]()
     for one in pieces:
         steps, placed = run.piece == one, of_node == one
         known, moved = rows[steps[rows]], np.zeros(3)
@@ -198,7 +197,7 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         relations: true relative motions of the recording, if any. gap: distance of the pairs of
             `energy_gap`, steps.
     """
-    rows, truth = truth_rows(run), run.truth
+    rows, truth = run.truth_rows, run.truth
     note = "map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else ""
     findings = {
         "steps": Finding(len(run.time)),
@@ -208,16 +207,24 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
         "map_doubt": Finding(run.doubt, note=note if np.isfinite(run.doubt) else run.unjudged),
     }
     if run.has_pieces:
-        findings |= piece_findings(run, rows)
+        findings |= _piece_findings(run, rows)
     if relations is not None:
-        findings |= _relations(run, relations)
+        translation, rotation, used, dropped = relation_errors(run.time, run.final, relations)
+        raw_translation, raw_rotation, *_ = relation_errors(run.time, run.odometry, relations)
+        note = f"{used} relations" + (f", {dropped} outside the recording" if dropped else "")
+        findings["relations_translation"] = Finding(translation, raw_translation, note)
+        findings["relations_rotation_deg"] = Finding(rotation, raw_rotation, note)
     if truth is None or len(rows) == 0:
         return RunData(run, exm, rows, findings | experience_findings(run.experience, None, exm))
     if len(rows) < len(run.time):
         findings["steps"] = Finding(len(run.time), note=f"{len(rows)} of them with a true pose")
     findings["path"] = Finding(path_length(truth[rows]), path_length(run.odometry[rows]))
     compared = _trajectories(run, truth, rows) | _energies(run, truth, rows, gap)
-    findings |= _undefined_across_pieces(compared) if run.has_pieces else compared
+    if run.has_pieces:  # links are within pieces; all others compare poses of different pieces
+        reason = "across pieces that nothing joins"
+        for name in (name for name in compared if not name.startswith("energy_links")):
+            compared[name] = Finding(np.nan, compared[name].odometry, reason)
+    findings |= compared
     base = None if exm.base is None else int(np.searchsorted(rows, exm.base))
     inside = exm.model_copy(update={"base": base})
     findings |= experience_findings(run.experience[rows], truth[rows], inside)
@@ -226,33 +233,28 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
 
 def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[str, Finding]:
     truth, online, final, odometry = (poses[rows] for poses in (truth, run.online, run.final, run.odometry))
-    raw_ate, raw_rpe = ate(odometry, truth), rpe(odometry, truth)
-    raw_now = summarize_errors(online_errors(odometry, truth))
-    known, step = len(run.online_error) > 0, rpe(final, truth)
-    now = summarize_errors(run.online_error if known else online_errors(online, truth))
-    note, tied = "in the map of that time" if known else "of the online poses", _tie_note(run)
+    raw_ate, (raw_translation, raw_rotation) = ate(odometry, truth), rpe(odometry, truth)
+    raw_errors = summarize_errors(online_errors(odometry, truth))
+    known, (translation, rotation) = len(run.online_error) > 0, rpe(final, truth)
+    errors = summarize_errors(run.online_error if known else online_errors(online, truth))
+    note, tied = "in the map of that time" if known else "of the online poses", ""
+    if jump := tie_jump(run.online, run.odometry):  # online poses were in a piece of their own at first
+        at, distance = run.time[jump[0]], jump[1]
+        tied = f"with a jump of {distance:.1f} m at t = {at:.1f} s, as where a new piece is tied"
     unfinished = np.array_equal(run.final, run.online)
     return {
         "ate_final": Finding(ate(final, truth), raw_ate, tied if unfinished else ""),
         "ate_online": Finding(ate(online, truth), raw_ate, tied),
-        "anytime_median": Finding(now.median, raw_now.median, note),
-        "anytime_late": Finding(now.late, raw_now.late, note),
-        "anytime_jump": Finding(now.jump, raw_now.jump, note),
-        "rpe_translation": Finding(step.translation, raw_rpe.translation),
-        "rpe_rotation_deg": Finding(float(np.degrees(step.rotation)), float(np.degrees(raw_rpe.rotation))),
+        **{
+            f"anytime_{name}": Finding(error, raw, note)
+            for name, error, raw in zip(("median", "late", "jump"), errors, raw_errors, strict=True)
+        },
+        "rpe_translation": Finding(translation, raw_translation),
+        "rpe_rotation_deg": Finding(float(np.degrees(rotation)), float(np.degrees(raw_rotation))),
     }
 
 
-def _tie_note(run: RunArrays) -> str:
-    """A remark on errors of online poses that were in a piece of their own at first; '' for others."""
-    jump = tie_jump(run.online, run.odometry)
-    if jump is None:
-        return ""
-    step, distance = jump
-    return f"with a jump of {distance:.1f} m at t = {run.time[step]:.1f} s, as where a new piece is tied"
-
-
-def piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
+def _piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
     """Findings on a map in several pieces; rows: [K] steps with a true pose."""
     sizes = np.unique(run.piece, return_counts=True)[1]
     found = {
@@ -269,25 +271,6 @@ def piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
     return found | {
         "energy_within_pieces": Finding(ours.total, raw.total, f"{ours.pairs} pairs"),
         "ate_within_pieces": Finding(error, raw_error, "each piece aligned by itself"),
-    }
-
-
-def _undefined_across_pieces(findings: dict[str, Finding]) -> dict[str, Finding]:
-    """The findings without those that compare poses of different pieces; links are within pieces."""
-    reason = "across pieces that nothing joins"
-    return {
-        name: found if name.startswith("energy_links") else Finding(np.nan, found.odometry, reason)
-        for name, found in findings.items()
-    }
-
-
-def _relations(run: RunArrays, relations: Relations) -> dict[str, Finding]:
-    ours = relation_errors(run.time, run.final, relations)
-    raw = relation_errors(run.time, run.odometry, relations)
-    note = f"{ours.used} relations" + (f", {ours.dropped} outside the recording" if ours.dropped else "")
-    return {
-        "relations_translation": Finding(ours.translation, raw.translation, note),
-        "relations_rotation_deg": Finding(ours.rotation_deg, raw.rotation_deg, note),
     }
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig, ExperienceLog
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
-from evaluation.metrics.run_arrays import RunArrays, check_run
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import (
     DOUBTED,
     PIECES,
@@ -24,9 +24,7 @@ from tactile.base.errors import printable
 from tactile.base.settings import Settings
 
 REGISTERED = "Registered metrics"
-"""Heading of the metrics that are not ours."""
-
-
+"""Heading of the metrics of other packages."""
 MOST_WARNINGS = 10
 """Largest number of warnings that are printed."""
 WORSE = 1.01
@@ -58,6 +56,32 @@ class Scorecard(Settings):
     health: HealthCard | None = None
     """Of a run; None (null) for the log of another system."""
 
+    @property
+    def position_error(self) -> Quantity:
+        """The ATE of the final trajectory, within its pieces if there are several."""
+        return self.quantities.get("ate_within_pieces", self.quantities["ate_final"])
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the map is farther from the truth than odometry, whatever its health says."""
+        error = self.position_error
+        return error.value is not None and error.odometry is not None and error.value > WORSE * error.odometry
+
+    def lines(self) -> dict[str, list[tuple[str, str, str, str, str]]]:
+        """The lines of the table under the heading of each section: label, value, unit, value of odometry
+        ("" without one), note ("as above" for one that repeats)."""
+        known = {metric.name: metric.section for metric in RUN_METRICS}
+        sections: dict[str, list[tuple[str, str, str, str, str]]] = {}
+        for section in dict.fromkeys(known.get(name, REGISTERED) for name in self.quantities):
+            sections[section], above = [], ""
+            for name, found in self.quantities.items():
+                if known.get(name, REGISTERED) == section:
+                    raw = "" if found.odometry is None else _text(found.odometry)
+                    note = "as above" if found.note and found.note == above else found.note
+                    sections[section].append((found.label, _text(found.value), found.unit, raw, note))
+                    above = found.note
+        return sections
+
 
 def score_run(
     run: RunArrays,
@@ -72,12 +96,12 @@ def score_run(
 
     Args:
         relations: true relative motions of the recording, if any.
-        gap: distance of the pairs of `energy_gap`, steps. metrics: computed besides ours.
+        gap: distance of the pairs of `energy_gap`, steps. metrics: computed besides `RUN_METRICS`.
 
     Raises:
         InputError: the arrays do not fit each other.
     """
-    check_run(run)
+    run.check()
     data = run_data(run, exm, relations, gap)
     known = bool(np.isfinite(run.doubt))
     health = HealthCard(
@@ -106,36 +130,11 @@ def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT
     return Scorecard(name=name, exm=exm, quantities=quantities)
 
 
-class Line(NamedTuple):
-    """One line of a table of quantities, as text.
-
-    Attributes:
-        label, value, unit, note: of the quantity; "as above" for a note that repeats. odometry: value of
-            odometry, "" without one.
-    """
-
-    label: str
-    value: str
-    unit: str
-    odometry: str
-    note: str
-
-
-def scorecard_lines(card: Scorecard) -> dict[str, list[Line]]:
-    """The lines of a scorecard's table under the heading of each section."""
-    known, sections = {metric.name: metric.section for metric in RUN_METRICS}, {}
-    found = [(known.get(name, REGISTERED), quantity) for name, quantity in card.quantities.items()]
-    for section in dict.fromkeys(section for section, _ in found):
-        shown = [quantity for of, quantity in found if of == section]
-        sections[section] = [_line(q, above) for above, q in zip([None, *shown], shown, strict=False)]
-    return sections
-
-
 def render_scorecard(card: Scorecard) -> str:
     """The scorecard as a text table: quantity, value, unit, value of odometry, note."""
     width = max(len(quantity.label) for quantity in card.quantities.values()) + 2
     lines = [f"{printable(card.name):<{width + 2}}{'value':>9}  {'unit':<8} {'odometry':>9}"]
-    for section, shown in scorecard_lines(card).items():
+    for section, shown in card.lines().items():
         lines += ["", section]
         for label, value, unit, odometry, note in shown:
             lines.append(f"  {label:<{width}}{value:>9}  {unit:<8} {odometry:>9}  {note}".rstrip())
@@ -145,7 +144,7 @@ def render_scorecard(card: Scorecard) -> str:
 def scorecard_html(card: Scorecard) -> str:
     """The scorecard as an HTML table with the same columns; its texts are escaped."""
     rows = [_html_row("th", (card.name, "value", "unit", "odometry", ""))]
-    for section, shown in scorecard_lines(card).items():
+    for section, shown in card.lines().items():
         rows += [_html_row("th", (section, "", "", "", "")), *(_html_row("td", line) for line in shown)]
     return f"<table>{''.join(rows)}</table>"
 
@@ -174,31 +173,14 @@ def render_warnings(card: Scorecard) -> list[str]:
     return lines if len(lines) <= MOST_WARNINGS else lines[:MOST_WARNINGS] + more
 
 
-def position_error(card: Scorecard) -> Quantity:
-    """The ATE of the final trajectory, within its pieces if there are several."""
-    return card.quantities.get("ate_within_pieces", card.quantities["ate_final"])
-
-
-def is_worse(card: Scorecard) -> bool:
-    """Whether the map is farther from the truth than odometry, whatever its health says."""
-    error = position_error(card)
-    return error.value is not None and error.odometry is not None and error.value > WORSE * error.odometry
-
-
 def render_error(card: Scorecard) -> str:
     """The position error beside that of odometry in one line, with a word where the map is worse."""
-    error = position_error(card)
+    error = card.position_error
     if error.value is None:
         return "ATE (RMS): unknown, no truth"
     raw = "" if error.odometry is None else f", odometry {error.odometry:.3g} {error.unit}"
-    worse = "; against the truth the map is worse than odometry" if is_worse(card) else ""
+    worse = "; against the truth the map is worse than odometry" if card.is_worse else ""
     return f"{error.label} (RMS): {error.value:.3g} {error.unit}{raw}{worse}"
-
-
-def _line(quantity: Quantity, above: Quantity | None) -> Line:
-    raw = "" if quantity.odometry is None else _text(quantity.odometry)
-    note = "as above" if above and quantity.note and quantity.note == above.note else quantity.note
-    return Line(quantity.label, _text(quantity.value), quantity.unit, raw, note)
 
 
 def _html_row(cell: str, texts: tuple[str, ...]) -> str:

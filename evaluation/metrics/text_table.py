@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from itertools import chain
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,15 +18,8 @@ Columns = Mapping[str, tuple[str, ...]]
 """Columns to read, in order: name -> alternative names in a header (compared in lower case)."""
 
 
-class TextTable(NamedTuple):
-    """The rows of a file: `values` [N, columns] float64 and their `line` numbers [N], from 1."""
-
-    values: np.ndarray
-    line: np.ndarray
-
-
-def read_text_table(path: str | Path, columns: Columns) -> TextTable:
-    """Reads columns of a file.
+def read_text_table(path: str | Path, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    """Reads columns of a file: the values [N, columns] float64 of its rows and their line numbers [N] from 1.
 
     A first line that is not all numbers is a header; other columns of the file are ignored. A file without a
     header holds exactly these columns in this order. Blank lines and lines that begin with `#` are skipped. A
@@ -37,38 +28,13 @@ def read_text_table(path: str | Path, columns: Columns) -> TextTable:
     Raises:
         InputError: the file cannot be read, lacks a column or has a malformed row (with file and line).
     """
-    lines = _lines(path)
-    first, fields, ended = next(lines, (1, [], False))
-    if not fields:
+    every = list(enumerate(read_text(path, "a text file of numbers").split("\n"), start=1))
+    lines = [(number, line) for number, line in every if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
         raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
+    fields = _cells(lines[0][1])
     header = _numbers(fields) is None
     names = [name.lower() for name in fields] if header else list(columns)
-    where = _places(f"{path}:{first}", names, columns)
-    rows, at = [], []
-    for number, cells, whole in lines if header else chain([(first, fields, ended)], lines):
-        row = _numbers(cells)
-        if row is not None and len(row) == len(names) and all(abs(number) <= LARGEST for number in row):
-            rows.append([row[place] for place in where])
-            at.append(number)
-        elif whole:
-            found = f"'{' '.join(cells)[:LONGEST]}'"
-            raise InputError(f"{path}:{number}", found, f"{len(names)} finite numbers: {' '.join(names)}")
-    if not rows:
-        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
-    return TextTable(np.array(rows), np.array(at))
-
-
-def _lines(path: str | Path) -> Iterator[tuple[int, list[str], bool]]:
-    """Line number, fields, and whether the line ends with a newline."""
-    lines = read_text(path, "a text file of numbers").split("\n")
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            cells = [cell.strip() for cell in line.split(",")] if "," in line else line.split()
-            yield number, cells, number < len(lines)
-
-
-def _places(where: str, names: list[str], columns: Columns) -> list[int]:
-    """Index of each column in the header."""
     found = [
         [names.index(name) for name in (column, *others) if name in names]
         for column, others in columns.items()
@@ -76,8 +42,25 @@ def _places(where: str, names: list[str], columns: Columns) -> list[int]:
     missing = [column for column, at in zip(columns, found, strict=True) if not at]
     if missing:
         known = "; ".join("/".join((column, *columns[column])) for column in missing)
-        raise InputError(where, f"no column {', '.join(missing)} among {' '.join(names)}", known)
-    return [at[0] for at in found]
+        lack = f"no column {', '.join(missing)} among {' '.join(names)}"
+        raise InputError(f"{path}:{lines[0][0]}", lack, known)
+    rows, at = [], []
+    for number, line in lines[header:]:
+        cells = _cells(line)
+        row = _numbers(cells)
+        if row is not None and len(row) == len(names) and all(abs(value) <= LARGEST for value in row):
+            rows.append([row[places[0]] for places in found])
+            at.append(number)
+        elif number < len(every):  # the line ends with a newline
+            shown = f"'{' '.join(cells)[:LONGEST]}'"
+            raise InputError(f"{path}:{number}", shown, f"{len(names)} finite numbers: {' '.join(names)}")
+    if not rows:
+        raise InputError(str(path), "no rows", f"lines of {' '.join(columns)}")
+    return np.array(rows), np.array(at)
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def _numbers(cells: list[str]) -> list[float] | None:

@@ -7,7 +7,6 @@ same times (`interpolate` makes them).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,26 +15,6 @@ from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, fit_rigid_motion, tum_line, wrap
 
 _TUM = {name: () for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")}
-
-
-class MotionError(NamedTuple):
-    """Root mean square errors of relative motions: translation in m, rotation in rad."""
-
-    translation: float
-    rotation: float
-
-
-class OnlineError(NamedTuple):
-    """Error of the current position over the course of a run, m.
-
-    Attributes:
-        median: over all rows. late: RMS over the second half of the rows.
-        jump: largest change of the error between successive rows.
-    """
-
-    median: float
-    late: float
-    jump: float
 
 
 def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -78,11 +57,12 @@ def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray
     return between(between(reference[i], reference[j]), between(estimate[i], estimate[j]))
 
 
-def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> MotionError:
-    """Relative pose error over `step` rows (Sturm et al. 2012); NaN with fewer rows."""
+def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> tuple[float, float]:
+    """Relative pose error over `step` rows (Sturm et al. 2012): root mean squares of translation, m, and
+    rotation, rad; NaN with fewer rows."""
     i = np.arange(max(0, len(estimate) - step))
     error = motion_errors(estimate, reference, np.stack([i, i + step], axis=1))
-    return MotionError(_rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2]))
+    return _rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2])
 
 
 def online_errors(online: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -106,10 +86,11 @@ def current_error(path: np.ndarray, reference: np.ndarray) -> float:
     return float(position_errors(path, reference)[-1])
 
 
-def summarize_errors(error: np.ndarray) -> OnlineError:
-    """Summary of errors [N] in order of time."""
+def summarize_errors(error: np.ndarray) -> tuple[float, float, float]:
+    """Of errors [N] in order of time their median, the root mean square over the second half of the rows, and
+    the largest change from one row to the next."""
     jump = np.abs(np.diff(error)).max(initial=0.0)
-    return OnlineError(float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump))
+    return float(np.median(error)), _rms(error[len(error) // 2 :]), float(jump)
 
 
 def interpolate(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -137,11 +118,11 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: the file cannot be read or a line is malformed.
     """
-    table = read_text_table(path, _TUM)
-    t, x, y, _, qx, qy, qz, qw = table.values.T
+    values, line = read_text_table(path, _TUM)
+    t, x, y, _, qx, qy, qz, qw = values.T
     norm = qx * qx + qy * qy + qz * qz + qw * qw
     if np.any(norm == 0):
-        where = f"{path}:{table.line[norm == 0][0]}"
+        where = f"{path}:{line[norm == 0][0]}"
         raise InputError(where, "a quaternion of length 0", "a unit quaternion qx qy qz qw")
     heading = np.arctan2(2 * (qw * qz + qx * qy), norm - 2 * (qy * qy + qz * qz))
     return t, np.stack([x, y, heading], axis=1)

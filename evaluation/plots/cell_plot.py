@@ -55,7 +55,14 @@ def map_cells(recording: CellRecording, most: int = MOST) -> CellMaps:
             enough.
     """
     settings = MapSettings()
-    sums, cell = _recorded_sums(recording, settings)
+    sums, cell = recording.sums, recording.cell
+    if sums is not None and len(cell) == 0:
+        cell = np.arange(len(sums.place))
+    elif len(cell) == 0:
+        raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
+    else:
+        edges, bins = arena_edges(recording.truth, settings.place_bins), settings.heading_bins
+        sums = bin_activity(recording.time, recording.truth, recording.activity, *edges, bins)
     total = sums.place.sum(axis=(1, 2))
     active = np.sort(np.argsort(-total, kind="stable")[: -(-len(cell) // 2)])
     chosen = active[np.unique(np.linspace(0, len(active) - 1, most).round().astype(int))]
@@ -151,15 +158,3 @@ def draw_spikes_on_path(
         label = f"cell {recording.cell[k]}, {len(times)} spike{'s' * (len(times) != 1)}"
         axes.set_title(label, fontsize=7, color=INK, pad=2)
     return figure
-
-
-def _recorded_sums(recording: CellRecording, settings: MapSettings) -> tuple[BinnedSums, np.ndarray]:
-    """The sums of the chosen cells, or if there are none those of all, and the indices of these cells."""
-    if len(recording.cell) == 0 and recording.sums is not None:
-        return recording.sums, np.arange(len(recording.sums.place))
-    if len(recording.cell) == 0:
-        raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
-    edges = arena_edges(recording.truth, settings.place_bins)
-    bins = settings.heading_bins
-    sums = bin_activity(recording.time, recording.truth, recording.activity, *edges, bins)
-    return sums, recording.cell

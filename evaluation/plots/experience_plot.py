@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.metrics.exm import ExperienceMetric, experience_metric
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION
@@ -19,11 +19,17 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
 
     Without truth or a return to the start there are no verdicts; then all steps look the same.
     """
-    rows = truth_rows(run) if len(truth_rows(run)) else np.arange(len(run.time))
+    rows = run.truth_rows if len(run.truth_rows) else np.arange(len(run.time))
     judged, reason = _judge(run, card, rows)
     rows = rows[run.experience[rows] >= 0]
     experience = run.experience[rows]
-    figure = style.new_figure(_HEIGHT, card.name, reason if judged is None else _line(judged))
+    line = reason
+    if judged is not None:
+        arr = f"ARR {judged.arr:.2f} ({judged.relocalisations} of {judged.entries} steps after it)"
+        arcr = f"ARCR {judged.arcr:.2f} ({judged.correct} of {judged.relocalisations} correct, strict mode)"
+        parts = (f"base set of {judged.base} steps", arr, arcr)
+        line = "  ·  ".join(part for part in parts if "nan" not in part)
+    figure = style.new_figure(_HEIGHT, card.name, line)
     inner = style.WIDTH - style.LEFT - style.RIGHT
     axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
@@ -53,7 +59,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
 
 def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:
     """The strict Experience Metric of the steps `rows`, or None and the reason."""
-    if run.truth is None or len(truth_rows(run)) == 0:
+    if run.truth is None or len(run.truth_rows) == 0:
         return None, "no ground truth: re-localisations cannot be judged"
     if (run.experience[rows] < 0).all():
         return None, "no experiences"
@@ -63,10 +69,3 @@ def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[Experienc
         return experience_metric(run.experience[rows], run.truth[rows], config), ""
     except InputError as error:
         return None, f"no verdicts: {error.where} {error.found}"
-
-
-def _line(found: ExperienceMetric) -> str:
-    arr = f"ARR {found.arr:.2f} ({found.relocalisations} of {found.entries} steps after it)"
-    arcr = f"ARCR {found.arcr:.2f} ({found.correct} of {found.relocalisations} correct, strict mode)"
-    parts = (f"base set of {found.base} steps", arr, arcr)
-    return "  ·  ".join(part for part in parts if "nan" not in part)

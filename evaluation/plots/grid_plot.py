@@ -109,12 +109,6 @@ def grid_headline(score: GridScore) -> str:
     return "  ·  ".join(parts)
 
 
-def mean_position_error(path: np.ndarray, truth: np.ndarray) -> float:
-    """Mean distance from the true positions without alignment, m; NaN without truth."""
-    away = np.hypot(*(np.asarray(path)[:, :2] - np.asarray(truth)[:, :2]).T)
-    return float(np.nanmean(away)) if np.isfinite(away).any() else float("nan")
-
-
 def _aspect(grid: OccupancyGrid) -> float:
     height, width = grid.probability.shape
     return height / width
@@ -145,8 +139,9 @@ def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) ->
     truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
 
     def name(word: str, path: np.ndarray) -> str:
-        off = mean_position_error(path, truth) if errors else np.nan
-        return word if np.isnan(off) else f"{word}, mean error {off:.3f} m"
+        away = np.hypot(*(path - truth).T)
+        known = errors and np.isfinite(away).any()
+        return f"{word}, mean error {float(np.nanmean(away)):.3f} m" if known else word
 
     dashed = (0, (4, 2))
     axes.plot(*odometry.T, color=_PALE, lw=0.8, ls=dashed, zorder=3, label=name("odometry", odometry))

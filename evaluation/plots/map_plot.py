@@ -1,11 +1,5 @@
-"""Plot of the map of a run with truth, odometry and walls.
-
-Plot of the places at which a localised session does not agree with its map.
-
-Plot of a map that was merged of several sessions.
-
-Plot of a way over the experiences of a map.
-"""
+"""Plots in the frame of a map: the map of a run with truth, odometry and walls; the places at which a
+localised session does not agree with its map; the sessions of a merged map; a way over its experiences."""
 
 from __future__ import annotations
 
@@ -15,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.artifacts.closure_table import ChangeRow
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
@@ -47,6 +41,20 @@ class Layers(NamedTuple):
     nodes: np.ndarray
     to_map: np.ndarray = IN_PLACE
 
+    @classmethod
+    def align(cls, run: RunArrays) -> Layers:
+        """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without
+        truth, odometry starts at the first pose of the map."""
+        rows = run.truth_rows
+        if run.truth is None or len(rows) == 0:
+            to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
+            return cls(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
+        true = run.truth[rows]
+        to_map = align(true, run.final[rows])
+        odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
+        truth = compose(to_map, run.truth)
+        return cls(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
+
 
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
@@ -68,15 +76,24 @@ def draw_map(
     of = f"piece {run.main + 1}, the largest" if run.has_pieces and not localised else style.MAP
     line = map_headline(card, f"found in {known:,} of {len(run.time):,} steps" if localised else "")
     run = arrange_pieces(run)
-    layers = align_layers(run)
+    layers = Layers.align(run)
     shown = walls if layers.truth is not None else NO_WALLS
-    figure, axes = style.map_figure(_frame(layers, shown), card.name, line, of)
+    # The box around truth, walls and map, and around odometry near them.
+    truth = layers.truth
+    points = [layers.final, layers.nodes] + ([] if truth is None else [truth])
+    low, high = bounds(*points, wall_corners(shown, layers.to_map))
+    if len(shown) == 0:
+        room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
+        low = np.minimum(low, np.maximum(far_low, low - room))
+        high = np.maximum(high, np.minimum(far_high, high + room))
+    figure, axes = style.map_figure(style.frame(np.stack([low, high])), card.name, line, of)
     if len(shown):
         draw_walls(axes, shown, layers.to_map)
         _paint_laps(axes, run, layers, card.exm.position, closures)
     else:
         _paint(axes, run, layers)
-    _paint_start(axes, layers)
+    start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
+    axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
     style.add_legend(figure, axes)
     return figure
 
@@ -126,34 +143,8 @@ def wall_corners(walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> np.ndarray
     return _xy(compose(to_map, np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=-1)))
 
 
-def align_layers(run: RunArrays) -> Layers:
-    """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without truth,
-    odometry starts at the first pose of the map."""
-    rows = truth_rows(run)
-    if run.truth is None or len(rows) == 0:
-        to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
-        return Layers(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
-    true = run.truth[rows]
-    to_map = align(true, run.final[rows])
-    odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
-    truth = compose(to_map, run.truth)
-    return Layers(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
-
-
 def _xy(pose: np.ndarray) -> np.ndarray:
     return np.asarray(pose)[..., :2]
-
-
-def _frame(layers: Layers, walls: np.ndarray) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] (m) around truth, walls, map and odometry near them."""
-    truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(walls, layers.to_map), *truth)
-    if len(walls) == 0:
-        room = _ROOM * (high - low).max()
-        far_low, far_high = bounds(layers.odometry)
-        low = np.minimum(low, np.maximum(far_low, low - room))
-        high = np.maximum(high, np.minimum(far_high, high + room))
-    return style.frame(np.stack([low, high]))
 
 
 def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
@@ -241,12 +232,6 @@ def split_at_jumps(line: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.insert(line, 1 + np.flatnonzero(step > _JUMP * usual), np.nan, axis=0)
 
 
-def _paint_start(axes: style.Axes, layers: Layers) -> None:
-    truth = layers.truth
-    start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
-    axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
-
-
 _MARGIN = 0.06  # m around all
 _KINDS = {
     "new": (VERMILLION, "something new"),
@@ -265,7 +250,7 @@ def draw_changes(
             surest first. walls: [B, 5] west, south, east, north, height, m, as the session found them; drawn
             with truth, in whose frame they are.
     """
-    rows = truth_rows(run)[run.found[truth_rows(run)]]
+    rows = run.truth_rows[run.found[run.truth_rows]]
     known = run.truth is not None and len(rows) > 0
     to_map = align(run.truth[rows], run.final[rows]) if known and run.truth is not None else IN_PLACE
     path = np.where(run.found[:, None], run.final[:, :2], np.nan)
@@ -275,7 +260,15 @@ def draw_changes(
     seen = path if run.found.any() or len(ground) else np.zeros((1, 2))
     low, high = bounds(seen, ground[:, :2], places, wall_corners(shown, to_map))
     box = np.stack([low - _MARGIN, high + _MARGIN])
-    figure, axes = style.map_figure(box, name, _headline(run, changes), style.MAP)
+    line, found = "not found in the map: nothing compared", run.found.sum()
+    if changes:
+        verb, surest = "place has" if len(changes) == 1 else "places have", changes[0]
+        sure = f"surest: {surest.evidence:.0f} nat in {surest.passes} passes"
+        line = f"{len(changes)} {verb} changed  ·  {sure}"
+    elif found:
+        steps = f"{found:,} of {len(run.time):,} steps"
+        line = f"the session agrees with the map in the {steps} that were found"
+    figure, axes = style.map_figure(box, name, line, style.MAP)
     if len(shown):
         draw_walls(axes, shown, to_map)
     if len(ground):
@@ -303,18 +296,6 @@ def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, si
         axes.text(*at, str(number), color=color, fontsize=11, fontweight="bold", zorder=7)
 
 
-def _headline(run: RunArrays, changes: Sequence[ChangeRow]) -> str:
-    if not changes:
-        known = run.found.sum()
-        where = f"in the {known:,} of {len(run.time):,} steps that were found"
-        return (
-            f"the session agrees with the map {where}" if known else "not found in the map: nothing compared"
-        )
-    places = "place has" if len(changes) == 1 else "places have"
-    surest = changes[0]
-    return f"{len(changes)} {places} changed  ·  surest: {surest.evidence:.0f} nat in {surest.passes} passes"
-
-
 def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequence[int]) -> style.Figure:
     """Draws the paths of the sessions of a merged map, each in a colour of its own; pieces that nothing joins
     beside each other.
@@ -323,7 +304,14 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
         path: [T, 3] poses of all steps in the map, m, m, rad. piece: [T] the piece of each. steps: number of
             steps of each session, in the order of `path`.
     """
-    shown = _beside_each_other(path, piece)
+    # The pieces where pictures show them: beside each other.
+    count = len(path)
+    run = RunArrays(
+        time=np.arange(float(count)), truth=None, online=path, final=path, odometry=path,
+        experience=np.full(count, -1), created=np.zeros(0, int), nodes=np.zeros((0, 3)),
+        links=np.zeros((0, 2), int), piece=piece,
+    )  # fmt: skip
+    shown = arrange_pieces(run).final[:, :2]
     pieces, largest = len(np.unique(piece)), int(np.bincount(piece).argmax())
     joined = "joined" if pieces == 1 else f"{pieces} pieces"
     line = f"{len(steps)} sessions, {len(path)} steps  ·  {joined}"
@@ -342,17 +330,6 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
         axes.plot(*shown[end - count], "o", ms=8, mfc="none", mec=GREEN, mew=1.6, zorder=4, label=label)
     style.add_legend(figure, axes)
     return figure
-
-
-def _beside_each_other(path: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """[T, 2] positions with the pieces where pictures show them."""
-    none, count = np.zeros(0, int), len(path)
-    run = RunArrays(
-        time=np.arange(float(count)), truth=None, online=path, final=path, odometry=path,
-        experience=np.full(count, -1), created=none, nodes=np.zeros((0, 3)), links=np.zeros((0, 2), int),
-        piece=piece,
-    )  # fmt: skip
-    return arrange_pieces(run).final[:, :2]
 
 
 def draw_way(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts import closure_table
-from evaluation.artifacts.closure_table import read_closures
+from evaluation.artifacts.closure_table import CHANGES, read_changes, read_closures
 from evaluation.artifacts.grid_files import read_grid, read_grid_truth
 from evaluation.artifacts.recorded_views import read_whisker_views
 from evaluation.artifacts.run_reader import read_run, read_scorecard, read_walls
@@ -21,7 +19,7 @@ from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
-from evaluation.plots.map_plot import align_layers, draw_changes, draw_map
+from evaluation.plots.map_plot import Layers, draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.files import read_json
 from tactile.base.se2 import between
@@ -46,8 +44,8 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         images = read_whisker_views(directory / "views.npz")
         plots["whiskers"] = lambda: draw_whiskers(run, card, images, walls)
         plots["experiences"] = lambda: draw_experience_history(run, card)
-    if (directory / closure_table.NAME).exists():
-        changes = closure_table.read_changes(directory / closure_table.NAME)
+    if (directory / CHANGES).exists():
+        changes = read_changes(directory / CHANGES)
         plots["changes"] = lambda: draw_changes(card.name, run, changes, walls)
     if (directory / "grid.npz").exists():
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))
@@ -67,11 +65,10 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     Raises:
         InputError: a file is missing or malformed.
     """
-    return {f"{name}.png": partial(_save, draw) for name, draw in run_plots(directory).items()}
-
-
-def _save(draw: Callable[[], Figure], path: Path) -> None:
-    draw().savefig(path)
+    return {
+        f"{name}.png": lambda path, draw=draw: draw().savefig(path)  # type: ignore[misc]
+        for name, draw in run_plots(directory).items()
+    }
 
 
 def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
@@ -79,7 +76,7 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
     grid = read_grid(directory / "grid.npz")
     if len(run.state):
         shown = arrange_pieces(run)
-        layers = align_layers(shown)
+        layers = Layers.align(shown)
         true = np.full((1, 2), np.nan) if layers.truth is None else layers.truth
         known = np.where(run.found[:, None], shown.final[:, :2], np.nan)
         line = f"found in {run.found.sum():,} of {len(run.time):,} steps"

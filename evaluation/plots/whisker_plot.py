@@ -6,7 +6,7 @@ import numpy as np
 
 from evaluation.artifacts.recorded_views import WhiskerViews
 from evaluation.metrics.exm import base_end
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, split_at_jumps, wall_corners
@@ -40,23 +40,41 @@ def draw_whiskers(
     Raises:
         InputError: the numbers of images and steps differ.
     """
+    from matplotlib.colors import to_rgb
+
     if len(images.view) != len(run.time):
         raise InputError("views.npz", f"{len(images.view)} images", f"{len(run.time)}, one for each step")
-    rows = truth_rows(run)
+    rows = run.truth_rows
     pose = run.final if len(rows) == 0 or run.truth is None else run.truth
     steps = np.arange(len(pose)) if len(rows) == 0 else rows
     shown = walls if len(rows) else NO_WALLS
-    box, reach = _frame(pose[steps, :2], shown)
-    chosen = _spread(pose, _first_visit(pose, steps), 2.4 * reach)
+    # The corners of the scene and the radius of a drawn head, m.
+    low, upper = bounds(pose[steps, :2], wall_corners(shown))
+    extent = max((upper - low).max(), 1e-3)
+    reach = float(np.clip(_REACH, _LEAST * extent, _LARGEST * extent))
+    middle, size = (low + upper) / 2, upper - low + (0.02 * extent if len(shown) else 2.6 * reach)
+    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
+    box = np.stack([middle - size / 2, middle + size / 2])
+    try:
+        loop = steps[: max(1, base_end(pose[steps]))]  # the first loop
+    except InputError:
+        loop = steps
+    chosen = _spread(pose, loop, 2.4 * reach)
 
     parts = np.array_split(np.arange(len(run.time)), min(MAX_STRIPS, -(-len(run.time) // STRIP_COLUMNS)))
     inner = style.WIDTH - style.LEFT - style.RIGHT
     high = (inner - _KEY) * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
     tall = images.view[0].size * _ROW
     total = style.TOP + _MARKS + len(parts) * (tall + _GAP) + 0.25 + high + _BOTTOM
-    figure = style.new_figure(total, card.name, _line(images))
+    rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
+    touched = (images.view > 0).sum() / max(1, images.alive.sum())
+    heads = f"rings of {images.view.shape[2]} whiskers, {rings} mm long"
+    line = f"{len(images.view)} whisks  ·  {heads}  ·  {touched:.0%} of whiskers in contact"
+    figure = style.new_figure(total, card.name, line)
 
-    pixels, bottom = _pixels(images), total - style.TOP - _MARKS + _GAP
+    pixels, bottom = _colors(images.view), total - style.TOP - _MARKS + _GAP
+    pixels[images.view == 0] = to_rgb(_NOTHING)
+    pixels[~images.alive] = to_rgb(_DEAD)
     for part in parts:
         bottom -= tall + _GAP
         axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
@@ -79,31 +97,6 @@ def draw_whiskers(
     return figure
 
 
-def _line(images: WhiskerViews) -> str:
-    rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
-    touched = (images.view > 0).sum() / max(1, images.alive.sum())
-    heads = f"rings of {images.view.shape[2]} whiskers, {rings} mm long"
-    return f"{len(images.view)} whisks  ·  {heads}  ·  {touched:.0%} of whiskers in contact"
-
-
-def _frame(path: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float]:
-    """Corners [[left, bottom], [right, top]] (m), and the radius of a drawn head (m)."""
-    low, high = bounds(path, wall_corners(walls))
-    extent = max((high - low).max(), 1e-3)
-    reach = float(np.clip(_REACH, _LEAST * extent, _LARGEST * extent))
-    middle, size = (low + high) / 2, high - low + (0.02 * extent if len(walls) else 2.6 * reach)
-    size = np.maximum(size, size[::-1] * [1 / _TALLEST, _FLATTEST])
-    return np.stack([middle - size / 2, middle + size / 2]), reach
-
-
-def _first_visit(pose: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """The steps of the first loop, or all steps without a loop."""
-    try:
-        return steps[: max(1, base_end(pose[steps]))]
-    except InputError:
-        return steps
-
-
 def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
     """Up to `MAX_HEADS` of the steps, in order, at least `apart` m from each other.
 
@@ -123,16 +116,6 @@ def _colors(share: np.ndarray) -> np.ndarray:
     import matplotlib
 
     return matplotlib.colormaps["viridis_r"](share)[..., :3]
-
-
-def _pixels(images: WhiskerViews) -> np.ndarray:
-    """The colour [N, R, C, 3] of each whisker."""
-    from matplotlib.colors import to_rgb
-
-    pixels = _colors(images.view)
-    pixels[images.view == 0] = to_rgb(_NOTHING)
-    pixels[~images.alive] = to_rgb(_DEAD)
-    return pixels
 
 
 def _paint_strip(

@@ -1,6 +1,6 @@
 """The charts of the page, as figures of plotly.
 
-A trace names its role in `meta`; the page colours roles by `palette.PALETTE`.
+A trace names its role in `meta`; the page colours roles by `PALETTE`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.closure_table import ACCEPTED
-from evaluation.metrics.run_arrays import truth_rows
+from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import position_errors
 from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
@@ -30,24 +30,46 @@ _ROOM, _MARGIN = 0.15, 0.06  # shares of the map's size: for drifting odometry, 
 def run_charts(report: RunReport) -> dict[str, Any]:
     """The charts of a run by name: `map`, and those of `error`, `doubt`, `belief`, `spread`, `cost` that have
     data."""
-    charts = {"map": map_chart(report), "error": error_chart([report])}
+    charts = {"map": _map_chart(report), "error": error_chart([report])}
+    time = report.run.time - report.run.time[0]
     if np.isfinite(report.doubt).any():
-        charts["doubt"] = _doubt_chart(report)
+        doubt, name = np.column_stack([time, report.doubt]), "probability worse than odometry"
+        limit = np.array([[time[0], DOUBTED], [time[-1], DOUBTED]])
+        bound = _line(limit, "limit above which a map is doubted", "limit", dash="dash", width=1.4)
+        traces = [_line(doubt, name, "final", width=2), bound]
+        charts["doubt"] = _figure(traces, "time, s", "probability")
+        charts["doubt"].update_yaxes(range=[-0.02, 1.02])
     elif report.run.truth is None:
-        charts["spread"] = _spread_chart(report)
+        spread = _line(np.column_stack([time, report.spread]), "standard deviation", "final", width=1.6)
+        charts["spread"] = _figure([spread], "time, s", "m", zero=True)
     if len(report.belief):
-        charts["belief"] = _belief_chart(report)
-    if len(report.cost.time):
-        charts["cost"] = _cost_chart(report)
+        kinds = (("heaviest packet", "final"), ("second packet", "doubted"), ("new place", "odometry"))
+        traces = [
+            _line(np.column_stack([time[report.belief_step], share]), name, role, width=1.2)
+            for (name, role), share in zip(kinds, report.belief.T, strict=True)
+        ]
+        charts["belief"] = _figure(traces, "time, s", "probability")
+        charts["belief"].update_yaxes(range=[-0.02, 1.02])
+    if len(report.cost):
+        cost = np.column_stack([report.cost_step, 1e3 * report.cost])
+        shown = _line(cost, "mean of each chunk of steps", "final", width=1.4)
+        charts["cost"] = _figure([shown], "step", "ms a step")
+        charts["cost"].update_yaxes(type="log", dtick=1)
     return {name: chart for name, chart in charts.items() if chart is not None}
 
 
-def map_chart(report: RunReport) -> Any:
+def _map_chart(report: RunReport) -> Any:
     """The map: walls or grid, truth, odometry, final trajectory, experiences with their links, closures."""
+    from plotly import graph_objects
+
     layers, traces = report.layers, []
+    corners = wall_corners(report.walls, layers.to_map)
     if report.grid is not None:
-        traces.append(_grid_trace(report))
-    traces += [] if not len(report.walls) else [_wall_trace(wall_corners(report.walls, layers.to_map))]
+        traces.append(_grid_trace(report.grid))
+    if len(report.walls):
+        x, y = _columns(_gapped(corners))
+        wall = graph_objects.Scatter(x=x, y=y, fill="toself", mode="lines", line_width=0)
+        traces.append(wall.update(name="wall", meta="wall", hoverinfo="skip"))
     if len(report.truth_lines):
         lines = _gapped(report.truth_lines.reshape(-1, 2, 2))
         traces.append(_line(lines, "walls, true", "ink", width=1.5))
@@ -61,8 +83,19 @@ def map_chart(report: RunReport) -> Any:
     run = report.run
     main = f"piece {run.main + 1}," if run.has_pieces and not len(run.state) else "the map,"
     traces = [*traces, *_place_traces(report), *_closure_traces(report)]
-    figure = _map_figure(traces, _frame(report), main)
-    figure.update_layout(shapes=_shapes(report))
+    # The frame around the map, and around odometry near it.
+    points = [layers.final, layers.nodes] + ([] if layers.truth is None else [layers.truth])
+    low, high = bounds(*points, corners, report.truth_lines.reshape(-1, 2))
+    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
+    low = np.minimum(low, np.maximum(far_low, low - room))
+    high = np.maximum(high, np.minimum(far_high, high + room))
+    figure = _map_figure(traces, _around(low, high), main)
+    # The links, and of each verdict the lines between the two places, in the order of its marks.
+    links = layers.nodes[run.links]
+    shapes = [_line_shape(links, "link", "solid", "experience")] if len(links) else []
+    for verdict, _, ends in _drawn_closures(report):
+        shapes.append(_line_shape(ends, *_CLOSURES.get(verdict, _OTHER)[::2], _text(verdict)))
+    figure.update_layout(shapes=shapes)
     if report.grid is not None:  # no empty space beside the grid
         figure.update_xaxes(constrain="domain").update_yaxes(constrain="domain")
     return figure
@@ -106,7 +139,7 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
     truth."""
     traces, alone = [], len(reports) == 1
     for number, report in enumerate(reports):
-        run, rows = report.run, truth_rows(report.run)
+        run, rows = report.run, report.run.truth_rows
         if run.truth is None or len(rows) == 0:
             continue
         time, start = run.time[rows] - run.time[0], run.time[0]
@@ -116,46 +149,11 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
             continue
         odometry = np.column_stack([time, position_errors(run.odometry[rows], run.truth[rows])])
         traces.append(_line(odometry, "odometry", "odometry", width=1))
-        if len(report.online_error.time) and not run.has_pieces:  # it compares poses of different pieces
-            online = np.column_stack([report.online_error.time - start, report.online_error.value])
+        if len(report.online_time) and not run.has_pieces:  # it compares poses of different pieces
+            online = np.column_stack([report.online_time - start, report.online_error])
             traces.append(_line(online, "map, as known at the time", "online", dash="dot", width=1.6))
         traces.append(_line(final, "final trajectory", "final", width=2))
     return _figure(traces, "time, s", "position error, m", zero=True) if traces else None
-
-
-def _doubt_chart(report: RunReport) -> Any:
-    time = report.run.time - report.run.time[0]
-    doubt = _line(np.column_stack([time, report.doubt]), "probability worse than odometry", "final", width=2)
-    limit = np.array([[time[0], DOUBTED], [time[-1], DOUBTED]])
-    traces = [doubt, _line(limit, "limit above which a map is doubted", "limit", dash="dash", width=1.4)]
-    figure = _figure(traces, "time, s", "probability")
-    figure.update_yaxes(range=[-0.02, 1.02])
-    return figure
-
-
-def _belief_chart(report: RunReport) -> Any:
-    time = report.run.time[report.belief_step] - report.run.time[0]
-    kinds = (("heaviest packet", "final"), ("second packet", "doubted"), ("new place", "odometry"))
-    traces = [
-        _line(np.column_stack([time, share]), name, role, width=1.2)
-        for (name, role), share in zip(kinds, report.belief.T, strict=True)
-    ]
-    figure = _figure(traces, "time, s", "probability")
-    figure.update_yaxes(range=[-0.02, 1.02])
-    return figure
-
-
-def _spread_chart(report: RunReport) -> Any:
-    time = report.run.time - report.run.time[0]
-    spread = np.column_stack([time, report.spread])
-    return _figure([_line(spread, "standard deviation", "final", width=1.6)], "time, s", "m", zero=True)
-
-
-def _cost_chart(report: RunReport) -> Any:
-    cost = np.column_stack([report.cost.time, 1e3 * report.cost.value])
-    figure = _figure([_line(cost, "mean of each chunk of steps", "final", width=1.4)], "step", "ms a step")
-    figure.update_yaxes(type="log", dtick=1)
-    return figure
 
 
 def _place_traces(report: RunReport) -> list[Any]:
@@ -191,15 +189,6 @@ def _closure_traces(report: RunReport) -> list[Any]:
     return traces
 
 
-def _shapes(report: RunReport) -> list[Any]:
-    """The links, and of each verdict the lines between the two places, in the order of its marks."""
-    lines = report.layers.nodes[report.run.links]
-    shapes = [_line_shape(lines, "link", "solid", "experience")] if len(lines) else []
-    for verdict, _, ends in _drawn_closures(report):
-        shapes.append(_line_shape(ends, *_CLOSURES.get(verdict, _OTHER)[::2], _text(verdict)))
-    return shapes
-
-
 def _drawn_closures(report: RunReport) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Each verdict, accepted last, with the numbers [k] and ends [k, 2, 2] of its closures in this run."""
     table, path = report.closures, report.map_path if report.map_path is not None else report.layers.final
@@ -219,11 +208,9 @@ def _line_shape(lines: np.ndarray, role: str, dash: str, group: str) -> dict[str
     return shape | {"legendgroup": group, "opacity": 0.15 if role == "refused" else 0.6}
 
 
-def _grid_trace(report: RunReport) -> Any:
+def _grid_trace(grid: OccupancyGrid) -> Any:
     from plotly import graph_objects
 
-    grid = report.grid
-    assert grid is not None
     percent = np.rint(100 * grid.probability).astype(np.uint8)
     x0, y0 = (grid.origin + grid.cell / 2).tolist()
     return graph_objects.Heatmap(
@@ -232,15 +219,6 @@ def _grid_trace(report: RunReport) -> Any:
         hovertemplate="occupied: %{z} %<extra></extra>",
         colorbar={"title": {"text": "occupied, %", "side": "right"}, "thickness": 10, "len": 0.6},
     )  # fmt: skip
-
-
-def _wall_trace(corners: np.ndarray) -> Any:
-    from plotly import graph_objects
-
-    x, y = _columns(_gapped(corners))
-    return graph_objects.Scatter(
-        x=x, y=y, fill="toself", mode="lines", line_width=0, name="wall", meta="wall", hoverinfo="skip"
-    )
 
 
 def _line(
@@ -263,17 +241,6 @@ def _map_figure(traces: list[Any], frame: np.ndarray, of: str = "the map,") -> A
     figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
     figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
     return figure
-
-
-def _frame(report: RunReport) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] (m) around the map, and around odometry near it."""
-    layers, lines = report.layers, report.truth_lines.reshape(-1, 2)
-    truth = [] if layers.truth is None else [layers.truth]
-    low, high = bounds(layers.final, layers.nodes, wall_corners(report.walls, layers.to_map), lines, *truth)
-    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
-    low = np.minimum(low, np.maximum(far_low, low - room))
-    high = np.maximum(high, np.minimum(far_high, high + room))
-    return _around(low, high)
 
 
 def _around(low: np.ndarray, high: np.ndarray) -> np.ndarray:

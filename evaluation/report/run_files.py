@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 FILES = {
     "config.yaml": "the completed configuration; `run` accepts it from any folder",
@@ -54,17 +53,9 @@ FILES = {
 OTHER = "not a file of ratslam's own"
 
 
-class RunFile(NamedTuple):
-    """A file of a run directory: its name, its size in bytes, and what it is."""
-
-    name: str
-    size: int
-    content: str
-
-
-def list_run_files(directory: Path) -> list[RunFile]:
-    """The files in a run directory, known ones first; hidden ones are left out."""
+def list_run_files(directory: Path) -> list[tuple[str, int, str]]:
+    """Name, size in bytes and content of the files of a run directory, known ones first; no hidden ones."""
     found = {path.name: path for path in sorted(directory.iterdir()) if path.is_file()}
     order = [name for name in FILES if name in found]
     order += [name for name in found if name not in FILES and not name.startswith(".")]
-    return [RunFile(name, found[name].stat().st_size, FILES.get(name, OTHER)) for name in order]
+    return [(name, found[name].stat().st_size, FILES.get(name, OTHER)) for name in order]

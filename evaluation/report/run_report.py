@@ -1,7 +1,4 @@
-"""A run as the report shows it, read from its directory.
-
-The loop closures of a run as the page needs them: columns of plain numbers, and views of 8 bits.
-"""
+"""A run as the report shows it, read from its directory; its loop closures and views as data for the page."""
 
 from __future__ import annotations
 
@@ -29,8 +26,8 @@ from evaluation.metrics.run_arrays import UNFINISHED, RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.scorecard import Scorecard, score_run
 from evaluation.metrics.trajectory import read_tum
-from evaluation.plots.map_plot import Layers, align_layers
-from evaluation.report.run_files import RunFile, list_run_files
+from evaluation.plots.map_plot import Layers
+from evaluation.report.run_files import list_run_files
 from evaluation.report.verdict import Verdict, judge_map
 from tactile.base.errors import InputError
 from tactile.base.files import read_json, read_plain_yaml, read_text
@@ -47,13 +44,6 @@ SOURCES = {
 """Sections of a configuration that name its source, and what each is."""
 
 
-class Series(NamedTuple):
-    """Values [n] at times [n], s."""
-
-    time: np.ndarray
-    value: np.ndarray
-
-
 class RunReport(NamedTuple):
     """A run of N steps.
 
@@ -63,7 +53,8 @@ class RunReport(NamedTuple):
         spread: [N] standard deviation of the position at each step, m. belief: [n, 3] probability of the
             heaviest packet of the pose cells, of the second and of a new place, at the steps `belief_step`
             [n]; n = 0 of methods whose pose cells hold no belief.
-        online_error: error of the current pose. cost: computing time a step, s, against the number of steps.
+        online_error: [k] errors of the current pose at times `online_time` [k] s.
+        cost: [k] computing times a step, s, after `cost_step` [k] steps.
         run: its arrays, pieces of the map as `arrange_pieces` draws them.
         layers: paths in the frame of the map, to which `layers.to_map` moves `walls`.
         map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
@@ -81,8 +72,10 @@ class RunReport(NamedTuple):
     spread: np.ndarray
     belief: np.ndarray
     belief_step: np.ndarray
-    online_error: Series
-    cost: Series
+    online_time: np.ndarray
+    online_error: np.ndarray
+    cost_step: np.ndarray
+    cost: np.ndarray
     layers: Layers
     map_path: np.ndarray | None
     walls: np.ndarray
@@ -91,7 +84,19 @@ class RunReport(NamedTuple):
     grid_score: GridScore | None
     closures: ClosureTable
     views: ClosureViews | None
-    files: Sequence[RunFile]
+    files: Sequence[tuple[str, int, str]]
+
+    def describe_status(self) -> str:
+        """How the run ended, in a few words."""
+        count, total, status = len(self.run.time), self.manifest.total, self.manifest.status
+        steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
+        if status == "complete":
+            return f"finished, {steps}"
+        if status == "interrupted":
+            return f"interrupted after {steps}"
+        if status == RUNNING:
+            return f"not finished: killed, or still running, after {steps}"
+        return f"ended as {status} after {steps}"
 
 
 def read_run_report(directory: Path) -> RunReport:
@@ -119,7 +124,8 @@ def read_run_report(directory: Path) -> RunReport:
     if file.exists():
         score = read_json(file, "the scores of a grid", GridScore.model_validate)
     belief, belief_step = _belief(steps, count)
-    step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
+    cost_step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
+    online_time, online_error = _columns(directory / "online_error.csv", "t", "error")
     return RunReport(
         name=name,
         manifest=read_manifest(directory),
@@ -131,8 +137,10 @@ def read_run_report(directory: Path) -> RunReport:
         spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
         belief=belief,
         belief_step=belief_step,
-        online_error=Series(*_columns(directory / "online_error.csv", "t", "error")),
-        cost=Series(step, seconds / np.maximum(steps_of, 1)),
+        online_time=online_time,
+        online_error=online_error,
+        cost_step=cost_step,
+        cost=seconds / np.maximum(steps_of, 1),
         layers=layers,
         map_path=_map_path(directory, measured),
         walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
@@ -143,19 +151,6 @@ def read_run_report(directory: Path) -> RunReport:
         views=read_closure_views(directory),
         files=list_run_files(directory),
     )
-
-
-def describe_status(report: RunReport) -> str:
-    """How the run ended, in a few words."""
-    count, total, status = len(report.run.time), report.manifest.total, report.manifest.status
-    steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
-    if status == "complete":
-        return f"finished, {steps}"
-    if status == "interrupted":
-        return f"interrupted after {steps}"
-    if status == RUNNING:
-        return f"not finished: killed, or still running, after {steps}"
-    return f"ended as {status} after {steps}"
 
 
 def _method(directory: Path) -> dict[str, str]:
@@ -174,14 +169,14 @@ def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, Occupa
     """Paths, true walls [S, 4] and grid in one frame: that of the map."""
     nothing = np.zeros((0, 4))
     if not (directory / "grid.npz").exists():
-        return align_layers(run), nothing, None
+        return Layers.align(run), nothing, None
     grid, lines, truth = read_grid(directory / "grid.npz"), nothing, None
     if (directory / "arena.npz").exists():
         arena, start = read_grid_truth(directory / "arena.npz")
         lines = arena.segments
         truth = None if run.truth is None else between(start, run.truth)
     if truth is None:
-        return align_layers(run), lines, grid
+        return Layers.align(run), lines, grid
     paths = (truth[:, :2], run.odometry[:, :2], run.final[:, :2], run.nodes[:, :2])
     return Layers(*paths), lines, grid
 
@@ -244,11 +239,11 @@ def closure_records(table: ClosureTable, run: RunArrays) -> dict[str, Any]:
     evidence = {name: column for name, column in table.evidence.items() if name not in _LEFT_OUT}
     return {
         "steps": table.steps.tolist(),
-        "times": [plain_numbers(row) for row in time],
-        "apart": plain_numbers(apart),
+        "times": [_plain_numbers(row) for row in time],
+        "apart": _plain_numbers(apart),
         "verdicts": [WORDS.get(verdict, verdict) for verdict in table.verdicts],
         "evidence": [
-            {"name": name, "label": LABELS.get(name, name), "values": plain_numbers(column)}
+            {"name": name, "label": LABELS.get(name, name), "values": _plain_numbers(column)}
             for name, column in evidence.items()
         ],
     }
@@ -292,12 +287,9 @@ def halve(image: np.ndarray) -> np.ndarray:
     return (total // np.expand_dims(count, (0, 3 - axis))).astype(np.uint8)
 
 
-def plain_numbers(values: np.ndarray) -> list[float | str | None]:
+def _plain_numbers(values: np.ndarray) -> list[float | str | None]:
     """Values [n] of 5 digits for JSON; NaN as None, infinity as "inf"."""
-    return [_plain(value) for value in np.asarray(values, float).tolist()]
-
-
-def _plain(value: float) -> float | str | None:
-    if np.isnan(value):
-        return None
-    return float(f"{value:.5g}") if np.isfinite(value) else f"{value}"
+    return [
+        None if np.isnan(value) else float(f"{value:.5g}") if np.isfinite(value) else f"{value}"
+        for value in np.asarray(values, float).tolist()
+    ]

@@ -1,7 +1,5 @@
-"""The verdict on a map in words: whether to believe it, and how it compares with the truth.
-
-The five lines that open the score of a run: what was done, error, closures, warnings, health.
-"""
+"""A run in words: whether to believe its map, how it compares with the truth, and the five lines that end the
+command `run` (what was done, error, closures, warnings, health)."""
 
 from __future__ import annotations
 
@@ -15,14 +13,7 @@ from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED
 from evaluation.metrics.run_metrics import DOUBTED, path_length
-from evaluation.metrics.scorecard import (
-    Scorecard,
-    is_worse,
-    position_error,
-    render_error,
-    render_health,
-    render_warnings,
-)
+from evaluation.metrics.scorecard import Scorecard, render_error, render_health, render_warnings
 
 CAUTION = 1 - DOUBTED
 """Probability of being worse than odometry above which a map is to be taken with care."""
@@ -66,15 +57,22 @@ def judge_map(doubt: float, unjudged: str = NOT_JUDGED) -> Verdict:
 
 def describe_score(card: Scorecard) -> str:
     """The position error in a sentence, or that the truth is unknown."""
-    error = position_error(card)
+    error = card.position_error
     if error.value is None:
         return "The truth is unknown, so there is no score."
     of = " within the pieces of the map" * ("ate_within_pieces" in card.quantities)
     text = f"Against the truth, the root mean square position error{of} is {error.value:.3g} {error.unit}"
     if error.odometry is None:
         return f"{text}."
-    factor = _factor(error.value, error.odometry) + ", worse than odometry" * is_worse(card)
-    return f"{text}; that of odometry is {error.odometry:.3g} {error.unit}{factor}."
+    factor = ""
+    if min(error.value, error.odometry) > 0:
+        more = error.odometry / error.value
+        factor = (
+            f", {more:.2g} times as much" if more > 1 else f": the map is {1 / more:.2g} times as far off"
+        )
+        factor = ", the same" if max(more, 1 / more) < 1.05 else factor
+    worse = ", worse than odometry" * card.is_worse
+    return f"{text}; that of odometry is {error.odometry:.3g} {error.unit}{factor}{worse}."
 
 
 def _percent(probability: float) -> str:
@@ -82,16 +80,6 @@ def _percent(probability: float) -> str:
     if 0.995 <= probability < 1:
         return "over 99%"
     return "under 1%" if 0 < probability < 0.005 else f"{probability:.0%}"
-
-
-def _factor(error: float, odometry: float) -> str:
-    """The ratio of two errors in words."""
-    if min(error, odometry) <= 0:
-        return ""
-    more = odometry / error
-    if max(more, 1 / more) < 1.05:
-        return ", the same"
-    return f", {more:.2g} times as much" if more > 1 else f": the map is {1 / more:.2g} times as far off"
 
 
 def summarise(directory: Path, card: Scorecard, method: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import NAME, read_changes
+from evaluation.artifacts.closure_table import CHANGES, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.estimates import Localisation
 from ratslam.grid.localiser import GridLocaliser
@@ -141,7 +141,7 @@ def localise(
         card = runner.finish(interrupted)
         made = runner.session.map
         assert isinstance(made, Localiser | GridLocaliser)
-        changes = read_changes(directory / NAME) if isinstance(made, Localiser) else []
+        changes = read_changes(directory / CHANGES) if isinstance(made, Localiser) else []
         lines = [_describe_course(made.states(), made.localisation().mass)]
     return card, "\n".join([*lines, *(change.describe() for change in changes)]), interrupted
 

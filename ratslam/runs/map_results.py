@@ -13,9 +13,14 @@ from typing import Any
 import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
-from evaluation.artifacts.run_reader import MERGED_MAP_NAME as MERGED
-from evaluation.artifacts.run_reader import NAME as PIECES
-from evaluation.artifacts.run_reader import is_merged, read_run, read_session_steps, write_pieces
+from evaluation.artifacts.run_reader import MERGE_REPORT as MERGED
+from evaluation.artifacts.run_reader import (
+    PIECES,
+    is_merged,
+    read_run,
+    read_session_steps,
+    write_pieces,
+)
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -23,7 +28,7 @@ from evaluation.metrics.trajectory import read_tum, write_tum
 from evaluation.plots.map_plot import draw_sessions
 from evaluation.plots.run_plots import plot_writers
 from evaluation.report import PAGE_START
-from evaluation.report.page import PageRun, check_report_libraries, write_page
+from evaluation.report.page import check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
 from ratslam.runs.settings.changed_settings import changed_settings
@@ -55,7 +60,7 @@ def write_report(directories: Sequence[Path], path: Path) -> None:
             settings = changed_settings(directory / "config.yaml")
         except InputError:
             settings = None  # of a configuration of another version
-        runs.append(PageRun(read_run_report(directory), settings))
+        runs.append((read_run_report(directory), settings))
     write_page(path, runs, read_citation())
 
 

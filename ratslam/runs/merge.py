@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.run_reader import MERGED_MAP_NAME as REPORT
+from evaluation.artifacts.run_reader import MERGE_REPORT as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.map_views import MapViews

@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from evaluation.artifacts import recorded_views
-from evaluation.artifacts.closure_table import NAME, ChangeRow, read_closure_table, write_changes
+from evaluation.artifacts.closure_table import CHANGES, ChangeRow, read_closure_table, write_changes
 from evaluation.artifacts.grid_files import read_grid, write_grid_truth, write_nav2
 from evaluation.artifacts.recorded_views import (
     ClosureViews,
@@ -176,7 +176,7 @@ class RunDirectory:
         """Writes changes.csv of a session that was localised in a map."""
         if isinstance(map, Localiser):
             rows = change_rows(map, changes_of(map, config))
-            self.file(NAME, lambda path: write_changes(path, rows))
+            self.file(CHANGES, lambda path: write_changes(path, rows))
 
 
 def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:

@@ -40,7 +40,7 @@ from tactile.base.types import Cycle, Observation, Whisk
 from tactile.contact_stream import Touch
 from tactile.frontend import Frontend
 from tactile.rig_signals import SignalFit, SignalRecord, fit_head, fit_signals, head_with
-from tactile.wall_estimation.signal_map import fit_signal_map, predict_signal
+from tactile.wall_estimation.signal_map import fit_signal_map
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
 REST_SHARE = 0.05
@@ -323,7 +323,7 @@ def _fit_stage(source: PluginConfig) -> Rig:
             known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
             for out, mean in zip(
                 errors,
-                (predict_signal(known, record.position[fold]), record.signal[~fold].mean(axis=0)),
+                (known.predict(record.position[fold]), record.signal[~fold].mean(axis=0)),
                 strict=True,
             ):
                 out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))

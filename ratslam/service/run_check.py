@@ -13,7 +13,7 @@ import numpy as np
 from evaluation.artifacts.closure_table import Closures, count_closures
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.run_reader import check_run_directory, has_steps, read_run
-from evaluation.metrics.run_arrays import RunArrays, truth_rows
+from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import ate
 from evaluation.report.verdict import CAUTION, judge_map
 from ratslam.mapping.pose_graph import read_json
@@ -94,7 +94,7 @@ def diagnose_run(path: Path) -> Diagnosis:
 
 def _error_note(run: RunArrays) -> str:
     """Position errors of map and odometry, if truth is known."""
-    rows = truth_rows(run)
+    rows = run.truth_rows
     if run.truth is None or len(rows) < 2:
         return "truth: unknown, so nothing but the health tells how good the map is"
     final, odometry = ate(run.final[rows], run.truth[rows]), ate(run.odometry[rows], run.truth[rows])

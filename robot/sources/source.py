@@ -22,7 +22,7 @@ from tactile.base.errors import InputError
 from tactile.base.files import SPOILT, reason
 from tactile.base.plugins import Registry
 from tactile.base.settings import Settings
-from tactile.calibration import Calibration, calibration_from_arrays, calibration_json
+from tactile.calibration import Calibration
 from tactile.whisker_geometry import HeadConfig
 
 
@@ -32,7 +32,7 @@ def _read_calibration(value: Any) -> Calibration | None:
     try:
         kinds = {name: bool if name == "alive" else float for name in value}
         arrays = {name: np.asarray(array, kinds[name]) for name, array in value.items()}
-        return calibration_from_arrays(arrays)
+        return Calibration.from_arrays(arrays)
     except (AttributeError, TypeError) as error:
         raise ValueError(f"not a calibration: {error}") from None
 
@@ -88,7 +88,7 @@ class SourceInfo(Settings):
     calibration: Annotated[
         Calibration | None,
         PlainValidator(_read_calibration),
-        PlainSerializer(lambda c: c and calibration_json(c)),
+        PlainSerializer(lambda c: c and c.to_json()),
     ] = None
     """Free-whisking calibration of the head."""
     planar_whiskers: PlanarWhiskersInfo | None = None

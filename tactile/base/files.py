@@ -1,10 +1,8 @@
-"""Atomic file writes: a reader finds the old file or the complete new one, never a part of it.
+"""Files: written atomically, made new without replacing any, read from outside within bounds.
 
-New files and folders: checked before the work, made whole, and never in the place of what others made.
-
-Reading files from outside within bounds, with one line for whatever is wrong with them.
-
-Reading of .npz files, with errors that name the file.
+An atomic write leaves the old file or the complete new one, never a part of it. New files and folders are
+checked before the work, made whole, and never put in the place of what others made. Readers (text, JSON,
+YAML, CSV, .npz) bound the size of what they read, and tell in one line whatever is wrong with a file.
 """
 
 from __future__ import annotations
@@ -121,7 +119,11 @@ def require_new_file(path: Path, *, replaces: bytes = b"", parents: bool = False
         InputError: something is there already, be it a file, a folder, a link or a device; or its folder is
             missing or cannot be written in.
     """
-    if os.path.lexists(path) and not (replaces and _begins(path, replaces)):
+    replaceable = False
+    if replaces and path.is_file() and not path.is_symlink():
+        with path.open("rb") as file:
+            replaceable = re.match(replaces, file.read(_BEGINNING), re.DOTALL) is not None
+    if os.path.lexists(path) and not replaceable:
         dangles = path.is_symlink() and not path.exists()
         found = f"a link to {os.readlink(path)}, which does not exist" if dangles else "exists already"
         expected = "a new file, or one that this command made before" if replaces else "a new file"
@@ -157,14 +159,6 @@ def require_own_folder(path: Path, marks: Sequence[str]) -> None:
     require_writable(path / f"{marks[0]}.new")
 
 
-def _begins(path: Path, pattern: bytes) -> bool:
-    """Whether a path is a file of its own that begins with a pattern."""
-    if path.is_symlink() or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return re.match(pattern, file.read(_BEGINNING), re.DOTALL) is not None
-
-
 def require_writable(path: Path) -> None:
     """Checks that a file can be made at a path, or replaced there.
 
@@ -189,7 +183,14 @@ def make_new_file(path: Path, write: Callable[[Path], Any]) -> None:
     try:
         with errors_of(path, temporary):
             write(temporary)
-            _put_file(temporary, path)
+            try:
+                os.link(temporary, path)
+            except FileExistsError:
+                raise _appeared(path) from None
+            except OSError:  # a file system without hard links
+                if os.path.lexists(path):
+                    raise _appeared(path) from None
+                os.rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -209,31 +210,16 @@ def new_folder(path: Path) -> Iterator[Path]:
         with errors_of(path, folder):
             yield folder
             folder.chmod(0o755)
-            _put_folder(folder, path)
+            if os.path.lexists(path):
+                raise _appeared(path)
+            try:
+                os.rename(folder, path)
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                    raise _appeared(path) from None
+                raise
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _put_file(temporary: Path, path: Path) -> None:
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise _appeared(path) from None
-    except OSError:  # a file system without hard links
-        if os.path.lexists(path):
-            raise _appeared(path) from None
-        os.rename(temporary, path)
-
-
-def _put_folder(folder: Path, path: Path) -> None:
-    if os.path.lexists(path):
-        raise _appeared(path)
-    try:
-        os.rename(folder, path)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-            raise _appeared(path) from None
-        raise
 
 
 def _appeared(path: Path) -> InputError:
@@ -405,17 +391,16 @@ def read_arrays(archive: zipfile.ZipFile, members: Sequence[str], where: str) ->
     """
     infos = [archive.getinfo(member) for member in members]
     check_size(where, sum(info.file_size for info in infos), archive.start_dir)
-    return [_array(archive, info) for info in infos]
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    content = io.BytesIO(archive.read(info))
-    version = np.lib.format.read_magic(content)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(content)
-    # Compared as Python's integers, because NumPy's may overflow.
-    left = info.file_size - content.tell()
-    if not dtype.hasobject and (min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != left):
-        raise ValueError(f"{info.filename} is not a plain array")
-    content.seek(0)
-    return np.lib.format.read_array(content, allow_pickle=False)
+    arrays = []
+    for info in infos:
+        content = io.BytesIO(archive.read(info))
+        version, form = np.lib.format.read_magic(content), np.lib.format
+        read = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+        shape, _, dtype = read(content)
+        # Compared as Python's integers, because NumPy's may overflow.
+        left = info.file_size - content.tell()
+        if not dtype.hasobject and (min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != left):
+            raise ValueError(f"{info.filename} is not a plain array")
+        content.seek(0)
+        arrays.append(form.read_array(content, allow_pickle=False))
+    return arrays

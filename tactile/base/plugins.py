@@ -88,7 +88,8 @@ class Registry(Generic[Entry]):
         return self._load(points, where)
 
     def _load(self, points: list[EntryPoint], where: str) -> Entry:
-        found = f"the {self.noun} '{points[0].name}' of {', '.join(map(_origin, points))}"
+        dists = [f"{p.dist.name} {p.dist.version}" if p.dist else p.value for p in points]
+        found = f"the {self.noun} '{points[0].name}' of {', '.join(dists)}"
         if len({point.value for point in points}) > 1:
             raise InputError(where, f"{found} is defined twice", "one package with that name installed")
         try:
@@ -115,8 +116,3 @@ def read_settings(model: type[Model], settings: Mapping[str, Any], where: str) -
         first = error.errors(include_url=False)[0]
         key = ".".join([where, *map(str, first["loc"])])
         raise InputError(key, first["msg"]) from None
-
-
-def _origin(point: EntryPoint) -> str:
-    """The distribution of an entry point, with its version."""
-    return f"{point.dist.name} {point.dist.version}" if point.dist else point.value

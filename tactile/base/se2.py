@@ -1,9 +1,8 @@
 """Planar rigid motions (SE(2)) for NumPy and JAX, and the wrapping of angles.
 
 A pose is an array [..., 3] of x (m), y (m), heading (rad, counter-clockwise); REP-103 axes. The functions
-compute in the namespace of the arrays they are given: JAX arrays give JAX arrays.
-
-Distances of points from straight segments in the plane.
+compute in the namespace of the arrays they are given: JAX arrays give JAX arrays. Also distances of points
+from straight segments in the plane, and the line of a pose in a TUM file.
 """
 
 from __future__ import annotations

@@ -54,6 +54,19 @@ class WallContact(NamedTuple):
     strain: np.ndarray
     alive: np.ndarray
 
+    def first_whisker(self) -> int | None:
+        """The whisker in contact at HIT1, of several the most strained one; None without usable strain."""
+        may = self.first & self.alive
+        if not may.any() or not len(self.strain):
+            return None
+        return int(np.argmax(np.where(may, np.abs(self.strain[0, :, 0]), -1.0)))
+
+    def to_final_frame(self, points: np.ndarray) -> np.ndarray:
+        """Points [..., 2] in the frame at HIT1, transformed to the frame at the end."""
+        x, y, turn = inverse(self.travel)
+        c, s = np.cos(turn), np.sin(turn)
+        return points @ np.array([[c, s], [-s, c]]) + np.array([x, y])
+
 
 class Wall(NamedTuple):
     """An estimated wall; all fields are 0 if there is no estimate.
@@ -64,15 +77,16 @@ class Wall(NamedTuple):
         sd: standard deviation of the direction, rad.
     """
 
-    known: bool
-    direction: float
-    point: np.ndarray
-    sd: float
+    known: bool = False
+    direction: float = 0.0
+    point: np.ndarray = np.zeros(2)
+    sd: float = 0.0
 
-
-def no_wall() -> Wall:
-    """The `Wall` without an estimate."""
-    return Wall(False, 0.0, np.zeros(2), 0.0)
+    @classmethod
+    def through(cls, point: np.ndarray, direction: float, sd: float) -> Wall:
+        """The wall with a direction (rad) through a point [2]."""
+        normal = wall_normal(direction)
+        return cls(True, float(direction % np.pi % np.pi), (normal @ point) * normal, float(sd))
 
 
 def wall_normal(direction: float) -> np.ndarray:
@@ -80,30 +94,9 @@ def wall_normal(direction: float) -> np.ndarray:
     return np.array([np.sin(direction), -np.cos(direction)])
 
 
-def wall_through(point: np.ndarray, direction: float, sd: float) -> Wall:
-    """The wall with a direction (rad) through a point [2]."""
-    normal = wall_normal(direction)
-    return Wall(True, float(direction % np.pi % np.pi), (normal @ point) * normal, float(sd))
-
-
 def contact_points(feelers: PlanarWhiskers, radius: float) -> np.ndarray:
     """Assumed contact points [W, 2], m: at a fixed radius along the whiskers (II-D)."""
     return feelers.base + radius * feelers.direction
-
-
-def first_whisker(contact: WallContact) -> int | None:
-    """The whisker in contact at HIT1, of several the most strained one; None without usable strain."""
-    may = contact.first & contact.alive
-    if not may.any() or not len(contact.strain):
-        return None
-    return int(np.argmax(np.where(may, np.abs(contact.strain[0, :, 0]), -1.0)))
-
-
-def to_final_frame(points: np.ndarray, contact: WallContact) -> np.ndarray:
-    """Points [..., 2] in the frame at HIT1, transformed to the frame at the end."""
-    x, y, turn = inverse(contact.travel)
-    c, s = np.cos(turn), np.sin(turn)
-    return points @ np.array([[c, s], [-s, c]]) + np.array([x, y])
 
 
 def geometric_wall(points: np.ndarray, contact: WallContact) -> Wall:
@@ -115,15 +108,15 @@ def geometric_wall(points: np.ndarray, contact: WallContact) -> Wall:
         points: [W, 2] assumed contact points, m.
     """
     if contact.moment != StepEnd.HIT2:
-        return no_wall()
-    before, new = to_final_frame(points[contact.first], contact), points[contact.now & ~contact.first]
+        return Wall()
+    before, new = contact.to_final_frame(points[contact.first]), points[contact.now & ~contact.first]
     there = np.concatenate([before, new])
     apart = np.linalg.norm(there[:, None] - there, axis=-1).max(initial=0.0)
     if apart < MIN_SEPARATION:
-        return no_wall()
+        return Wall()
     middle = there.mean(axis=0)
     along = np.linalg.svd(there - middle)[2][0]
-    return wall_through(middle, float(np.arctan2(along[1], along[0])), LINE_SD)
+    return Wall.through(middle, float(np.arctan2(along[1], along[0])), LINE_SD)
 
 
 def template_wall(
@@ -134,10 +127,10 @@ def template_wall(
     Args:
         max_error: relative error of the match above which there is no estimate; None: no limit (the paper).
     """
-    whisker = first_whisker(contact)
+    whisker = contact.first_whisker()
     if whisker is None or (max_error is not None and match.relative >= max_error):
-        return no_wall()
-    return wall_through(to_final_frame(points[whisker], contact), match.angle, TEMPLATE_SD)
+        return Wall()
+    return Wall.through(contact.to_final_frame(points[whisker]), match.angle, TEMPLATE_SD)
 
 
 def fused_wall(tip: TipModel, points: np.ndarray, contact: WallContact) -> Wall:
@@ -146,27 +139,27 @@ def fused_wall(tip: TipModel, points: np.ndarray, contact: WallContact) -> Wall:
     There is no estimate if no straight wall fits the strain, or walls of too different directions do. The
     wall passes through the tip of the first whisker.
     """
-    whisker = first_whisker(contact)
+    whisker = contact.first_whisker()
     if whisker is None:
-        return no_wall()
-    fit = direction_misfit(tip, whisker, contact.strain)
-    best = fit.misfit.min()
+        return Wall()
+    misfit, away, samples = direction_misfit(tip, whisker, contact.strain)
+    best = misfit.min()
     if not best < MAX_WALL_MISFIT:
-        return no_wall()
-    log = -0.5 * min(fit.samples, MAX_INDEPENDENT_SAMPLES) * (fit.misfit - best)
+        return Wall()
+    log = -0.5 * min(samples, MAX_INDEPENDENT_SAMPLES) * (misfit - best)
     line = geometric_wall(points, contact)
     if line.known:
         off = np.sin(WALL_DIRECTIONS - line.direction) / line.sd
         log += np.log(OTHER_WALL_PROBABILITY + (1 - OTHER_WALL_PROBABILITY) * np.exp(-0.5 * off**2))
     weight = np.exp(log - log.max())
     likely = int(weight.argmax())
-    if not fit.misfit[likely] < MAX_WALL_MISFIT:
-        return no_wall()
+    if not misfit[likely] < MAX_WALL_MISFIT:
+        return Wall()
     # Circular standard deviation at twice the angle, since directions repeat after half a turn.
     length = abs((weight @ np.exp(2j * WALL_DIRECTIONS)) / weight.sum())
     spread = np.sqrt(max(-2 * np.log(max(length, 1e-300)), 0.0)) / 2
     if spread > MAX_DIRECTION_SD:
-        return no_wall()
+        return Wall()
     direction = float(WALL_DIRECTIONS[likely])
-    reached = tip.feelers.base[whisker] + fit.away[likely] * wall_normal(direction)
-    return wall_through(reached, direction, float(np.hypot(TIP_SD, spread)))
+    reached = tip.feelers.base[whisker] + away[likely] * wall_normal(direction)
+    return Wall.through(reached, direction, float(np.hypot(TIP_SD, spread)))

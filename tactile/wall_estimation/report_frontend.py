@@ -7,7 +7,7 @@ stores only that between reports.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
@@ -22,7 +22,6 @@ from tactile.wall_estimation.estimators import (
     contact_points,
     fused_wall,
     geometric_wall,
-    no_wall,
     template_wall,
 )
 from tactile.wall_estimation.strain_templates import (
@@ -31,7 +30,6 @@ from tactile.wall_estimation.strain_templates import (
     filter_strain,
     fit_tip_model,
     match_template,
-    read_templates,
     strain_sample_rate,
 )
 from tactile.whisker_geometry import Degrees, PlanarWhiskers
@@ -91,14 +89,6 @@ class ReportFrontendConfig(Settings):
         return PlanarWhiskers(base, direction, np.full(len(base), self.length))
 
 
-class _Slow(NamedTuple):
-    """The current FWD2: contacts [W] at HIT1, motion [3] since, strain of each step."""
-
-    first: np.ndarray
-    travel: np.ndarray
-    strain: tuple[np.ndarray, ...]
-
-
 class ReportFrontend:
     """Turns consecutive reports into observations.
 
@@ -115,7 +105,7 @@ class ReportFrontend:
 
     def __init__(self, config: ReportFrontendConfig, templates: StrainTemplates | None = None) -> None:
         if config.templates is not None and config.walls in ("template", "fused"):
-            templates = read_templates(config.templates)
+            templates = StrainTemplates.read(config.templates)
         if config.walls == "template" and templates is None:
             expected, cure = "`templates`: a file of strain templates", f"{TRAIN_HINT}, or use `geometric`"
             raise InputError("walls", "`template` without strain templates", expected, cure)
@@ -125,7 +115,8 @@ class ReportFrontend:
         self.view_shape = (1, self.whiskers, 1)
         self.point = contact_points(self.feelers, config.contact_radius)
         self._tip = fit_tip_model(templates, self.feelers) if templates and config.walls == "fused" else None
-        self._slow: _Slow | None = None
+        # The current FWD2: contacts [W] at HIT1, motion [3] since, strain of each step.
+        self._slow: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]] | None = None
         self._back: Odometry | None = None
 
     def observe(self, report: Report) -> Observation | None:
@@ -140,7 +131,10 @@ class ReportFrontend:
             found = f"a report of {len(report.contact)} whiskers"
             raise InputError("mounts", found, f"of {self.whiskers}, as configured")
         wall = self._estimate_wall(report)
-        odometry = report.odometry if self._back is None else _add_motions(self._back, report.odometry)
+        odometry = report.odometry
+        if self._back is not None:  # turns are added without wrapping
+            x, y, _ = compose(np.array(self._back[:3], np.float64), np.array(odometry[:3], np.float64))
+            odometry = Odometry(x, y, self._back.dtheta + odometry.dtheta, self._back.dt + odometry.dt)
         self._back = None
         back = report.motion == MotionKind.BACK
         if back and self.config.fold_back:
@@ -166,59 +160,51 @@ class ReportFrontend:
         back = {} if self._back is None else {"back": np.array(self._back, np.float64)}
         if self._slow is None:
             return back
-        strain = {f"strain/{k:06}": part for k, part in enumerate(self._slow.strain)}
-        return back | strain | {"first": self._slow.first, "travel": self._slow.travel}
+        first, travel, strain = self._slow
+        parts = {f"strain/{k:06}": part for k, part in enumerate(strain)}
+        return back | parts | {"first": first, "travel": travel}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Continues after the reports of a front end whose `arrays` these are."""
         self._back = Odometry(*arrays["back"]) if "back" in arrays else None
         strain = tuple(arrays[name] for name in sorted(arrays) if name.startswith("strain/"))
-        self._slow = _Slow(arrays["first"], arrays["travel"], strain) if "first" in arrays else None
+        self._slow = (arrays["first"], arrays["travel"], strain) if "first" in arrays else None
 
     def _estimate_wall(self, report: Report) -> Wall:
         """Estimates the wall at the end of the step and stores the state for the next one."""
         slow, self._slow = self._slow, None
         contact = np.asarray(report.contact & report.alive, bool)
         if report.moment == StepEnd.HIT1:
-            self._slow = _Slow(contact, np.zeros(3), ())
+            self._slow = contact, np.zeros(3), ()
         if slow is None or report.motion != MotionKind.FORWARD or report.moment == StepEnd.HIT1:
-            return no_wall()
-        travel = compose(slow.travel, np.array(report.odometry[:3], np.float64))
-        slow = _Slow(slow.first, travel, (*slow.strain, self._check_strain(report)))
-        if report.moment == StepEnd.FREE:
-            self._slow = slow
-            return no_wall()
-        return self._wall(slow, contact, report)
-
-    def _check_strain(self, report: Report) -> np.ndarray:
-        """The strain [T, W, 2] of a step, checked against the sample rate of the templates."""
+            return Wall()
+        first, before, strain = slow
+        travel = compose(before, np.array(report.odometry[:3], np.float64))
         rate = strain_sample_rate(report)
         if self.templates is not None and rate:
             usual = self.templates.training.rate
             if abs(rate - usual) > RATE_TOLERANCE * usual:
                 found, cure = f"{rate:.5g} samples per second", "train templates at this rate"
                 raise InputError("strain", found, f"{usual:g}, as in the templates", cure)
-        return np.asarray(report.strain, np.float64)
-
-    def _wall(self, slow: _Slow, contact: np.ndarray, report: Report) -> Wall:
-        raw = np.concatenate(slow.strain)
+        strain = (*strain, np.asarray(report.strain, np.float64))
+        if report.moment == StepEnd.FREE:
+            self._slow = first, travel, strain
+            return Wall()
+        raw = np.concatenate(strain)
         alive = np.asarray(report.alive, bool) & np.isfinite(raw).all(axis=(0, 2))
         raw = np.where(alive[:, None], raw, 0.0)
-        strain = filter_strain(self.templates.training, raw) if self.templates else raw
-        meeting = WallContact(slow.first, contact, slow.travel, StepEnd(report.moment), strain, alive)
-        if not np.isfinite(slow.travel).all() or self.config.walls == "none":
-            return no_wall()
+        filtered = filter_strain(self.templates.training, raw) if self.templates else raw
+        return self._wall(WallContact(first, contact, travel, StepEnd(report.moment), filtered, alive))
+
+    def _wall(self, meeting: WallContact) -> Wall:
+        """The wall of a contact, by the configured estimator."""
+        if not np.isfinite(meeting.travel).all() or self.config.walls == "none":
+            return Wall()
         if self._tip is not None:
             return fused_wall(self._tip, self.point, meeting)
         if self.config.walls == "template" and self.templates is not None:
-            if not len(strain) or not alive.any():
-                return no_wall()
-            match = match_template(self.templates, strain, alive)
+            if not len(meeting.strain) or not meeting.alive.any():
+                return Wall()
+            match = match_template(self.templates, meeting.strain, meeting.alive)
             return template_wall(self.point, match, meeting, self.config.max_template_error)
         return geometric_wall(self.point, meeting)
-
-
-def _add_motions(one: Odometry, other: Odometry) -> Odometry:
-    """The composition of two motions; turns are added without wrapping."""
-    x, y, _ = compose(np.array(one[:3], np.float64), np.array(other[:3], np.float64))
-    return Odometry(x, y, one.dtheta + other.dtheta, one.dt + other.dt)

@@ -55,6 +55,43 @@ class SignalMap(NamedTuple):
     weight: np.ndarray
     left_out: np.ndarray
 
+    def predict(self, position: np.ndarray) -> np.ndarray:
+        """The signals [M, C] expected at positions [M, 3], m."""
+        between = _covariance(*self._both(position))
+        signal: np.ndarray = self.offset + self.scale * (between @ self.weight)
+        return signal
+
+    def variance(self, position: np.ndarray) -> np.ndarray:
+        """Variances [M, C] of the map's errors at positions [M, 3]; large beyond the calibration."""
+        there, here = self._both(position)
+        solved = solve_triangular(self.factor, _covariance(here, there), lower=True)
+        prior = 1.0 + TREND**2 * (1.0 + (there**2).sum(axis=1))
+        share = np.maximum(prior - (solved**2).sum(axis=0), 0.0)
+        variance: np.ndarray = share[:, None] * self.scale**2
+        return variance
+
+    def slope(self, position: np.ndarray) -> np.ndarray:
+        """The derivatives [M, C, 3] of the expected signals by position, 1/m."""
+        there, here = self._both(position)
+        distance = np.sqrt(5.0) * cdist(there, here)
+        radial = -5.0 / 3.0 * (1.0 + distance) * np.exp(-distance)
+        # The sum over rows n of radial[m, n] (there[m] - here[n]) weight[n], plus the trend's slope.
+        moment = (self.weight[:, :, None] * here[:, None, :]).reshape(len(here), -1)
+        slope = (radial @ self.weight)[:, :, None] * there[:, None, :]
+        slope -= (radial @ moment).reshape(slope.shape)
+        slope = (slope + TREND**2 * (self.weight.T @ here)) * self.scale[:, None]
+        away = position - self.base
+        reach = np.linalg.norm(away, axis=1)[:, None, None]
+        ahead = away[:, None, :] / reach
+        turn = (np.eye(3) - ahead.swapaxes(1, 2) * ahead) / reach / self.length[0]
+        result: np.ndarray = slope @ np.concatenate([turn, ahead / self.length[1]], axis=1)
+        return result
+
+    def _both(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Features of positions [M, 3] and of the calibration's."""
+        here = _features(self.position - self.base, self.length)
+        return _features(position - self.base, self.length), here
+
 
 def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -> SignalMap:
     """Learns the map; length scales and noise are the most likely ones.
@@ -80,7 +117,13 @@ def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -
         length, noise = _most_likely(away[use], value[use], share[use])
         where = _features(away, length)
         factor = _factor(where[use], noise * share[use])
-        error = _left_out_error(factor, value[use])
+        # The largest leave-one-out error over the channels, in the usual one or in standard deviations, the
+        # larger (Rasmussen and Williams 2006, eq. 5.12).
+        weight = cho_solve((factor, True), value[use])
+        variance = 1.0 / np.diag(cho_solve((factor, True), np.eye(len(weight))))
+        amplitude = np.sqrt((value[use] * weight).mean(axis=0))
+        error = np.abs(weight * np.sqrt(variance)[:, None] / amplitude).max(axis=1)
+        error = np.asarray(error / max(1.0, float(np.median(error))))
         if not (error > MAX_MISFIT).any():
             break
         use[np.flatnonzero(use)[error > MAX_MISFIT]] = False
@@ -90,47 +133,6 @@ def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -
     scale = scale * amplitude
     left_out = np.flatnonzero(~use)
     return SignalMap(position[use], base, length, noise, offset, scale, factor, weight / amplitude, left_out)
-
-
-def predict_signal(known: SignalMap, position: np.ndarray) -> np.ndarray:
-    """The signals [M, C] expected at positions [M, 3], m."""
-    between = _covariance(*_both(known, position))
-    signal: np.ndarray = known.offset + known.scale * (between @ known.weight)
-    return signal
-
-
-def signal_variance(known: SignalMap, position: np.ndarray) -> np.ndarray:
-    """Variances [M, C] of the map's errors at positions [M, 3]; large beyond the calibration."""
-    there, here = _both(known, position)
-    solved = solve_triangular(known.factor, _covariance(here, there), lower=True)
-    prior = 1.0 + TREND**2 * (1.0 + (there**2).sum(axis=1))
-    share = np.maximum(prior - (solved**2).sum(axis=0), 0.0)
-    variance: np.ndarray = share[:, None] * known.scale**2
-    return variance
-
-
-def signal_slope(known: SignalMap, position: np.ndarray) -> np.ndarray:
-    """The derivatives [M, C, 3] of the expected signals by position, 1/m."""
-    there, here = _both(known, position)
-    distance = np.sqrt(5.0) * cdist(there, here)
-    radial = -5.0 / 3.0 * (1.0 + distance) * np.exp(-distance)
-    # The sum over rows n of radial[m, n] (there[m] - here[n]) weight[n], plus the trend's slope.
-    moment = (known.weight[:, :, None] * here[:, None, :]).reshape(len(here), -1)
-    slope = (radial @ known.weight)[:, :, None] * there[:, None, :]
-    slope -= (radial @ moment).reshape(slope.shape)
-    slope = (slope + TREND**2 * (known.weight.T @ here)) * known.scale[:, None]
-    away = position - known.base
-    reach = np.linalg.norm(away, axis=1)[:, None, None]
-    ahead = away[:, None, :] / reach
-    turn = (np.eye(3) - ahead.swapaxes(1, 2) * ahead) / reach / known.length[0]
-    result: np.ndarray = slope @ np.concatenate([turn, ahead / known.length[1]], axis=1)
-    return result
-
-
-def _both(known: SignalMap, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Features of positions [M, 3] and of the calibration's."""
-    here = _features(known.position - known.base, known.length)
-    return _features(position - known.base, known.length), here
 
 
 def _features(away: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -147,16 +149,6 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def _factor(where: np.ndarray, noise: np.ndarray) -> np.ndarray:
     factor: np.ndarray = cholesky(_covariance(where, where) + np.diag(noise**2), lower=True)
     return factor
-
-
-def _left_out_error(factor: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Largest leave-one-out error [N] over the channels, in the usual one or in standard deviations, the
-    larger (Rasmussen and Williams 2006, eq. 5.12)."""
-    weight = cho_solve((factor, True), value)
-    variance = 1.0 / np.diag(cho_solve((factor, True), np.eye(len(value))))
-    amplitude = np.sqrt((value * weight).mean(axis=0))
-    error = np.abs(weight * np.sqrt(variance)[:, None] / amplitude).max(axis=1)
-    return np.asarray(error / max(1.0, float(np.median(error))))
 
 
 def _most_likely(away: np.ndarray, value: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, float]:

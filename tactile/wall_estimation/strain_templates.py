@@ -1,21 +1,11 @@
-"""Strain templates (Fox et al. 2012, II-G): training, file format and matching (eq. 5).
+"""Strain templates of walls (Fox et al. 2012, II-G): training, file, matching (eq. 5); sliding-tip model.
 
 A template is the mean strain of all whiskers while the robot drives into a wall at one of fifteen angles. An
 angle is the wall's *direction* in base_link, counter-clockwise from ahead, modulo half a turn: 90 degrees is
 a wall straight across. (The paper uses normals, which are at right angles to it.)
 
-Model of a whisker whose tip slides along a straight wall, fitted to strain templates.
-
-While the robot drives on, the distance d of a whisker's base from the wall falls steadily. The tip stays on
-the wall, so the whisker turns by tau:
-
-    L sin(beta - tau) = d - (speed x time) sin(phi)
-
-phi is the wall's direction and beta the angle between whisker and wall on the nearer side. Horizontal strain
-is gain x tau. Vertical strain is crosstalk x horizontal strain minus a share of its size, which depends on
-the slant beta - tau (the angle between wall and the line from base to tip). Gain, crosstalk and shares are
-fitted to the templates of all whiskers together. The model therefore also covers angles at which a whisker
-was never the first to touch in training, and detects contacts with objects other than a straight wall.
+`TipModel`, fitted to the templates, is a whisker whose tip slides along a straight wall. It also covers
+angles at which a whisker was never the first to touch in training, and detects contacts with other objects.
 """
 
 from __future__ import annotations
@@ -103,6 +93,11 @@ class TrainingDrive(NamedTuple):
     strain: np.ndarray
     rate: float
 
+    @classmethod
+    def of_report(cls, angle: float, repeat: int, report: Report) -> TrainingDrive:
+        """The drive recorded in a report."""
+        return cls(angle, repeat, report.strain, strain_sample_rate(report))
+
 
 class StrainTemplates(NamedTuple):
     """Trained templates of A wall directions, T samples and W whiskers.
@@ -116,6 +111,31 @@ class StrainTemplates(NamedTuple):
     angle: np.ndarray
     mean: np.ndarray
     spread: np.ndarray
+
+    def write(self, path: Path | str) -> None:
+        """Writes the templates to an .npz file."""
+        with open(path, "wb") as file:
+            arrays = self._asdict() | {"training": np.array(self.training.model_dump_json())}
+            np.savez_compressed(file, strain_templates=np.int64(FILE_VERSION), **arrays)
+
+    @classmethod
+    def read(cls, path: Path | str) -> StrainTemplates:
+        """Reads a file of `write`.
+
+        Raises:
+            InputError: the file is missing, cannot be read or holds something else.
+        """
+
+        def parse(version: np.ndarray, settings: np.ndarray, *arrays: np.ndarray) -> StrainTemplates:
+            training, (angle, mean, spread) = TemplateTraining.model_validate_json(str(settings)), arrays
+            whole = int(version) == FILE_VERSION and angle.shape == training.angles.shape
+            whole &= mean.shape[:2] + mean.shape[3:] == (len(angle), training.samples, 2)
+            if not whole or spread.shape != (training.samples, 2) or not np.isfinite(mean).all():
+                raise ValueError("another version or incomplete")
+            return cls(training, angle, mean, spread)
+
+        names = ("strain_templates", *cls._fields)
+        return read_npz(path, names, parse, f"strain templates of version {FILE_VERSION}", TRAIN_HINT)
 
 
 class TemplateMatch(NamedTuple):
@@ -139,11 +159,6 @@ def strain_sample_rate(report: Report) -> float:
     """Samples per second of a report's strain; 0 for fewer than two samples."""
     count = len(report.time)
     return float((count - 1) / (report.time[-1] - report.time[0])) if count > 1 else 0.0
-
-
-def training_drive(angle: float, repeat: int, report: Report) -> TrainingDrive:
-    """The training drive recorded in a report."""
-    return TrainingDrive(angle, repeat, report.strain, strain_sample_rate(report))
 
 
 def filter_strain(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
@@ -218,32 +233,6 @@ def match_template(
     return TemplateMatch(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
 
 
-def write_templates(templates: StrainTemplates, path: Path | str) -> None:
-    """Writes templates to an .npz file."""
-    with open(path, "wb") as file:
-        arrays = templates._asdict() | {"training": np.array(templates.training.model_dump_json())}
-        np.savez_compressed(file, strain_templates=np.int64(FILE_VERSION), **arrays)
-
-
-def read_templates(path: Path | str) -> StrainTemplates:
-    """Reads a file of `write_templates`.
-
-    Raises:
-        InputError: the file is missing, cannot be read or holds something else.
-    """
-
-    def parse(version: np.ndarray, settings: np.ndarray, *arrays: np.ndarray) -> StrainTemplates:
-        training, (angle, mean, spread) = TemplateTraining.model_validate_json(str(settings)), arrays
-        whole = int(version) == FILE_VERSION and angle.shape == training.angles.shape
-        whole &= mean.shape[:2] + mean.shape[3:] == (len(angle), training.samples, 2)
-        if not whole or spread.shape != (training.samples, 2) or not np.isfinite(mean).all():
-            raise ValueError("another version or incomplete")
-        return StrainTemplates(training, angle, mean, spread)
-
-    names = ("strain_templates", *StrainTemplates._fields)
-    return read_npz(path, names, parse, f"strain templates of version {FILE_VERSION}", TRAIN_HINT)
-
-
 def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
     if not drives:
         expected = f"{training.repeats} drives at each of {len(training.angles)} angles"
@@ -303,7 +292,16 @@ SHARE_SMOOTHING = 0.03
 
 
 class TipModel(NamedTuple):
-    """The fitted model.
+    """A whisker whose tip slides along a straight wall, fitted to strain templates.
+
+    While the robot drives on, the distance d of a whisker's base from the wall falls steadily. The tip stays
+    on the wall, so the whisker turns by tau:
+
+        L sin(beta - tau) = d - (speed x time) sin(phi)
+
+    phi is the wall's direction and beta the angle between whisker and wall on the nearer side. Horizontal
+    strain is gain x tau. Vertical strain is crosstalk x horizontal strain minus a share of its size, which
+    depends on the slant beta - tau (the angle between wall and the line from base to tip).
 
     Attributes:
         gain: strain per radian. crosstalk: horizontal strain in the vertical one. share: [K] at `SLANTS`.
@@ -319,20 +317,6 @@ class TipModel(NamedTuple):
     feelers: PlanarWhiskers
     speed: float
     rate: float
-
-
-class DirectionMisfit(NamedTuple):
-    """Misfit of one whisker's strain for each of the K `WALL_DIRECTIONS`.
-
-    Attributes:
-        misfit: [K] mean squared normalised error, summed over both channels; at most about 2 for a wall,
-            infinite for impossible directions.
-        away: [K] distance of the whisker's base from the wall at the last sample, m. samples: number used.
-    """
-
-    misfit: np.ndarray
-    away: np.ndarray
-    samples: int
 
 
 def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipModel:
@@ -363,24 +347,32 @@ def fit_tip_model(templates: StrainTemplates, feelers: PlanarWhiskers) -> TipMod
     return tip._replace(crosstalk=crosstalk, share=share)
 
 
-def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> DirectionMisfit:
-    """Compares a whisker's filtered strain ([N, W, 2], from HIT1 on) with the model for all directions."""
+def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Compares a whisker's filtered strain ([N, W, 2], from HIT1 on) with the model for all directions.
+
+    Returns:
+        Of each of the K `WALL_DIRECTIONS` the mean squared normalised error [K], summed over both channels
+        (at most about 2 for a wall, infinite for impossible directions), and the distance [K] of the
+        whisker's base from the wall at the last sample, m; the number of samples used.
+    """
     rows = _rows(len(strain), tip.rate)[: len(tip.time)]
     across, down = strain[rows, whisker].T
     side = np.sign(across.sum())
     nearer = _nearer(tip, whisker, WALL_DIRECTIONS, side)
     time, noise = tip.time[: len(rows)], tip.noise[: len(rows)]
-    fit = _sliding(tip, whisker, nearer, np.sin(WALL_DIRECTIONS), across, np.ones(len(across), bool))
-    expected = tip.crosstalk * across - np.abs(across) * (_between(fit.slant) @ tip.share)
+    misfit, distance, slant, use = _sliding(
+        tip, whisker, nearer, np.sin(WALL_DIRECTIONS), across, np.ones(len(across), bool)
+    )
+    expected = tip.crosstalk * across - np.abs(across) * (_between(slant) @ tip.share)
     sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
-    vertical = _mean(((down - expected) / sd) ** 2, fit.use)
+    vertical = _mean(((down - expected) / sd) ** 2, use)
     # The shaft of a whisker nearly parallel to the wall, not its tip, would touch it.
-    grazing = np.where(fit.use, fit.slant, np.inf).min(axis=1, initial=np.inf) < MIN_SLANT
-    possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (fit.use.sum() >= 2)
+    grazing = np.where(use, slant, np.inf).min(axis=1, initial=np.inf) < MIN_SLANT
+    possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (use.sum() >= 2)
     possible &= bool(np.abs(across[:1]).max(initial=0.0) < MAX_FIRST_TURN * tip.gain)
     last = time[-1] if len(time) else 0.0
-    away = fit.away - tip.speed * np.sin(WALL_DIRECTIONS) * last
-    return DirectionMisfit(np.where(possible, fit.misfit + vertical, np.inf), away, int(fit.use.sum()))
+    away = distance - tip.speed * np.sin(WALL_DIRECTIONS) * last
+    return np.where(possible, misfit + vertical, np.inf), away, int(use.sum())
 
 
 class _Series(NamedTuple):
@@ -392,15 +384,6 @@ class _Series(NamedTuple):
     across: np.ndarray
     down: np.ndarray
     touching: np.ndarray
-
-
-class _Fit(NamedTuple):
-    """Fit of K walls: misfit [K], distance of the base at HIT1 [K] m, slant [K, N] rad, samples used [N]."""
-
-    misfit: np.ndarray
-    away: np.ndarray
-    slant: np.ndarray
-    use: np.ndarray
 
 
 def _rows(count: int, rate: float) -> np.ndarray:
@@ -417,8 +400,9 @@ def _nearer(tip: TipModel, whisker: int, angle: np.ndarray, side: float) -> np.n
 
 def _sliding(
     tip: TipModel, whisker: int, nearer: np.ndarray, slope: np.ndarray, across: np.ndarray, use: np.ndarray
-) -> _Fit:
-    """Fits the distance of the wall at HIT1 for K angles `nearer` and directions (`slope`: their sines)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Fits the distance of the wall at HIT1 for K angles `nearer` and directions (`slope`: their sines):
+    misfit [K], distance of the base at HIT1 [K] m, slant [K, N] rad, samples used [N]."""
     count, length, turn = len(across), float(tip.feelers.length[whisker]), np.abs(across) / tip.gain
     use = use & (turn < MAX_TURN)
     slant = nearer[:, None] - turn
@@ -426,7 +410,7 @@ def _sliding(
     sd = length * np.cos(slant) * np.hypot(tip.noise[:count, 0] / tip.gain, HORIZONTAL_MODEL_SD * turn)
     weight = use / (sd**2 + SURFACE_SD**2)
     away = (weight * distance).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-    return _Fit(_mean(weight * (distance - away[:, None]) ** 2, use), away, slant, use)
+    return _mean(weight * (distance - away[:, None]) ** 2, use), away, slant, use
 
 
 def _mean(square: np.ndarray, use: np.ndarray) -> np.ndarray:
@@ -462,9 +446,9 @@ def _best_gain(tip: TipModel, series: list[_Series], gains: np.ndarray) -> tuple
         nearer, slope = np.array([one.nearer]), np.sin([one.angle])
         for k, gain in enumerate(gains):
             model = tip._replace(gain=gain)
-            fit = _sliding(model, one.whisker, nearer, slope, one.across, one.touching)
+            misfit, _, _, use = _sliding(model, one.whisker, nearer, slope, one.across, one.touching)
             # With this gain, too many samples would be turned further than `MAX_TURN`.
-            total[k] += min(fit.misfit[0], 10.0) if fit.use.sum() >= MIN_CONTACT_SAMPLES // 2 else 10.0
+            total[k] += min(misfit[0], 10.0) if use.sum() >= MIN_CONTACT_SAMPLES // 2 else 10.0
     best = int(total.argmin())
     return float(gains[best]), float(total[best] / len(series))
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from evaluation.cells.decoding import packet_pose, torus_sides, truth_in_sheet
+from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.recording import CellRecording
 from evaluation.plots import style
 from evaluation.studies.machine import one_core, processor_name, watch_load
@@ -62,12 +62,12 @@ class CellFigure(NamedTuple):
 def torus_error(recording: CellRecording) -> np.ndarray:
     """[T, 3] decoded minus true pose along the x and y of the sheet and in heading (m, m, rad), 0 at the
     first known pose; each at most half a side of the torus."""
-    return shortest(recording, packet_pose(recording) - truth_in_sheet(recording))
+    return shortest(recording, recording.packet_pose - truth_in_sheet(recording))
 
 
 def shortest(recording: CellRecording, difference: np.ndarray) -> np.ndarray:
     """Differences [..., 3] of poses (m, m, rad), the shortest way round the torus."""
-    sides = np.array(torus_sides(recording))
+    sides = np.array(recording.torus_sides)
     return difference - sides * np.round(difference / sides)
 
 

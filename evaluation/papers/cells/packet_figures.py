@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.cells.decoding import packet_pose
 from evaluation.papers.cells.figure import (
     CellFigure,
     CellTask,
@@ -287,7 +286,7 @@ def measure_anchoring(task: CellTask, schedule: Schedule | None = None) -> Ancho
 def anchored_after(run: RatRun, light: RatRun, schedule: Schedule) -> float:
     """Time from the return of the light until the packet is and stays near to that of the session of the same
     seed in light throughout, s; inf if it does not."""
-    apart = packet_pose(run.recording) - packet_pose(light.recording)
+    apart = run.recording.packet_pose - light.recording.packet_pose
     far = np.any(error_size(shortest(run.recording, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
     held = round(HELD * RATE)
     windows = np.lib.stride_tricks.sliding_window_view(far, held)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
-from evaluation.cells.decoding import packet_pose, truth_in_sheet
+from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
@@ -259,7 +259,7 @@ def _place_phase(recording: CellRecording) -> np.ndarray:
     c, s = np.cos(heading), np.sin(heading)
     centre = true[0, :2] + np.array([[c, -s], [s, c]]) @ (middle - recording.truth[0, :2])
     origin = np.array([*centre, 0.0])
-    packet, there = shortest(recording, packet_pose(recording) - origin), true - origin
+    packet, there = shortest(recording, recording.packet_pose - origin), true - origin
     return (there[:, 0] + 1j * there[:, 1]) * np.conj(packet[:, 0] + 1j * packet[:, 1])
 
 

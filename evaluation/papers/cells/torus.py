@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.fields import count_by_cell, find_fields
+from evaluation.cells.fields import find_fields
 from evaluation.cells.grid_score import (
     HEXAGONAL,
     SQUARE,
@@ -140,7 +140,7 @@ def measure_cells(
     maps = _maps(activity, bins, bin)
     lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
     fields = find_fields(maps, least_bins=round(FIELD / bin**2))
-    return LatticeFigures(size, bin, maps, hexagonal, square, lattice, count_by_cell(fields, len(maps)))
+    return LatticeFigures(size, bin, maps, hexagonal, square, lattice, fields.number)
 
 
 def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:

@@ -23,7 +23,6 @@ from tactile.wall_estimation.strain_templates import (
     filter_strain,
     fit_tip_model,
     match_template,
-    write_templates,
 )
 
 DURATIONS = (0.5, 1.0, 2.0)
@@ -56,7 +55,7 @@ def train_to_file(config: CreateSimulationConfig, path: Path) -> StrainTemplates
     require_new_file(path, parents=True)
     templates = train_strain_templates(config)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_templates(templates, path)
+    templates.write(path)
     return templates
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from tactile.base.errors import InputError
 from tactile.base.samples import longest_run
-from tactile.wall_estimation.signal_map import SignalMap, predict_signal, signal_slope, signal_variance
+from tactile.wall_estimation.signal_map import SignalMap
 
 FREE_ROWS = 8
 """Samples at the start of a sweep, and at its end if the whisker is free there, that give the baseline."""
@@ -143,7 +143,7 @@ class _Search:
     def starts(self) -> list[np.ndarray]:
         """In each range of reaches, the calibrated position [3] with signals nearest to the strongest."""
         strongest = self.touch.signal[np.argmax(np.linalg.norm(self.touch.signal, axis=1))]
-        expected = predict_signal(self.known, self.known.position)
+        expected = self.known.predict(self.known.position)
         error = np.linalg.norm(expected - strongest, axis=1)
         ranges = [
             (self.reaches >= low * self.reach) & (self.reaches <= high * self.reach)
@@ -153,7 +153,7 @@ class _Search:
 
     def errors(self, contact: np.ndarray, sd: np.ndarray) -> np.ndarray:
         """Errors of signals, of the outline's smoothness and of the tip, in standard deviations."""
-        wrong = (self.touch.signal - predict_signal(self.known, contact)) / sd
+        wrong = (self.touch.signal - self.known.predict(contact)) / sd
         rough = self.smooth @ (contact - self.place).ravel()
         return np.concatenate([wrong.ravel(), rough, self.tip(contact)[0]])
 
@@ -169,7 +169,7 @@ class _Search:
         """The local optimum from a contact [3] at the same place of the whisker in all samples."""
         contact = np.tile(start, (len(self.place), 1))
         for _ in range(ROUNDS):
-            variance = self.sample_variance + signal_variance(self.known, contact)
+            variance = self.sample_variance + self.known.variance(contact)
             contact, normal, error = self._round(contact, np.sqrt(variance))
         misfit = float((error[: variance.size] ** 2).mean())
         cost = float(error @ error + np.log(variance).sum())
@@ -201,7 +201,7 @@ class _Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix and right side of a Gauss-Newton step."""
         count, channels = sd.shape
-        slope = signal_slope(self.known, contact) / sd[:, :, None]
+        slope = self.known.slope(contact) / sd[:, :, None]
         rest = np.concatenate([self.smooth, self.tip(contact)[1]])
         normal = rest.T @ rest
         blocks = np.einsum("nci,ncj->nij", slope, slope)

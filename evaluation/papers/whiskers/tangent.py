@@ -19,7 +19,7 @@ from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from evaluation.papers.whiskers.sliding_contact import SlidingContact, find_contact, track_contact
 from robot.recordings.real_whiskers import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
-from tactile.wall_estimation.signal_map import SignalMap, fit_signal_map, predict_signal
+from tactile.wall_estimation.signal_map import SignalMap, fit_signal_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -290,7 +290,7 @@ def _contacts_at_tip(known: SignalMap, signal: np.ndarray) -> np.ndarray:
     reach = np.linalg.norm(known.position - known.base, axis=1)
     tip = known.position[reach > TIP_SHARE * reach.max()]
     level = np.abs(tip[:, 2] - np.median(tip[:, 2])).argsort()[: max(len(tip) // 3, 4)]
-    size = np.linalg.norm(predict_signal(known, tip[level]), axis=1)
+    size = np.linalg.norm(known.predict(tip[level]), axis=1)
     powers = np.arange(3)
     bend = np.linalg.lstsq((size / size.max())[:, None] ** powers, tip[level], rcond=None)[0]
     contacts: np.ndarray = (np.linalg.norm(signal, axis=1) / size.max())[:, None] ** powers @ bend

@@ -45,8 +45,8 @@ from tactile.base.types import Odometry, Report, StepEnd
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     TemplateTraining,
+    TrainingDrive,
     train_templates,
-    training_drive,
 )
 
 
@@ -212,7 +212,7 @@ def train_strain_templates(
     random = stream(config.seed, "templates")
     return train_templates(
         (
-            training_drive(angle, repeat, drive_into_wall(config, angle, random))
+            TrainingDrive.of_report(angle, repeat, drive_into_wall(config, angle, random))
             for angle in training.angles.tolist()
             for repeat in range(training.repeats)
         ),

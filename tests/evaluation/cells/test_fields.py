@@ -7,11 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from evaluation.cells.fields import (
-    bin_area,
     border_score,
-    count_by_cell,
     find_fields,
-    largest_by_cell,
     largest_field,
     score_borders,
     wall_coverage,
@@ -19,7 +16,7 @@ from evaluation.cells.fields import (
 )
 from evaluation.cells.rate_map import rate_maps
 from tactile.base.errors import InputError
-from tests.evaluation.cells.box_walk import EDGES, mixed_sums, random_walk
+from tests.evaluation.cells.box_walk import mixed_sums, random_walk
 
 SECONDS = np.ones((20, 20))
 
@@ -45,8 +42,8 @@ def test_fields_of_blocks() -> None:
     assert fields.bins.tolist() == [16, 15, 400]
     assert fields.peak.tolist() == [1.0, 0.5, 2.0]
     assert np.unique(fields.label[0]).tolist() == [0, 1, 2]
-    assert count_by_cell(fields, 3).tolist() == [2, 0, 1]
-    assert largest_by_cell(fields, 3).tolist() == largest_field(rates, SECONDS).tolist() == [16, 0, 400]
+    assert fields.number.tolist() == [2, 0, 1]
+    assert fields.largest.tolist() == largest_field(rates, SECONDS).tolist() == [16, 0, 400]
 
 
 def test_fields_touch_by_sides_and_not_by_corners_or_cells() -> None:
@@ -65,11 +62,10 @@ def test_bins_without_a_rate_part_fields() -> None:
 def test_place_cells_have_one_field() -> None:
     sums = mixed_sums(random_walk())
     fields = find_fields(rate_maps(sums)[:6])
-    assert count_by_cell(fields, 6).tolist() == [1] * 6
+    assert fields.number.tolist() == [1] * 6
     # A fifth of a Gaussian of 0.12 m is reached at 0.2154 m; smoothing by 1.5 bins widens it.
-    inside = largest_by_cell(fields, 6)[1] * bin_area(sums.x_edges, sums.y_edges)
+    inside = fields.largest[1] * (sums.x_edges[1] - sums.x_edges[0]) * (sums.y_edges[1] - sums.y_edges[0])
     assert_allclose(inside, np.pi * 2 * np.log(5) * (0.12**2 + 0.075**2), rtol=0.1)
-    assert_allclose(bin_area(EDGES, EDGES), 0.0025)
 
 
 def test_border_scores_of_blocks() -> None:

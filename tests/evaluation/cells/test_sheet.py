@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from evaluation.cells.decoding import packet_drift, packet_pose, torus_sides, truth_in_sheet
+from evaluation.cells.decoding import packet_drift, truth_in_sheet
 from evaluation.cells.sheet_phase import (
     circular_correlation,
     compare_phases,
@@ -67,9 +67,9 @@ def test_bad_recordings_give_one_clear_error() -> None:
 
 def test_cells_of_a_perfect_sheet_fire_at_their_place() -> None:
     recording = sheet_recording(WIDE, CELLS)
-    side = torus_sides(recording)[:2]
+    side = recording.torus_sides[:2]
     assert side == pytest.approx((1.05, 1.05))
-    assert_allclose(packet_pose(recording)[0], truth_in_sheet(recording)[0] % [*side, 2 * np.pi])
+    assert_allclose(recording.packet_pose[0], truth_in_sheet(recording)[0] % [*side, 2 * np.pi])
     found = compare_phases(sheet_phases(CELLS, SHAPE), map_phases(*folded_maps(recording)), side)
     assert (found.correlation > 0.98).all()
     assert (abs(found.offset) < 0.01).all()
@@ -80,7 +80,7 @@ def test_shuffled_cells_have_no_phase() -> None:
     recording = sheet_recording(WIDE, CELLS)
     phase = map_phases(*folded_maps(recording))
     other = stream(2, "shuffle").permutation(sheet_phases(CELLS, SHAPE))
-    found = compare_phases(other, phase, torus_sides(recording)[:2])
+    found = compare_phases(other, phase, recording.torus_sides[:2])
     assert (abs(found.correlation) < 0.3).all()
     assert (found.residual > 0.2).all()
 

@@ -11,7 +11,6 @@ from evaluation.metrics.occupancy_grid import (
     GridTruth,
     OccupancyGrid,
     touchable_surface,
-    truth_occupancy,
 )
 from evaluation.metrics.occupancy_score import Convention, grid_error
 
@@ -43,7 +42,7 @@ def scene(boxes=((5, 5, 8, 8), (13, 12, 16, 15)), side=20, margin=6, cell=CELL):
 
 def true_grid(grid, truth, outside=PRIOR_OCCUPANCY):
     """The truth as a map on the cells of another map: the best possible map."""
-    return grid._replace(probability=truth_occupancy(truth, touchable_surface(grid, truth).wall, outside))
+    return grid._replace(probability=truth.occupancy(touchable_surface(grid, truth).wall, outside))
 
 
 @st.composite

@@ -14,7 +14,6 @@ from evaluation.metrics.occupancy_grid import (
     cell_centres,
     mean_grid,
     touchable_surface,
-    truth_occupancy,
 )
 from evaluation.metrics.occupancy_score import (
     CLAMP,
@@ -288,7 +287,7 @@ def test_only_surfaces_that_face_free_space_count():
     assert block[:, -1].all()
     assert not block[1:-1, :-1].any()
     assert not surface.wall[6 + 7 : 6 + 11, 5].any()  # the ring behind it is out of reach
-    assert truth_occupancy(truth, surface.wall)[6 + 8, 7] == 1
+    assert truth.occupancy(surface.wall)[6 + 8, 7] == 1
 
 
 def test_rotated_objects_have_a_closed_surface():

@@ -9,9 +9,9 @@ import pytest
 
 from evaluation.artifacts.run_reader import read_pieces, read_run, write_pieces
 from evaluation.metrics.run_metrics import PIECES, arrange_pieces, ate_within_pieces
-from evaluation.metrics.scorecard import score_run, scorecard_lines
+from evaluation.metrics.scorecard import score_run
 from evaluation.metrics.trajectory import ate, write_tum
-from evaluation.plots.map_plot import align_layers, draw_changes, draw_map, map_headline
+from evaluation.plots.map_plot import Layers, draw_changes, draw_map, map_headline
 from evaluation.report.verdict import describe_score
 from ratslam.core.estimates import Localisation, pieces_of, write_course
 from tactile.base.errors import InputError
@@ -35,7 +35,7 @@ def parted(circle):
 def test_a_run_in_one_piece_is_scored_as_before(circle):
     one = circle._replace(piece=np.zeros(len(circle.time), int))
     assert score_run(one) == score_run(circle)
-    assert PIECES not in scorecard_lines(score_run(one))
+    assert PIECES not in score_run(one).lines()
     assert arrange_pieces(one) is one
 
 
@@ -127,7 +127,7 @@ def test_the_saved_map_of_a_localised_session_stays_where_it_is(circle, tmp_path
     assert shown.final[found] == pytest.approx(circle.final[found], abs=1e-9)
     if seen and found.any():
         assert shown.final[:, :2] == pytest.approx(circle.final[:, :2], abs=1e-6)
-        assert align_layers(shown).truth == pytest.approx(circle.final[:, :2], abs=1e-6)
+        assert Layers.align(shown).truth == pytest.approx(circle.final[:, :2], abs=1e-6)
     elif not found.any():
         assert shown.final[:, 0].min() > circle.nodes[:, 0].max()
     (path,) = (line for line in draw_changes("", run, []).axes[0].lines if line.get_zorder() == 3)

@@ -77,7 +77,7 @@ def test_one_row_aligns_and_none_is_refused():
 def test_relative_rotations_are_compared_across_half_a_turn():
     truth = np.array([[0, 0, np.radians(179)], [0, 0, np.radians(-179)]])
     estimate = np.array([[0, 0, np.radians(178)], [0, 0, np.radians(-177)]])
-    assert np.degrees(rpe(estimate, truth).rotation) == pytest.approx(3)
+    assert np.degrees(rpe(estimate, truth)[1]) == pytest.approx(3)
     assert np.isnan(rpe(estimate, truth, step=2)).all()
 
 

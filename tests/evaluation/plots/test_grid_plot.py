@@ -18,7 +18,6 @@ from evaluation.plots.grid_plot import (
     draw_grid,
     draw_grids,
     grid_headline,
-    mean_position_error,
 )
 from evaluation.plots.style import VERMILLION, YELLOW
 
@@ -150,8 +149,6 @@ def test_rows_without_truth_are_not_drawn():
     assert [line.get_label() for line in axes.lines][2] == "online path, mean error 0.050 m"
     (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
     assert [line.get_label() for line in axes.lines] == ["odometry", "truth", "online path"]
-    poses = np.column_stack([WAY, TURN])
-    assert mean_position_error(poses + [0.3, 0.4, 9], poses) == pytest.approx(0.5)
 
 
 def test_the_headline_names_the_defined_metrics():

@@ -26,7 +26,7 @@ from evaluation.artifacts.recorded_views import (
 )
 from evaluation.metrics.run_arrays import UNFINISHED
 from evaluation.metrics.scorecard import score_run
-from evaluation.plots.map_plot import align_layers
+from evaluation.plots.map_plot import Layers
 from evaluation.report.charts import PALETTE, overlay_chart
 from evaluation.report.page import content_policy, embedded_json, read_citations
 from evaluation.report.run_files import FILES, OTHER, list_run_files
@@ -74,7 +74,7 @@ def test_compared_runs_are_drawn_in_the_frame_of_their_truth(circle) -> None:
     """Each map has a frame of its own."""
     turned = circle._replace(final=compose(np.array([3.0, -2.0, 1.0]), circle.final))
     runs = [
-        SimpleNamespace(name=name, layers=align_layers(run)) for name, run in (("a", circle), ("b", turned))
+        SimpleNamespace(name=name, layers=Layers.align(run)) for name, run in (("a", circle), ("b", turned))
     ]
     traces = overlay_chart(runs).data
     assert [trace.name for trace in traces] == ["truth", "a", "b"]
@@ -95,12 +95,12 @@ def test_files_are_explained(tmp_path: Path) -> None:
     for name in ("steps.csv", "config.yaml", "<b>.txt", ".hidden"):
         (tmp_path / name).write_text("ab")
     found = list_run_files(tmp_path)
-    assert [(file.name, file.size) for file in found] == [
+    assert [(name, size) for name, size, _ in found] == [
         ("config.yaml", 2),
         ("steps.csv", 2),
         ("<b>.txt", 2),
     ]
-    assert found[-1].content == OTHER
+    assert found[-1][2] == OTHER
 
 
 def test_the_readme_and_the_page_explain_the_same_files() -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
 from evaluation.artifacts.run_reader import read_run, read_walls
-from evaluation.monitor import RunMonitor, RunProgress, draw_watch, path_length, status_line, watch_run
+from evaluation.monitor import RunMonitor, RunProgress, draw_watch, path_length, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor
 from ratslam.core.session import CHUNK
@@ -305,7 +305,7 @@ def test_the_status_line_shows_steps_distance_pace_and_outcomes():
         "name", RUNNING, 9, np.zeros((4, 3)), np.zeros(3), way, nothing,
         outcomes={"ok": 1, "reseeded": 3}, lost=2, online_error=0.5, checkpoint=2, rate=None, silence=11.0,
     )  # fmt: skip
-    assert status_line(seen, 8.2) == (
+    assert seen.status_line(8.2) == (
         "name: running, 4 of 9 steps, 5.0 m, 8 steps/s, error 0.5 m, 3 reseeded, 1 ok, 2 lost, "
         "checkpoint at 2, silent for 11 s"
     )

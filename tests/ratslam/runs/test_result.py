@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ratslam
-from evaluation.metrics.scorecard import render_scorecard, scorecard_lines
+from evaluation.metrics.scorecard import render_scorecard
 
 CONFIG = """
 simulation: {path: {explore: 40}}
@@ -108,7 +108,7 @@ def test_the_page_shows_map_and_scorecard(result: ratslam.Result) -> None:
     page = Page(result._repr_html_())
     picture = b64decode((page.attributes["src"] or "").removeprefix("data:image/png;base64,"))
     assert picture == (result.directory / "map.png").read_bytes()
-    cells = [list(line) for lines in scorecard_lines(result.scorecard).values() for line in lines]
+    cells = [list(line) for lines in result.scorecard.lines().values() for line in lines]
     assert [row for row in page.rows if row in cells] == cells
     for line in cells:
         assert line[0] in render_scorecard(result.scorecard)

@@ -14,8 +14,6 @@ from tactile.calibration import (
     Calibration,
     CalibrationConfig,
     calibrate,
-    calibration_arrays,
-    calibration_from_arrays,
 )
 
 CONFIG = CalibrationConfig()
@@ -158,16 +156,16 @@ def test_times_that_do_not_increase_are_refused() -> None:
 
 def test_arrays_read_back_equal() -> None:
     found = calibrate(CONFIG, record())
-    again = calibration_from_arrays(calibration_arrays(found))
+    again = Calibration.from_arrays(found.arrays())
     for name, value in found._asdict().items():
         assert np.array_equal(getattr(again, name), value), name
 
 
 @pytest.mark.parametrize("name", Calibration._fields)
 def test_missing_arrays_and_wrong_shapes_are_refused(name: str) -> None:
-    arrays = calibration_arrays(calibrate(CONFIG, record()))
+    arrays = calibrate(CONFIG, record()).arrays()
     with pytest.raises(InputError, match=name):
-        calibration_from_arrays({key: value for key, value in arrays.items() if key != name})
+        Calibration.from_arrays({key: value for key, value in arrays.items() if key != name})
     if name != "alive":
         with pytest.raises(InputError, match=name):
-            calibration_from_arrays(arrays | {name: np.zeros(7)})
+            Calibration.from_arrays(arrays | {name: np.zeros(7)})

@@ -10,10 +10,9 @@ from tactile.base.random_streams import stream
 from tactile.base.types import Cycle, Odometry, Whisk
 from tactile.calibration import (
     Calibration,
+    RestBaseline,
     RestBaselineConfig,
-    bent_whiskers,
     follow_baseline,
-    start_baseline,
 )
 from tactile.frontend import Frontend, TouchConfig
 
@@ -97,7 +96,7 @@ def test_it_continues_from_its_arrays_bit_for_bit() -> None:
 
 
 def test_cycles_without_samples_and_with_nan_change_nothing() -> None:
-    config, start = RestBaselineConfig(), start_baseline(COUNT)
+    config, start = RestBaselineConfig(), RestBaseline.start(COUNT)
     empty = Cycle(np.zeros(0), np.zeros((0, COUNT)), np.zeros((0, COUNT, 2)), Odometry(0.0, 0.0, 0.0, 0.2))
     assert follow_baseline(config, FREE, start, empty) is start
     broken = cycle(0, 0.0)
@@ -105,4 +104,4 @@ def test_cycles_without_samples_and_with_nan_change_nothing() -> None:
     after = follow_baseline(config, FREE, start, broken)
     assert (after.offset[7] == 0).all()
     assert (after.offset[6] != 0).all()
-    assert not bent_whiskers(config, after).any()
+    assert not after.bent(config).any()

@@ -16,13 +16,10 @@ from tactile.wall_estimation.estimators import (
     Wall,
     WallContact,
     contact_points,
-    first_whisker,
     fused_wall,
     geometric_wall,
     template_wall,
-    to_final_frame,
     wall_normal,
-    wall_through,
 )
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
@@ -75,15 +72,15 @@ def is_none(wall: Wall) -> bool:
 
 def test_a_wall_straight_across_has_its_normal_ahead() -> None:
     np.testing.assert_allclose(wall_normal(np.pi / 2), [1, 0], atol=1e-15)
-    ahead = wall_through(np.array([0.3, 0.1]), np.pi / 2, 0.1)
+    ahead = Wall.through(np.array([0.3, 0.1]), np.pi / 2, 0.1)
     np.testing.assert_allclose(ahead.point, [0.3, 0.0], atol=1e-15)
-    left = wall_through(np.array([0.3, 0.2]), 0.0, 0.1)
+    left = Wall.through(np.array([0.3, 0.2]), 0.0, 0.1)
     np.testing.assert_allclose(left.point, [0.0, 0.2], atol=1e-15)
 
 
 @given(st.floats(-9, 9), st.floats(-1, 1), st.floats(-1, 1))
 def test_the_point_is_the_nearest_of_the_line_through(direction: float, x: float, y: float) -> None:
-    through_it = wall_through(np.array([x, y]), direction, 0.1)
+    through_it = Wall.through(np.array([x, y]), direction, 0.1)
     along = np.array([np.cos(direction), np.sin(direction)])
     assert 0 <= through_it.direction < np.pi
     assert apart(through_it.direction, direction) < 1e-9
@@ -95,7 +92,7 @@ def test_the_point_is_the_nearest_of_the_line_through(direction: float, x: float
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-3, 3))
 def test_points_transform_like_poses(x: float, y: float, turn: float) -> None:
     travel = np.array([x, y, turn])
-    there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
+    there = meeting(wall(1.2), travel=travel).to_final_frame(POINTS)
     for before, after in zip(POINTS, there, strict=True):
         np.testing.assert_allclose(compose(travel, np.array([*after, 0.0]))[:2], before, atol=1e-12)
 
@@ -106,14 +103,14 @@ def test_two_contacts_give_the_line_through_them_with_the_motion_between(
 ) -> None:
     """A wall through the first contact; the robot then moves until the second one is on it too."""
     normal, travel = wall_normal(angle), np.array([ahead, 0.02, 0.1])
-    there = to_final_frame(POINTS, meeting(wall(1.2), travel=travel))
+    there = meeting(wall(1.2), travel=travel).to_final_frame(POINTS)
     travel[:2] += normal * ((there[second] - there[first]) @ normal)
     hits = np.eye(4, dtype=bool)
     two = meeting(
         wall(1.2), first=hits[first], now=hits[second] | hits[first], travel=travel, moment=StepEnd.HIT2
     )
     found = geometric_wall(POINTS, two)
-    where = to_final_frame(POINTS, two)[first]
+    where = two.to_final_frame(POINTS)[first]
     if first == second or np.linalg.norm(where - POINTS[second]) < 0.05:
         assert is_none(found)
         return
@@ -141,7 +138,7 @@ def test_the_matched_wall_passes_through_the_first_contact(templates: StrainTemp
         match = match_template(templates, there.strain)
         found = template_wall(POINTS, match, there, 0.3)
         assert apart(found.direction, angle) < 0.1
-        at = POINTS[first_whisker(there)] - [there.travel[0], 0]
+        at = POINTS[there.first_whisker()] - [there.travel[0], 0]
         np.testing.assert_allclose(found.point, (wall_normal(angle) @ at) * wall_normal(angle), atol=1e-9)
         unlike = match._replace(relative=0.31)
         assert is_none(template_wall(POINTS, unlike, there, 0.3))
@@ -157,7 +154,7 @@ def test_directions_of_flat_walls_are_within_a_degree_also_after_abort(tip: TipM
         assert apart(found.direction, np.radians(angle)) < 1.5
         assert 0 < found.sd < MAX_DIRECTION_SD
         # The wall passes through the first whisker's tip at HIT1, and is nearer by the distance driven.
-        whisker = first_whisker(there)
+        whisker = there.first_whisker()
         assert whisker is not None
         touched = wall_normal(np.radians(angle)) @ (FEELERS.base + 0.14 * FEELERS.direction)[whisker]
         driven = len(there.strain) / RATE * SPEED * np.sin(np.radians(angle))
@@ -172,7 +169,7 @@ def test_a_short_wall_is_estimated_from_its_first_whisker(
     tip: TipModel, templates: StrainTemplates, whisker: int, angle: float
 ) -> None:
     there = meeting(wall(np.radians(angle), stream(1, "noise"), first=whisker))
-    assert first_whisker(there) == whisker
+    assert there.first_whisker() == whisker
     found = fused_wall(tip, POINTS, there)
     assert apart(found.direction, np.radians(angle)) < 4
     # The nearest template is of another wall.

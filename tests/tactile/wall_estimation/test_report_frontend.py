@@ -21,7 +21,6 @@ from tactile.wall_estimation.strain_templates import (
     TemplateTraining,
     TrainingDrive,
     train_templates,
-    write_templates,
 )
 from tests.helpers.flat_walls import RATE, apart, met, report, wall
 
@@ -224,7 +223,7 @@ def test_other_whiskers_and_sample_rates_are_refused(templates: StrainTemplates,
     with pytest.raises(InputError, match=r"nowhere\.npz: no such file"):
         ReportFrontend(ReportFrontendConfig(templates=tmp_path / "nowhere.npz"))
     path = tmp_path / "kept.npz"
-    write_templates(templates, path)
+    templates.write(path)
     hit, slow = met(wall(ANGLE))
     frontend = ReportFrontend(ReportFrontendConfig(templates=path))
     assert observe(frontend, hit, slow)[-1].wall

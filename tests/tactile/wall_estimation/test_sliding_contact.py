@@ -20,9 +20,6 @@ from tactile.base.errors import InputError
 from tactile.wall_estimation.signal_map import (
     SignalMap,
     fit_signal_map,
-    predict_signal,
-    signal_slope,
-    signal_variance,
 )
 
 SLICES = Path(__file__).parents[2] / "data" / "real_touch" / "stanford"
@@ -85,10 +82,10 @@ def angle_between(one: np.ndarray, other: np.ndarray | float) -> np.ndarray:
 def test_the_map_meets_held_out_places_and_knows_where_it_guesses() -> None:
     random = np.random.default_rng(1)
     inside = at(random.uniform(0.02, 0.04, 50), random.uniform(0.1, 0.9, 50), random.uniform(-0.15, 0.15, 50))
-    error = np.abs(predict_signal(synthetic_map(), inside) - signals(inside))
+    error = np.abs(synthetic_map().predict(inside) - signals(inside))
     assert np.median(error) < 0.01 * np.median(np.abs(signals(inside)))
     outside = at(np.full(1, 0.04), np.full(1, 2.0), np.full(1, 0.8))
-    variances = [signal_variance(synthetic_map(), place) for place in (inside, outside)]
+    variances = [synthetic_map().variance(place) for place in (inside, outside)]
     assert variances[1].min() > 10 * variances[0].max()
 
 
@@ -96,12 +93,10 @@ def test_slopes_are_those_of_the_map() -> None:
     place = at(np.array([0.02, 0.035]), np.array([0.2, 0.7]), np.array([0.0, 0.1]))
     step = 1e-6
     numeric = [
-        (predict_signal(synthetic_map(), place + move) - predict_signal(synthetic_map(), place - move))
-        / 2
-        / step
+        (synthetic_map().predict(place + move) - synthetic_map().predict(place - move)) / 2 / step
         for move in step * np.eye(3)
     ]
-    found = signal_slope(synthetic_map(), place)
+    found = synthetic_map().slope(place)
     np.testing.assert_allclose(found, np.stack(numeric, axis=2), atol=1e-4 * np.abs(found).max())
 
 

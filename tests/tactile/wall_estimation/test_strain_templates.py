@@ -17,9 +17,7 @@ from tactile.wall_estimation.strain_templates import (
     TrainingDrive,
     filter_strain,
     match_template,
-    read_templates,
     train_templates,
-    write_templates,
 )
 from tests.helpers.flat_walls import RATE, apart, wall
 
@@ -114,8 +112,8 @@ def test_dead_whiskers_are_left_out_of_the_match(templates: StrainTemplates) -> 
 
 def test_templates_read_back_equal(templates: StrainTemplates, tmp_path: Path) -> None:
     path = tmp_path / "templates.npz"
-    write_templates(templates, path)
-    again = read_templates(path)
+    templates.write(path)
+    again = StrainTemplates.read(path)
     assert again.training == templates.training
     for name in ("angle", "mean", "spread"):
         assert np.array_equal(getattr(again, name), getattr(templates, name))
@@ -131,13 +129,13 @@ def _plain_array(path: Path) -> None:
 
 
 def _truncated_file(path: Path) -> None:
-    write_templates(train_templates(DRIVES), path)
+    train_templates(DRIVES).write(path)
     path.write_bytes(path.read_bytes()[:9999])
 
 
 def _other_shape(path: Path) -> None:
     templates = train_templates(DRIVES)
-    write_templates(templates._replace(mean=templates.mean[:14]), path)
+    templates._replace(mean=templates.mean[:14]).write(path)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +158,7 @@ def test_other_files_are_refused(make: object, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"wrong\.npz: (no such file|another kind of file).*reproduce templates"
     ):
-        read_templates(path)
+        StrainTemplates.read(path)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from robot.simulation.create.simulated_session import (
 )
 from robot.touch_source import observation_of, open_touch_source
 from tactile.base.errors import InputError
-from tactile.wall_estimation.strain_templates import StrainTemplates, read_templates
+from tactile.wall_estimation.strain_templates import StrainTemplates
 
 CONFIG = CreateSimulationConfig(seed=4)
 
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def templates(folder: Path) -> StrainTemplates:
-    return read_templates(folder / "new" / "t.npz")
+    return StrainTemplates.read(folder / "new" / "t.npz")
 
 
 def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:

@@ -22,10 +22,10 @@ from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFronte
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     TemplateTraining,
+    TrainingDrive,
     filter_strain,
     match_template,
     train_templates,
-    training_drive,
 )
 from tests.helpers.flat_walls import apart
 
@@ -39,7 +39,7 @@ ARENAS = range(4)
 def templates() -> StrainTemplates:
     random = stream(0, "training")
     return train_templates(
-        training_drive(float(angle), k, drive_into_wall(CONFIG, float(angle), random))
+        TrainingDrive.of_report(float(angle), k, drive_into_wall(CONFIG, float(angle), random))
         for angle in TRAINING.angles
         for k in range(TRAINING.repeats)
     )
