@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from evaluation.papers.cells.reproduction import NAMES as CELL_ROWS
-from evaluation.papers.maps.reproduction import ROWS as MAP_ROWS
-from evaluation.papers.whiskers.reproduction import NAMES as REAL_ROWS
+from evaluation.papers.figure import CELLS, MAPS, REAL, Figure, Task, write_page
 from ratslam.cli.common import (
     INTERRUPTED,
     CommandParser,
@@ -76,17 +75,18 @@ def add_commands(commands: Commands) -> None:
         "real", _real, "figures on recordings of real whiskers and wheels",
         "reproduce real --rows contact -o runs/real",
     )  # fmt: skip
-    add_row_names(real, REAL_ROWS)
+    add_row_names(real, REAL)
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         check=own_folder("real.md"),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
     title = "maps found again, continued, merged and changed"
-    maps = add_rows(names, "maps", _maps, title, MAP_ROWS, 32000)
+    # Mazes 31000 to 31030, 32700 to 32707 and 33000 to 33059 were used to choose settings.
+    maps = add_rows(names, "maps", _maps, title, MAPS, 32000)
     add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
-    add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
+    add_rows(names, "cells", _cells, title, CELLS, 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -198,29 +198,49 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _real(arguments: argparse.Namespace) -> int:
-    from evaluation.papers.tables.markdown import select_rows
     from evaluation.papers.tables.recordings import DATA, real_recordings
-    from evaluation.papers.whiskers.reproduction import reproduce_real
+    from evaluation.papers.whiskers.recordings import UNPROVEN
 
     data = real_recordings()
     if data is None:
         raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
+    return _write_page(arguments, "real", REAL, data, [UNPROVEN])
+
+
+def _cells(arguments: argparse.Namespace) -> int:
+    return _write_page(
+        arguments, "cells", CELLS, Task(arguments.first, arguments.sessions, arguments.workers)
+    )
+
+
+def _write_page(
+    arguments: argparse.Namespace,
+    name: str,
+    places: Mapping[str, str],
+    task: Task | Path,
+    ending: Sequence[str] = (),
+) -> int:
     prepare_jax(keep_compiled=False)
-    names = select_rows(arguments.rows, dict.fromkeys(REAL_ROWS), REAL_ROWS)
-    for line in reproduce_real(names, data, arguments.output):
+    from evaluation.papers.tables.markdown import select_rows
+
+    def measure(name: str, figure: Figure) -> tuple[Sequence[str], Any]:
+        return (), figure.measure(task)
+
+    names, page = select_rows(arguments.rows, places, tuple(places)), arguments.output / f"{name}.md"
+    for line in write_page(page, places, names, measure, ending):
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'real.md'}")
+    print(f"wrote {page}")
     return 0
 
 
 def _maps(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.maps.reproduction import reproduce_maps
-    from evaluation.papers.maps.row import PRODUCT
+    from evaluation.papers.maps.operations import PRODUCT, reproduce_maps
     from evaluation.papers.tables.markdown import select_rows
 
-    names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
+    names = select_rows(arguments.rows, MAPS, tuple(MAPS))
     lines = reproduce_maps(
+        MAPS,
         names,
         PRODUCT,
         arguments.output,
@@ -232,20 +252,6 @@ def _maps(arguments: argparse.Namespace) -> int:
     for line in lines:
         print(line, flush=True)
     print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
-    return 0
-
-
-def _cells(arguments: argparse.Namespace) -> int:
-    prepare_jax(keep_compiled=False)
-    from evaluation.papers.cells.figure import CellTask
-    from evaluation.papers.cells.reproduction import reproduce_cells
-    from evaluation.papers.tables.markdown import select_rows
-
-    names = select_rows(arguments.rows, dict.fromkeys(CELL_ROWS), CELL_ROWS)
-    task = CellTask(arguments.first, arguments.sessions, arguments.workers)
-    for line in reproduce_cells(names, task, arguments.output):
-        print(line, flush=True)
-    print(f"wrote {arguments.output / 'cells.md'}")
     return 0
 
 

@@ -16,19 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
 from evaluation.papers.maps.localising import Judged, judge
-from evaluation.papers.maps.row import (
-    Line,
-    Localised,
-    MapRow,
-    MapTask,
-    Panel,
-    count,
-    draw_panels,
-    median,
-    spread,
-)
+from evaluation.papers.maps.operations import Localised, MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, count, draw_panels, median, spread, table_line
 from evaluation.papers.maps.scenarios import draw_seed
 from evaluation.papers.tables.comparison import Record
 from evaluation.papers.trial_sessions import simulate_session
@@ -70,6 +62,24 @@ class ArenaFigures(NamedTuple):
     best: tuple[bool, bool]
     reckoned: np.ndarray
 
+    def record(self) -> Record:
+        """The figures of an unknown start by name; errors in m."""
+        return {
+            "missed_soon": self.session.whisks > SOON,
+            "missed": self.session.whisks > REPORTS,
+            "sure_and_wrong": bool(self.session.wrong.any()),
+            "reports": self.session.whisks,
+            "error": median(self.session.error[self.session.found, 0]),
+            "odometry_error": median(self.reckoned),
+            "best_wrong_soon": not self.best[0],
+            "best_wrong": not self.best[1],
+            "denied": bool(self.session.foreign[-1]),
+            "found_elsewhere_soon": bool(self.other[:SOON].any()),
+            "found_elsewhere": bool(self.other.any()),
+            "not_said": not self.foreign,
+            "shuffled_sure_and_wrong": bool(self.shuffled.wrong.any()),
+        }
+
 
 def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     """One unknown start in the map of an arena."""
@@ -93,45 +103,27 @@ def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     )
 
 
-def arena_record(one: ArenaFigures) -> Record:
-    """The figures of an unknown start by name; errors in m."""
-    return {
-        "missed_soon": one.session.whisks > SOON,
-        "missed": one.session.whisks > REPORTS,
-        "sure_and_wrong": bool(one.session.wrong.any()),
-        "reports": one.session.whisks,
-        "error": median(one.session.error[one.session.found, 0]),
-        "odometry_error": median(one.reckoned),
-        "best_wrong_soon": not one.best[0],
-        "best_wrong": not one.best[1],
-        "denied": bool(one.session.foreign[-1]),
-        "found_elsewhere_soon": bool(one.other[:SOON].any()),
-        "found_elsewhere": bool(one.other.any()),
-        "not_said": not one.foreign,
-        "shuffled_sure_and_wrong": bool(one.shuffled.wrong.any()),
-    }
-
-
-def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
+def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
     """The lines of unknown starts."""
+    yield HEADER
     n = len(found)
     reports = np.array([one.session.whisks for one in found])
     mixed = np.array([one.shuffled.whisks for one in found])
     for within in (SOON, REPORTS):
         goal = f"{int(np.ceil(0.95 * n))} of {n}" if within == SOON else "-"
         control = f"{count(mixed <= within)} with shuffled contacts"
-        yield Line(f"found and right within {within} reports", goal, count(reports <= within), control)
+        yield table_line(f"found and right within {within} reports", goal, count(reports <= within), control)
     median = f"{np.median(reports):.0f} ({reports.max():.0f})"
-    yield Line("reports until then, median (worst)", "-", median, "-")
+    yield table_line("reports until then, median (worst)", "-", median, "-")
     for k, within in enumerate((SOON, REPORTS)):
         right = count([one.best[k] for one in found])
-        yield Line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
+        yield table_line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
     wrong, control = (count([bool(one.wrong.any()) for one in each]) for each in _both(found))
-    yield Line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
+    yield table_line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
     for within in (SOON, REPORTS):
         other = count([bool(one.other[:within].any()) for one in found])
-        yield Line(f"found in another arena within {within} reports", f"0 of {n}", other, "-")
-    yield Line(
+        yield table_line(f"found in another arena within {within} reports", f"0 of {n}", other, "-")
+    yield table_line(
         f"says after {REPORTS} reports that this is not the map",
         "-",
         f"{count([one.foreign for one in found])} in another arena",
@@ -139,7 +131,7 @@ def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
     )
     errors = [np.median(one.session.error[one.session.found, 0]) for one in found if one.session.found.any()]
     reckoned = spread([float(np.median(one.reckoned)) for one in found], 3)
-    yield Line(
+    yield table_line(
         "error while found, m, median of sessions (worst)",
         "-",
         spread(errors, 3),
@@ -172,16 +164,9 @@ def _localise(session: Session, drive: ArenaDrive) -> Localised:
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
-GRID = MapRow(
-    "Localise in a grid map from an unknown start", 20, measure_arena, arena_record, arena_lines, draw_arenas
-)
-GRID_LARGE = MapRow(
-    "The same in arenas of 2.5 m",
-    6,
-    partial(measure_arena, side=LARGE),
-    arena_record,
-    arena_lines,
-    draw_arenas,
+GRID = Figure("Localise in a grid map from an unknown start", measure_arena, arena_lines, draw_arenas, 20)
+GRID_LARGE = Figure(
+    "The same in arenas of 2.5 m", partial(measure_arena, side=LARGE), arena_lines, draw_arenas, 6
 )
 
 

@@ -13,10 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.run_metrics import unjoined_share
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import true_places
 from evaluation.papers.maps.localising import Judged, judge
 from evaluation.papers.maps.merged_maps import Join, judge_join, shown_paths
-from evaluation.papers.maps.row import Line, MapRow, MapTask, Panel, PathPanel, count, draw_panels, spread
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, PathPanel, count, draw_panels, spread, table_line
 from evaluation.papers.maps.scenarios import (
     LOCALISED,
     REENTERED,
@@ -62,6 +64,18 @@ class ChangeFigures(NamedTuple):
         """Whether the surest place is within a cell of a true one."""
         return bool(len(self.distance)) and bool(self.distance[0] <= CELL_SIDE)
 
+    def record(self) -> Record:
+        """The figures of a changed maze by name."""
+        return {
+            "missed": self.after.whisks > LOCALISED,
+            "sure_and_wrong": bool(self.after.wrong.any()),
+            "missed_before": self.before.whisks > LOCALISED,
+            "sure_and_wrong_before": bool(self.before.wrong.any()),
+            "not_named": not self.is_named,
+            "far_places": int((self.distance > CELL_SIDE).sum()),
+            "false_alarm": self.unchanged > 0,
+        }
+
 
 def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigures:
     """One changed maze in the map of ten circuits."""
@@ -82,45 +96,33 @@ def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigu
     )
 
 
-def change_record(one: ChangeFigures) -> Record:
-    """The figures of a changed maze by name."""
-    return {
-        "missed": one.after.whisks > LOCALISED,
-        "sure_and_wrong": bool(one.after.wrong.any()),
-        "missed_before": one.before.whisks > LOCALISED,
-        "sure_and_wrong_before": bool(one.before.wrong.any()),
-        "not_named": not one.is_named,
-        "far_places": int((one.distance > CELL_SIDE).sum()),
-        "false_alarm": one.unchanged > 0,
-    }
-
-
-def change_lines(found: Sequence[ChangeFigures]) -> Iterator[Line]:
+def change_lines(found: Sequence[ChangeFigures]) -> Iterator[str]:
     """The lines of changed mazes."""
+    yield HEADER
     n = len(found)
     before, after = (
         [getattr(one, name).whisks <= LOCALISED for one in found] for name in ("before", "after")
     )
-    yield Line(
+    yield table_line(
         f"found and right within {LOCALISED} whisks after the change",
         f"{int(np.ceil(0.9 * n))} of {n}",
         count(after),
         f"{count(before)} before it",
     )
-    yield Line(
+    yield table_line(
         "sure and wrong at some whisk after the change",
         "-",
         count([bool(one.after.wrong.any()) for one in found]),
         f"{count([bool(one.before.wrong.any()) for one in found])} before it",
     )
-    yield Line(
+    yield table_line(
         "surest place named within a cell of the change",
         f"{int(np.ceil(0.8 * n))} of {n}",
         count([one.is_named for one in found]),
         f"{count([one.unchanged > 0 for one in found])} name a place in an unchanged maze",
     )
     farther = [float((one.distance > CELL_SIDE).sum()) for one in found]
-    yield Line(
+    yield table_line(
         "places named farther away, median (worst)",
         "-",
         spread(farther, 0),
@@ -147,21 +149,19 @@ def draw_change(title: str, found: Sequence[ChangeFigures], png: Path) -> None:
     draw_panels(png, title, line, paths, panel)
 
 
-WALL = MapRow(
+WALL = Figure(
     "A wall moved",
-    10,
     partial(measure_change, moved_wall),
-    change_record,
     change_lines,
     partial(draw_change, "A wall moved"),
-)
-DOOR = MapRow(
-    "A door closed",
     10,
+)
+DOOR = Figure(
+    "A door closed",
     partial(measure_change, closed_door),
-    change_record,
     change_lines,
     partial(draw_change, "A door closed"),
+    10,
 )
 
 
@@ -184,6 +184,16 @@ class CarriedFigures(NamedTuple):
     shuffled: Join
     paths: tuple[np.ndarray, np.ndarray]
 
+    def record(self) -> Record:
+        """The figures of a carried robot by name; the error in m, where it was tied on."""
+        return {
+            "not_tied": not self.known.right,
+            "wrong_tie": self.known.wrong or self.unknown.wrong,
+            "tied_unknown": int(self.unknown.joined),  # no failure where it is right
+            "error": float(self.known.error[0]) if self.known.joined else np.nan,
+            "shuffled_tied": self.shuffled.joined,
+        }
+
 
 class KidnapFigures(NamedTuple):
     """One session with kidnaps.
@@ -197,6 +207,16 @@ class KidnapFigures(NamedTuple):
     within: float
     over_all: float
     unjoined: float
+
+    def record(self) -> Record:
+        """The figures of a kidnapped robot by name; Energy Metrics in m^2 + rad^2."""
+        return {
+            "above_goal": self.within > ENERGY,
+            "em_within_pieces": self.within,
+            "em": self.over_all,
+            "unjoined": self.unjoined,
+            "pieces": self.pieces,
+        }
 
 
 def measure_carried(task: MapTask) -> CarriedFigures:
@@ -227,68 +247,48 @@ def measure_kidnaps(task: MapTask) -> KidnapFigures:
     )
 
 
-def carried_record(one: CarriedFigures) -> Record:
-    """The figures of a carried robot by name; the error in m, where it was tied on."""
-    return {
-        "not_tied": not one.known.right,
-        "wrong_tie": one.known.wrong or one.unknown.wrong,
-        "tied_unknown": int(one.unknown.joined),  # no failure where it is right
-        "error": float(one.known.error[0]) if one.known.joined else np.nan,
-        "shuffled_tied": one.shuffled.joined,
-    }
-
-
-def kidnap_record(one: KidnapFigures) -> Record:
-    """The figures of a kidnapped robot by name; Energy Metrics in m^2 + rad^2."""
-    return {
-        "above_goal": one.within > ENERGY,
-        "em_within_pieces": one.within,
-        "em": one.over_all,
-        "unjoined": one.unjoined,
-        "pieces": one.pieces,
-    }
-
-
-def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[Line]:
+def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[str]:
     """The lines of carried robots."""
+    yield HEADER
     n = len(found)
-    yield Line(
+    yield table_line(
         f"tied on rightly after {REENTERED} whisks in the known part",
         f"{int(np.ceil(0.9 * n))} of {n}",
         count([one.known.right for one in found]),
         f"{count([one.shuffled.right for one in found])} with shuffled images",
     )
     wrong = [one.known.wrong for one in found] + [one.unknown.wrong for one in found]
-    yield Line(
+    yield table_line(
         "wrong ties, known and unknown part",
         f"0 of {2 * n}",
         count(wrong),
         f"{count([one.shuffled.wrong for one in found])} with shuffled images",
     )
-    yield Line(
+    yield table_line(
         "ties in the unknown part, never re-entered", "-", count([one.unknown.joined for one in found]), "-"
     )
     errors = [one.known.error[0] for one in found if one.known.joined]
-    yield Line("error of tied sessions, m, median (worst)", "-", spread(errors, 3), "-")
+    yield table_line("error of tied sessions, m, median (worst)", "-", spread(errors, 3), "-")
 
 
-def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[Line]:
+def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[str]:
     """The lines of kidnapped robots."""
+    yield HEADER
     n = len(found)
-    yield Line(
+    yield table_line(
         f"EM within pieces up to {ENERGY}",
         f"{int(np.ceil(10 / 12 * n))} of {n}",
         count([one.within <= ENERGY for one in found]),
         f"{count([one.over_all <= ENERGY for one in found])} over all pairs",
     )
-    yield Line(
+    yield table_line(
         "EM within pieces, median (worst)",
         "-",
         spread([one.within for one in found], 3),
         f"{spread([one.over_all for one in found])} over all pairs",
     )
-    yield Line("share outside the largest piece", "-", spread([one.unjoined for one in found]), "-")
-    yield Line("pieces", "-", spread([one.pieces for one in found], 0), "-")
+    yield table_line("share outside the largest piece", "-", spread([one.unjoined for one in found]), "-")
+    yield table_line("pieces", "-", spread([one.pieces for one in found], 0), "-")
 
 
 def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
@@ -319,7 +319,5 @@ def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
     draw_panels(png, "Eight kidnaps in ten circuits", line, None, panel)
 
 
-CARRIED = MapRow(
-    "Continue after being carried", 20, measure_carried, carried_record, carried_lines, draw_carried
-)
-KIDNAPS_ROW = MapRow("Eight kidnaps", 12, measure_kidnaps, kidnap_record, kidnap_lines, draw_kidnaps)
+CARRIED = Figure("Continue after being carried", measure_carried, carried_lines, draw_carried, 20)
+KIDNAPS_ROW = Figure("Eight kidnaps", measure_kidnaps, kidnap_lines, draw_kidnaps, 12)

@@ -20,17 +20,18 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, localisation_errors, true_places
-from evaluation.papers.maps.row import (
-    Line,
-    MapRow,
-    MapTask,
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import (
+    HEADER,
     Panel,
     PathPanel,
     count,
     draw_panels,
     median,
     spread,
+    table_line,
 )
 from evaluation.papers.maps.scenarios import Recipe, open_world, ten_circuits
 from evaluation.papers.maps.stored_maps import StoredMap
@@ -411,6 +412,21 @@ class GoalFigures(NamedTuple):
     mapped: np.ndarray
     clearance: float
 
+    def record(self) -> Record:
+        """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
+        drives, done = self.free + self.walled, [drive for drive in self.free if drive.said_reached]
+        lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
+        return {
+            "not_reached": sum(not drive.reached for drive in self.free),
+            "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
+            "error": median(np.array([drive.error for drive in done])),
+            "path_ratio": lengths[0] / lengths[1] if done else np.nan,
+            "clearance": min(drive.clearance for drive in drives),
+            "in_wall": sum(not drive.clear for drive in drives),
+            "seconds": self.seconds,
+            "wall_not_solved": sum(not _is_solved(drive) for drive in self.walled),
+        }
+
 
 def measure_goals(task: MapTask) -> GoalFigures:
     """Drives on one map, each from where the last one ended."""
@@ -433,45 +449,30 @@ def measure_drives(task: MapTask, pairs: int, walls: int) -> GoalFigures:
     )
 
 
-def goal_record(one: GoalFigures) -> Record:
-    """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
-    drives, done = one.free + one.walled, [drive for drive in one.free if drive.said_reached]
-    lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
-    return {
-        "not_reached": sum(not drive.reached for drive in one.free),
-        "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
-        "error": median(np.array([drive.error for drive in done])),
-        "path_ratio": lengths[0] / lengths[1] if done else np.nan,
-        "clearance": min(drive.clearance for drive in drives),
-        "in_wall": sum(not drive.clear for drive in drives),
-        "seconds": one.seconds,
-        "wall_not_solved": sum(not _is_solved(drive) for drive in one.walled),
-    }
-
-
 def _is_solved(drive: Drive) -> bool:
     """Whether a drive with a wall in its way ended at its goal by a new way, or as blocked."""
     return drive.state is DriveState.BLOCKED or (drive.replans > 0 and drive.reached)
 
 
-def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
+def goal_lines(found: Sequence[GoalFigures]) -> Iterator[str]:
     """The lines of drives to goals."""
+    yield HEADER
     free, walled = all_free(found), all_walled(found)
     n, done = len(free), [one for one in free if one.said_reached]
-    yield Line(
+    yield table_line(
         f"reached (truly within {RIGHT.distance:g} m)",
         f"{n} of {n}",
         count([one.reached for one in free]),
         f"{count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone, "
         f"{count([one.by_arm <= RIGHT.distance for one in free])} by the arm's exact motion alone",
     )
-    yield Line(
+    yield table_line(
         "said to be reached at a wrong place",
         f"0 of {n + len(walled)}",
         count([one.said_reached and not one.reached for one in free + walled]),
         "-",
     )
-    yield Line(
+    yield table_line(
         "error where reached, m, median (worst)",
         "-",
         spread([one.error for one in done], 3),
@@ -480,28 +481,28 @@ def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
     )
     short = np.array([one.shortest for one in done])
     ratio = np.array([one.length for one in done]).sum() / max(short.sum(), 1e-9)
-    yield Line("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-")
+    yield table_line("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-")
     least = min((one.clearance for one in free + walled), default=np.nan)
     mapping = min(one.clearance for one in found)
-    yield Line(
+    yield table_line(
         "least distance of the head's axis from a wall, m",
         "-",
         f"{least:.3f}",
         f"{mapping:.3f} while mapping",
     )
-    yield Line(
+    yield table_line(
         "no whisker at rest inside a wall on the way",
         f"{n + len(walled)} of {n + len(walled)}",
         count([one.clear for one in free + walled]),
         "-",
     )
     minutes = max(one.seconds for one in found) / 60
-    yield Line("duration of all drives, min", f"{MINUTES}", f"{minutes:.0f}", "-")
+    yield table_line("duration of all drives, min", f"{MINUTES}", f"{minutes:.0f}", "-")
     yield _wall_line(free, walled)
 
 
-def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> Line:
-    return Line(
+def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> str:
+    return table_line(
         "wall in the way: reached by a new way, or blocked",
         f"{len(walled)} of {len(walled)}",
         count([_is_solved(one) for one in walled]),
@@ -544,4 +545,4 @@ def _joined(drives: Sequence[Drive]) -> np.ndarray:
     return np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in drives)])
 
 
-GOALS = MapRow("Drive to goals on a map", 1, measure_goals, goal_record, goal_lines, draw_goals)
+GOALS = Figure("Drive to goals on a map", measure_goals, goal_lines, draw_goals, 1)

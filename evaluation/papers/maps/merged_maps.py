@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import (
     BUILDING,
     RIGHT,
@@ -29,7 +30,8 @@ from evaluation.papers.maps.localisation_metrics import (
     localisation_errors,
     nearest_steps,
 )
-from evaluation.papers.maps.row import Line, MapRow, MapTask, Panel, PathPanel, count, draw_panels, spread
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, PathPanel, count, draw_panels, spread, table_line
 from evaluation.papers.maps.scenarios import (
     Recipe,
     Recorded,
@@ -133,6 +135,17 @@ class OverlapFigures(NamedTuple):
     alone: float
     paths: tuple[np.ndarray, np.ndarray]
 
+    def record(self) -> Record:
+        """The figures of two sessions that overlap by name; Energy Metrics in m^2 + rad^2, the error in m,
+        where they are joined."""
+        return {
+            "not_joined": not self.join.right,
+            "wrong_join": self.join.wrong,
+            "em_union": self.union if self.join.joined else np.nan,
+            "em_alone": self.alone,
+            "error": float(self.join.error[0]) if self.join.joined else np.nan,
+        }
+
 
 class DifferentFigures(NamedTuple):
     """Sessions of two mazes, and control sessions of the first maze.
@@ -143,6 +156,10 @@ class DifferentFigures(NamedTuple):
 
     joined: bool
     same: bool
+
+    def record(self) -> Record:
+        """The figures of two mazes by name."""
+        return {"mazes_joined": self.joined, "maze_not_joined": not self.same}
 
 
 class TenFigures(NamedTuple):
@@ -159,6 +176,16 @@ class TenFigures(NamedTuple):
     alone: np.ndarray
     separate: np.ndarray
     joined: bool
+
+    def record(self) -> Record:
+        """The figures of ten sessions by name; the Energy Metric in m^2 + rad^2."""
+        (growth,), (frames,) = _growth([self])
+        return {
+            "not_joined": not self.joined,
+            "em_union": float(self.union[-1]),
+            "em_growth": growth,
+            "frames_growth": frames,
+        }
 
 
 def measure_overlap(task: MapTask) -> OverlapFigures:
@@ -202,42 +229,15 @@ def measure_ten(task: MapTask) -> TenFigures:
     )
 
 
-def overlap_record(one: OverlapFigures) -> Record:
-    """The figures of two sessions that overlap by name; Energy Metrics in m^2 + rad^2, the error in m, where
-    they are joined."""
-    return {
-        "not_joined": not one.join.right,
-        "wrong_join": one.join.wrong,
-        "em_union": one.union if one.join.joined else np.nan,
-        "em_alone": one.alone,
-        "error": float(one.join.error[0]) if one.join.joined else np.nan,
-    }
-
-
-def different_record(one: DifferentFigures) -> Record:
-    """The figures of two mazes by name."""
-    return {"mazes_joined": one.joined, "maze_not_joined": not one.same}
-
-
-def ten_record(one: TenFigures) -> Record:
-    """The figures of ten sessions by name; the Energy Metric in m^2 + rad^2."""
-    (growth,), (frames,) = _growth([one])
-    return {
-        "not_joined": not one.joined,
-        "em_union": float(one.union[-1]),
-        "em_growth": growth,
-        "frames_growth": frames,
-    }
-
-
-def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[Line]:
+def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[str]:
     """The lines of sessions that overlap."""
+    yield HEADER
     n = len(found)
     goal = f"{int(np.ceil(0.9 * n))} of {n}"
-    yield Line("joined rightly", goal, count([one.join.right for one in found]), "row of two mazes")
-    yield Line("wrong joins", f"0 of {n}", count([one.join.wrong for one in found]), "row of two mazes")
+    yield table_line("joined rightly", goal, count([one.join.right for one in found]), "row of two mazes")
+    yield table_line("wrong joins", f"0 of {n}", count([one.join.wrong for one in found]), "row of two mazes")
     joined = [one for one in found if one.join.joined]
-    yield Line(
+    yield table_line(
         "EM of the union, median (worst), of joined",
         "-",
         spread([one.union for one in joined], 3),
@@ -249,26 +249,30 @@ def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[Line]:
         else np.nan
     )
     each = [one.union / one.alone for one in joined]
-    yield Line("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(each)} of each pair")
+    yield table_line("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(each)} of each pair")
 
 
-def different_lines(found: Sequence[DifferentFigures]) -> Iterator[Line]:
+def different_lines(found: Sequence[DifferentFigures]) -> Iterator[str]:
     """The lines of two mazes."""
+    yield HEADER
     same = count([one.same for one in found])
-    yield Line("joined", f"0 of {len(found)}", count([one.joined for one in found]), f"{same} of one maze")
+    yield table_line(
+        "joined", f"0 of {len(found)}", count([one.joined for one in found]), f"{same} of one maze"
+    )
 
 
-def ten_lines(found: Sequence[TenFigures]) -> Iterator[Line]:
+def ten_lines(found: Sequence[TenFigures]) -> Iterator[str]:
     """The lines of ten sessions."""
-    yield Line("all sessions in one piece", "-", count([one.joined for one in found]), "-")
+    yield HEADER
+    yield table_line("all sessions in one piece", "-", count([one.joined for one in found]), "-")
     growth, frames = _growth(found)
-    yield Line(
+    yield table_line(
         "EM after ten sessions, over that after one",
         f"{GROWTH}",
         spread(growth),
         f"{spread([np.median(one.alone) / one.alone[0] for one in found])} sessions by themselves",
     )
-    yield Line(
+    yield table_line(
         "keyframes after ten sessions, over those after one",
         f"{FRAMES}",
         spread(frames),
@@ -331,18 +335,11 @@ def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
     )
 
 
-OVERLAP = MapRow(
-    "Merge two sessions that share half their cells",
-    20,
-    measure_overlap,
-    overlap_record,
-    overlap_lines,
-    draw_overlap,
+OVERLAP = Figure(
+    "Merge two sessions that share half their cells", measure_overlap, overlap_lines, draw_overlap, 20
 )
-DIFFERENT = MapRow(
-    "Merge sessions of two mazes", 20, measure_different, different_record, different_lines, draw_different
-)
-TEN = MapRow("Merge ten sessions one by one", 3, measure_ten, ten_record, ten_lines, draw_ten)
+DIFFERENT = Figure("Merge sessions of two mazes", measure_different, different_lines, draw_different, 20)
+TEN = Figure("Merge ten sessions one by one", measure_ten, ten_lines, draw_ten, 3)
 
 
 RECORDINGS = ("intel_laser", "tuc_lecture_hall")
@@ -389,6 +386,21 @@ class HalvesFigures(NamedTuple):
     reckoned: float
     paths: tuple[np.ndarray, np.ndarray, np.ndarray]
     error: np.ndarray
+
+    def record(self) -> Record:
+        """The figures of a recording by name: ATEs, m, and shares."""
+        return {
+            "not_joined": not self.joined,
+            "ate_merged": self.merged,
+            "ate_whole": self.whole,
+            "found": self.found,
+            "off": self.off,
+            "off_by_map": self.off_by_map,
+            "off_nearby": self.off_nearby,
+            "off_by_odometry": self.reckoned,
+            "shuffled_found": self.shuffled[0],
+            "shuffled_off": self.shuffled[1],
+        }
 
 
 def split_recording(name: str) -> Halves:
@@ -443,47 +455,32 @@ def measure_halves(task: MapTask) -> HalvesFigures:
     )
 
 
-def halves_record(one: HalvesFigures) -> Record:
-    """The figures of a recording by name: ATEs, m, and shares."""
-    return {
-        "not_joined": not one.joined,
-        "ate_merged": one.merged,
-        "ate_whole": one.whole,
-        "found": one.found,
-        "off": one.off,
-        "off_by_map": one.off_by_map,
-        "off_nearby": one.off_nearby,
-        "off_by_odometry": one.reckoned,
-        "shuffled_found": one.shuffled[0],
-        "shuffled_off": one.shuffled[1],
-    }
-
-
-def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[Line]:
+def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[str]:
     """The lines of each recording."""
+    yield HEADER
     for one in found:
         ratio = f"{metres(one.merged)} m, {one.merged / one.whole:.2f} times"
         joined = "" if one.joined else ", halves not joined"
-        yield Line(
+        yield table_line(
             f"{one.name}: ATE of the merged halves",
             f"{RATIO} times",
             ratio + joined,
             f"{metres(one.whole)} m whole",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: found at {one.revisited} revisits",
             f"{FOUND:.0%}",
             f"{one.found:.1%}",
             f"{one.shuffled[0]:.1%} in random order",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: found and off by 2 m or 30 degrees",
             f"{OFF:.0%}",
             f"{one.off:.1%}",
             f"{one.off_by_map:.1%} a perfect localiser there; {one.shuffled[1]:.1%} in random order; "
             f"{one.reckoned:.1%} odometry from the true start",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: the same against the nearest step of the map", "-", f"{one.off_nearby:.1%}", "-"
         )
 
@@ -525,12 +522,4 @@ def _share_off_by_odometry(recorded: Recorded) -> float:
     return float(exceeds(error, BUILDING).mean())
 
 
-HALVES = MapRow(
-    "Buildings in two halves",
-    len(RECORDINGS),
-    measure_halves,
-    halves_record,
-    halves_lines,
-    draw_halves,
-    RECORDINGS,
-)
+HALVES = Figure("Buildings in two halves", measure_halves, halves_lines, draw_halves, RECORDINGS)

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align, ate
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
@@ -280,4 +281,4 @@ def _drawn(
     return _aligned(run[2], truth), (run[3], align(run[2][known], truth[known]))
 
 
-FIGURE = RealFigure("A real Create and its bumpers", measure, table, draw)
+FIGURE = Figure("A real Create and its bumpers", measure, table, draw)

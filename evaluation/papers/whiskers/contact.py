@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.whiskers.drift import (
     Decide,
     Snippet,
@@ -25,7 +26,7 @@ from evaluation.papers.whiskers.drift import (
     score_stream,
     simulate_stream,
 )
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
 from tactile.base.errors import InputError
@@ -494,6 +495,4 @@ def _score_marks(
     )
 
 
-FIGURE = RealFigure(
-    "Contact on an arm in clutter, 14 whiskers", measure_contacts, list_contacts, draw_contacts
-)
+FIGURE = Figure("Contact on an arm in clutter, 14 whiskers", measure_contacts, list_contacts, draw_contacts)

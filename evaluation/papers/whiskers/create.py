@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align, ate
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.buildings import BuildingsRow, buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import metres
 from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
 from evaluation.papers.whiskers.bumps import WallDistances, wall_distances
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
@@ -300,4 +301,4 @@ def draw_create(result: CreateResult, png: Path) -> None:
     figure.savefig(png)
 
 
-FIGURE = RealFigure("A real Create: recall with nine depth rays", measure_create, create_table, draw_create)
+FIGURE = Figure("A real Create: recall with nine depth rays", measure_create, create_table, draw_create)

@@ -19,8 +19,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from robot.recordings.real_whiskers import read_columns, read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
 from tactile.base.random_streams import stream
@@ -275,7 +276,7 @@ def draw_drift(result: DriftResult, png: Path) -> None:
     figure.savefig(png, dpi=130)
 
 
-FIGURE = RealFigure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)
+FIGURE = Figure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)
 
 
 Decide = Callable[[np.ndarray], np.ndarray]

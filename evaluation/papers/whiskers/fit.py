@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
@@ -313,4 +314,4 @@ def _draw_whiskers(axes: style.Axes, result: FitResult) -> None:
     axes.legend(frameon=False, fontsize=8.5, loc="upper left", ncols=2)
 
 
-FIGURE = RealFigure("The rig from a record", measure, table, draw)
+FIGURE = Figure("The rig from a record", measure, table, draw)

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import expit, logit
 
 from evaluation.metrics.statistics import auc, expected_calibration_error
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream
@@ -250,4 +251,4 @@ def _draw_recognition(axis: Any, kinds: dict[str, list[HeldOut]]) -> None:
     axis.legend(fontsize=7, loc="upper left")
 
 
-FIGURE = RealFigure("Likeness of real touch images", measure, table, draw)
+FIGURE = Figure("Likeness of real touch images", measure, table, draw)

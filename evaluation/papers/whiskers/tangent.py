@@ -15,7 +15,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.distance import cdist
 
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.sliding_contact import SlidingContact, find_contact, track_contact
 from robot.recordings.real_whiskers import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
@@ -422,4 +423,4 @@ def _draw_errors(axis: Axes, result: TangentResult) -> None:
     axis.legend()
 
 
-FIGURE = RealFigure("Tangents of objects along which a real whisker slid", measure, table, draw)
+FIGURE = Figure("Tangents of objects along which a real whisker slid", measure, table, draw)

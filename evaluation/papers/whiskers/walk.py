@@ -17,9 +17,10 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
+from evaluation.papers.figure import Figure
 from evaluation.papers.trial_sessions import collect_session, run_session
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from evaluation.papers.whiskers.likeness import OBJECTS
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.walk_source import (
     WalkConfig,
     most_needed,
@@ -227,7 +228,7 @@ def draw(walks: list[WalkResult], png: Path) -> None:
     plt.close(figure)
 
 
-FIGURE = RealFigure("A map from real whisker images on a simulated walk", measure, table, draw)
+FIGURE = Figure("A map from real whisker images on a simulated walk", measure, table, draw)
 
 
 TURNS = 0.05
