@@ -31,9 +31,9 @@ from evaluation.papers.whiskers.walk_source import (
 from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
+from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import InMemorySource
-from robot.sources.odometry import OdometryConfig, simulate_odometry
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate, wrap
 

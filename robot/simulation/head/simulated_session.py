@@ -26,6 +26,7 @@ from scipy.linalg import expm
 from robot.simulation.head.baseline import has_baseline, make_baseline
 from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
+from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.whisk_stream import (
     WallSweep,
     simulate_cycles,
@@ -39,7 +40,6 @@ from robot.sources.in_memory import (
     digest_of_document,
     wrap_headings,
 )
-from robot.sources.odometry import OdometryConfig, simulate_odometry
 from robot.sources.source import SimulationInfo, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE, maze_text
 from robot.world.scene import (
