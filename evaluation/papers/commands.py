@@ -57,7 +57,7 @@ def add_commands(commands: Commands) -> None:
     names = Commands(reproduce)
     for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
         for name, title in figures.items():
-            add_figure(names, name, f"{paper}: {title}")
+            _add_figure(names, name, f"{paper}: {title}")
     threshold = names.add(
         "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
         "reproduce threshold whisker_maze -o runs/threshold",
@@ -70,12 +70,12 @@ def add_commands(commands: Commands) -> None:
     tables = names.add(
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
-    add_tables(Commands(tables))
+    _add_tables(Commands(tables))
     real = names.add(
         "real", _real, "figures on recordings of real whiskers and wheels",
         "reproduce real --rows contact -o runs/real",
     )  # fmt: skip
-    add_row_names(real, REAL)
+    _add_row_names(real, REAL)
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         check=own_folder("real.md"),
@@ -83,10 +83,10 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     title = "maps found again, continued, merged and changed"
     # Mazes 31000 to 31030, 32700 to 32707 and 33000 to 33059 were used to choose settings.
-    maps = add_rows(names, "maps", _maps, title, MAPS, 32000)
-    add_against(maps, "maps.csv")
+    maps = _add_rows(names, "maps", _maps, title, MAPS, 32000)
+    _add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
-    add_rows(names, "cells", _cells, title, CELLS, 40000)
+    _add_rows(names, "cells", _cells, title, CELLS, 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -98,7 +98,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def add_rows(
+def _add_rows(
     names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
 ) -> CommandParser:
     """Registers a set of tables and figures, of which each is a row; its parser.
@@ -109,7 +109,7 @@ def add_rows(
     """
     example = f"reproduce {name} --rows {next(iter(rows))} --sessions 1 -o runs/{name}"
     parser = names.add(name, command, title, example)
-    add_row_names(parser, rows)
+    _add_row_names(parser, rows)
     parser.add_argument(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
@@ -124,13 +124,13 @@ def add_rows(
     return parser
 
 
-def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
+def _add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
     """Registers `--rows`, whose help lists the names of all rows."""
     listed = ", ".join(f"'{name}'" if " " in name else name for name in rows)
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed} (default: all)")
 
 
-def add_figure(names: Commands, name: str, title: str) -> None:
+def _add_figure(names: Commands, name: str, title: str) -> None:
     """Registers a figure."""
     parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
     sets = SETS.get(name, USUAL_SETS)
@@ -262,7 +262,7 @@ SESSION_FILES = ("touch.csv", "buildings.csv")
 Lines = Callable[[argparse.Namespace], Iterator[str]]
 
 
-def add_tables(tables: Commands) -> None:
+def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
     def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
@@ -279,7 +279,7 @@ def add_tables(tables: Commands) -> None:
         help="sessions per row (default: of the row, 12 to 40)",
     )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
-    add_session_file(touch, "touch.csv")
+    _add_session_file(touch, "touch.csv")
     grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
@@ -288,7 +288,7 @@ def add_tables(tables: Commands) -> None:
     add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
-    add_session_file(buildings, "buildings.csv")
+    _add_session_file(buildings, "buildings.csv")
     health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
@@ -320,17 +320,17 @@ def add_tables(tables: Commands) -> None:
     add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
 
 
-def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `-o` and `--against` of a table whose sessions are written to a file."""
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
         help=f"folder for {file}, the figures of each session as soon as it is done",
     )  # fmt: skip
-    add_against(parser, file)
+    _add_against(parser, file)
     parser.set_defaults(file=file)
 
 
-def add_against(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_against(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `--against`."""
     parser.add_argument(
         "--against", type=Path, metavar="DIR",

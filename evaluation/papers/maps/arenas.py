@@ -81,21 +81,21 @@ class ArenaFigures(NamedTuple):
         }
 
 
-def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
+def _measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     """One unknown start in the map of an arena."""
-    made, drive = store_arena_map(task.seed, side, task.folder), drive_elsewhere(task.seed, side)
-    saved = read_map(made.path)
+    (path, steps), drive = store_arena_map(task.seed, side, task.folder), _drive_elsewhere(task.seed, side)
+    saved = read_map(path)
     session = build_session(localising(saved.config, saved), saved.source)
     known = _localise(session, drive)
     mixed = _localise(session, shuffled_contacts(drive, task.seed))
-    other = _localise(session, drive_elsewhere(task.seed + 1, side))
-    judged = judge(made.steps, known, drive.truth)
+    other = _localise(session, _drive_elsewhere(task.seed + 1, side))
+    judged = judge(steps, known, drive.truth)
     right = is_within(judged.error, RIGHT)
     reckoned = integrate(drive.motion, drive.truth[0]) - drive.truth
     return ArenaFigures(
         arena=task.seed,
         session=judged,
-        shuffled=judge(made.steps, mixed, drive.truth),
+        shuffled=judge(steps, mixed, drive.truth),
         other=other.found,
         foreign=bool(other.foreign[-1]),
         best=(bool(right[SOON - 1]), bool(right[-1])),
@@ -118,7 +118,9 @@ def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
     for k, within in enumerate((SOON, REPORTS)):
         right = count([one.best[k] for one in found])
         yield table_line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
-    wrong, control = (count([bool(one.wrong.any()) for one in each]) for each in _both(found))
+    wrong, control = (
+        count([bool(getattr(one, name).wrong.any()) for one in found]) for name in ("session", "shuffled")
+    )
     yield table_line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
     for within in (SOON, REPORTS):
         other = count([bool(one.other[:within].any()) for one in found])
@@ -139,7 +141,7 @@ def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
     )
 
 
-def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
+def _draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
     """Draws the error of all sessions over the reports."""
     curves = {"sessions": [np.where(one.session.found, one.session.error[:, 0], np.nan) for one in found]}
     limits = {"right": RIGHT.distance, "wrong": WRONG.distance}
@@ -148,10 +150,6 @@ def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
     other = count([bool(one.other.any()) for one in found])
     line = f"Unknown start: found and right in {known}; found in another arena: {other}."
     draw_panels(png, "Waking up in a known arena", line, None, panel)
-
-
-def _both(found: Sequence[ArenaFigures]) -> tuple[list[Judged], list[Judged]]:
-    return [one.session for one in found], [one.shuffled for one in found]
 
 
 def _localise(session: Session, drive: ArenaDrive) -> Localised:
@@ -164,9 +162,9 @@ def _localise(session: Session, drive: ArenaDrive) -> Localised:
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
-GRID = Figure("Localise in a grid map from an unknown start", measure_arena, arena_lines, draw_arenas, 20)
+GRID = Figure("Localise in a grid map from an unknown start", _measure_arena, arena_lines, _draw_arenas, 20)
 GRID_LARGE = Figure(
-    "The same in arenas of 2.5 m", partial(measure_arena, side=LARGE), arena_lines, draw_arenas, 6
+    "The same in arenas of 2.5 m", partial(_measure_arena, side=LARGE), arena_lines, _draw_arenas, 6
 )
 
 
@@ -184,14 +182,7 @@ class ArenaDrive(NamedTuple):
     motion: np.ndarray
 
 
-class ArenaMap(NamedTuple):
-    """A grid map on the disk, and its steps."""
-
-    path: Path
-    steps: MapSteps
-
-
-def arena_config(arena: int, side: float, seed: int) -> RunConfig:
+def _arena_config(arena: int, side: float, seed: int) -> RunConfig:
     """The configuration of a session in an arena.
 
     Args:
@@ -209,9 +200,9 @@ def arena_config(arena: int, side: float, seed: int) -> RunConfig:
     )
 
 
-def drive_elsewhere(arena: int, side: float) -> ArenaDrive:
+def _drive_elsewhere(arena: int, side: float) -> ArenaDrive:
     """A further session in an arena, from another start."""
-    config = arena_config(arena, side, draw_seed(arena, "arena start"))
+    config = _arena_config(arena, side, draw_seed(arena, "arena start"))
     assert config.create_simulation is not None
     session = simulate_session(config.create_simulation)
     touch = complete(config, session.source).touch
@@ -231,13 +222,13 @@ def shuffled_contacts(drive: ArenaDrive, seed: int) -> ArenaDrive:
     return drive._replace(observations=mixed)
 
 
-def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
-    """The map of an arena; made and written to `folder` unless the same code has done that."""
+def store_arena_map(arena: int, side: float, folder: Path) -> tuple[Path, MapSteps]:
+    """The file of the map of an arena, and its steps; made in `folder` unless the same code has done that."""
     path = folder / f"arena_{arena}_{side:g}-{code_digest()}.npz"
     beside = path.with_suffix(".steps.npz")
     if not (path.exists() and beside.exists()):
         folder.mkdir(parents=True, exist_ok=True)
-        with open_observations(arena_config(arena, side, arena)) as (config, source):
+        with open_observations(_arena_config(arena, side, arena)) as (config, source):
             samples = list(source)
             session = build_session(config, source)
             for _ in session.replay(observation_of(sample) for sample in samples):
@@ -248,4 +239,4 @@ def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
         np.savez(unfinished, trajectory=session.map.trajectory(), truth=truth)
         unfinished.replace(beside)
     with np.load(beside) as saved:
-        return ArenaMap(path, known_steps(saved["trajectory"], saved["truth"]))
+        return path, known_steps(saved["trajectory"], saved["truth"])

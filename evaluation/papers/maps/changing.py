@@ -1,6 +1,7 @@
-"""Rows: a wall that was moved, a door that was closed.
+"""Figures: a wall that was moved, a door that was closed, and a robot that was carried away or kidnapped.
 
-Rows: a robot that is carried away between two sessions, or kidnapped within one.
+A robot is carried away between two sessions, of which the second continues the map of the first, and
+kidnapped within one session.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from evaluation.papers.trial_sessions import apply_control
 from robot.world.maze import CELL_SIDE
 
 
-class ChangeFigures(NamedTuple):
+class _ChangeFigures(NamedTuple):
     """One changed maze.
 
     Attributes:
@@ -77,14 +78,14 @@ class ChangeFigures(NamedTuple):
         }
 
 
-def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigures:
+def _measure_change(change: Callable[[int], Change], task: MapTask) -> _ChangeFigures:
     """One changed maze in the map of ten circuits."""
     made, scenario = task.map_of(ten_circuits(task.seed)), change(task.seed)
     before, after = record(unknown_start(task.seed)), record(scenario.after)
     again = record(Recipe(same_maze(task.seed, 1).config, 0, after.log.length))
     steps, methods = made.arrays.steps, task.methods
     named = true_places(steps, methods.changes(made, after).reshape(-1, 2))
-    return ChangeFigures(
+    return _ChangeFigures(
         seed=task.seed,
         before=judge(steps, methods.localise(made, before), before.truth),
         after=judge(steps, methods.localise(made, after), after.truth),
@@ -96,7 +97,7 @@ def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigu
     )
 
 
-def change_lines(found: Sequence[ChangeFigures]) -> Iterator[str]:
+def _change_lines(found: Sequence[_ChangeFigures]) -> Iterator[str]:
     """The lines of changed mazes."""
     yield HEADER
     n = len(found)
@@ -130,7 +131,7 @@ def change_lines(found: Sequence[ChangeFigures]) -> Iterator[str]:
     )
 
 
-def draw_change(title: str, found: Sequence[ChangeFigures], png: Path) -> None:
+def _draw_change(title: str, found: Sequence[_ChangeFigures], png: Path) -> None:
     """Draws one changed maze with the places named, and their distances in all."""
     one = found[0]
     paths = PathPanel(
@@ -151,16 +152,16 @@ def draw_change(title: str, found: Sequence[ChangeFigures], png: Path) -> None:
 
 WALL = Figure(
     "A wall moved",
-    partial(measure_change, moved_wall),
-    change_lines,
-    partial(draw_change, "A wall moved"),
+    partial(_measure_change, moved_wall),
+    _change_lines,
+    partial(_draw_change, "A wall moved"),
     10,
 )
 DOOR = Figure(
     "A door closed",
-    partial(measure_change, closed_door),
-    change_lines,
-    partial(draw_change, "A door closed"),
+    partial(_measure_change, closed_door),
+    _change_lines,
+    partial(_draw_change, "A door closed"),
     10,
 )
 
@@ -169,7 +170,7 @@ ENERGY = 0.15
 """Goal of the Energy Metric within pieces, m^2 + rad^2."""
 
 
-class CarriedFigures(NamedTuple):
+class _CarriedFigures(NamedTuple):
     """One map, continued in its known part and in an unknown part.
 
     Attributes:
@@ -195,7 +196,7 @@ class CarriedFigures(NamedTuple):
         }
 
 
-class KidnapFigures(NamedTuple):
+class _KidnapFigures(NamedTuple):
     """One session with kidnaps.
 
     Attributes:
@@ -219,7 +220,7 @@ class KidnapFigures(NamedTuple):
         }
 
 
-def measure_carried(task: MapTask) -> CarriedFigures:
+def _measure_carried(task: MapTask) -> _CarriedFigures:
     """Continues one map three times."""
     scenario = carried_sessions(task.seed)
     made = task.map_of(scenario.first)
@@ -230,7 +231,7 @@ def measure_carried(task: MapTask) -> CarriedFigures:
     def extend(recorded: Recorded, entry: int) -> Join:
         return judge_join(task.methods.extend(made, recorded), earlier, entry)
 
-    return CarriedFigures(
+    return _CarriedFigures(
         task.seed,
         extend(known, scenario.entry),
         extend(unknown, 0),
@@ -239,15 +240,15 @@ def measure_carried(task: MapTask) -> CarriedFigures:
     )
 
 
-def measure_kidnaps(task: MapTask) -> KidnapFigures:
+def _measure_kidnaps(task: MapTask) -> _KidnapFigures:
     """Maps a session with kidnaps."""
     arrays = task.map_of(kidnapped(task.seed)).arrays
-    return KidnapFigures(
+    return _KidnapFigures(
         len(np.unique(arrays.piece)), arrays.em_within_pieces, arrays.em, unjoined_share(arrays.piece)
     )
 
 
-def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[str]:
+def _carried_lines(found: Sequence[_CarriedFigures]) -> Iterator[str]:
     """The lines of carried robots."""
     yield HEADER
     n = len(found)
@@ -271,7 +272,7 @@ def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[str]:
     yield table_line("error of tied sessions, m, median (worst)", "-", spread(errors, 3), "-")
 
 
-def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[str]:
+def _kidnap_lines(found: Sequence[_KidnapFigures]) -> Iterator[str]:
     """The lines of kidnapped robots."""
     yield HEADER
     n = len(found)
@@ -291,7 +292,7 @@ def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[str]:
     yield table_line("pieces", "-", spread([one.pieces for one in found], 0), "-")
 
 
-def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
+def _draw_carried(found: Sequence[_CarriedFigures], png: Path) -> None:
     """Draws one session that was carried and, if there is one, tied on, and the errors of all."""
     one = next((each for each in found if each.known.joined), found[0])
     paths = PathPanel(
@@ -310,7 +311,7 @@ def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
     draw_panels(png, "Carried away, and continued", line, paths, panel)
 
 
-def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
+def _draw_kidnaps(found: Sequence[_KidnapFigures], png: Path) -> None:
     """Draws the errors of all sessions."""
     dots = {"within pieces": [one.within for one in found], "over all pairs": [one.over_all for one in found]}
     panel = Panel("Energy Metric, m² + rad²", "pairs of steps", dots=dots, limits={"goal": ENERGY})
@@ -319,5 +320,5 @@ def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
     draw_panels(png, "Eight kidnaps in ten circuits", line, None, panel)
 
 
-CARRIED = Figure("Continue after being carried", measure_carried, carried_lines, draw_carried, 20)
-KIDNAPS_ROW = Figure("Eight kidnaps", measure_kidnaps, kidnap_lines, draw_kidnaps, 12)
+CARRIED = Figure("Continue after being carried", _measure_carried, _carried_lines, _draw_carried, 20)
+KIDNAPS_ROW = Figure("Eight kidnaps", _measure_kidnaps, _kidnap_lines, _draw_kidnaps, 12)

@@ -1,4 +1,4 @@
-"""Rows: a robot that wakes up somewhere in a known maze, and in a maze that it does not know."""
+"""Figures: a robot that wakes up somewhere in a known maze, and in a maze that it does not know."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Judged(NamedTuple):
         return int(np.argmax(self.right)) + 1 if self.right.any() else np.inf
 
 
-class StartFigures(NamedTuple):
+class _StartFigures(NamedTuple):
     """One unknown start.
 
     Attributes:
@@ -97,7 +97,7 @@ class StartFigures(NamedTuple):
         }
 
 
-class ForeignFigures(NamedTuple):
+class _ForeignFigures(NamedTuple):
     """One session in another maze, and one in the maze of the map.
 
     Attributes:
@@ -134,7 +134,7 @@ def judge(steps: MapSteps, localised: Localised, truth: np.ndarray) -> Judged:
     )
 
 
-def measure_start(task: MapTask) -> StartFigures:
+def _measure_start(task: MapTask) -> _StartFigures:
     """One unknown start in the map of ten circuits."""
     made, recorded = task.map_of(ten_circuits(task.seed)), record(unknown_start(task.seed))
     steps, truth = made.arrays.steps, recorded.truth
@@ -142,7 +142,7 @@ def measure_start(task: MapTask) -> StartFigures:
     mixed = Recorded(recorded.config, apply_control(recorded.log, "shuffled", task.seed))
     reckoned = integrate(recorded.log.motion[:, :3], truth[0])
     said = compose(align(steps.pose, steps.truth), localised.pose)
-    return StartFigures(
+    return _StartFigures(
         seed=task.seed,
         session=judge(steps, localised, truth),
         shuffled=judge(steps, task.methods.localise(made, mixed), truth),
@@ -151,12 +151,12 @@ def measure_start(task: MapTask) -> StartFigures:
     )
 
 
-def measure_foreign(task: MapTask) -> ForeignFigures:
+def _measure_foreign(task: MapTask) -> _ForeignFigures:
     """One session in another maze."""
     made = task.map_of(ten_circuits(task.seed))
     other = task.methods.localise(made, record(other_maze(task.seed)))
     known = task.methods.localise(made, record(unknown_start(task.seed)))
-    return ForeignFigures(
+    return _ForeignFigures(
         task.seed,
         int(other.found.sum()),
         bool(other.foreign[-1]),
@@ -165,7 +165,7 @@ def measure_foreign(task: MapTask) -> ForeignFigures:
     )
 
 
-def start_lines(found: Sequence[StartFigures]) -> Iterator[str]:
+def _start_lines(found: Sequence[_StartFigures]) -> Iterator[str]:
     """The lines of unknown starts."""
     yield HEADER
     n = len(found)
@@ -198,7 +198,7 @@ def start_lines(found: Sequence[StartFigures]) -> Iterator[str]:
     yield table_line("the same after the alignment of the map", "-", spread(aligned, 3), "-")
 
 
-def foreign_lines(found: Sequence[ForeignFigures]) -> Iterator[str]:
+def _foreign_lines(found: Sequence[_ForeignFigures]) -> Iterator[str]:
     """The lines of sessions in other mazes."""
     yield HEADER
     n = len(found)
@@ -216,7 +216,7 @@ def foreign_lines(found: Sequence[ForeignFigures]) -> Iterator[str]:
     )
 
 
-def draw_start(found: Sequence[StartFigures], png: Path) -> None:
+def _draw_start(found: Sequence[_StartFigures], png: Path) -> None:
     """Draws one session in its maze, and the error of all over the whisks."""
     one = found[0]
     paths = PathPanel(
@@ -242,7 +242,7 @@ def draw_start(found: Sequence[StartFigures], png: Path) -> None:
     )
 
 
-def draw_foreign(found: Sequence[ForeignFigures], png: Path) -> None:
+def _draw_foreign(found: Sequence[_ForeignFigures], png: Path) -> None:
     """Draws how long robots believed that they were found, in another maze and in that of the map."""
     dots = {
         "another maze": [100 * one.found / FOREIGN for one in found],
@@ -254,5 +254,5 @@ def draw_foreign(found: Sequence[ForeignFigures], png: Path) -> None:
     draw_panels(png, "A maze that is not in the map", line, None, panel)
 
 
-START = Figure("Localise from an unknown start", measure_start, start_lines, draw_start, 20)
-FOREIGN_ROW = Figure("Localise in another maze", measure_foreign, foreign_lines, draw_foreign, 20)
+START = Figure("Localise from an unknown start", _measure_start, _start_lines, _draw_start, 20)
+FOREIGN_ROW = Figure("Localise in another maze", _measure_foreign, _foreign_lines, _draw_foreign, 20)

@@ -1,8 +1,6 @@
-"""Rows: sessions of one maze merged, of two mazes, and ten of one maze one by one.
+"""Figures: maps merged of sessions of one maze, of two mazes, of ten sessions and of buildings in two halves.
 
-Whether two sessions of one map are joined, and rightly.
-
-Row: recordings of buildings in two halves, merged, and the second found in the first.
+Merging is judged by whether sessions are joined in one piece, and rightly, and by the errors of the whole.
 """
 
 from __future__ import annotations
@@ -120,7 +118,7 @@ SESSIONS = 10
 """Number of sessions that are merged one by one."""
 
 
-class OverlapFigures(NamedTuple):
+class _OverlapFigures(NamedTuple):
     """Two sessions that share half their cells.
 
     Attributes:
@@ -147,7 +145,7 @@ class OverlapFigures(NamedTuple):
         }
 
 
-class DifferentFigures(NamedTuple):
+class _DifferentFigures(NamedTuple):
     """Sessions of two mazes, and control sessions of the first maze.
 
     Attributes:
@@ -162,7 +160,7 @@ class DifferentFigures(NamedTuple):
         return {"mazes_joined": self.joined, "maze_not_joined": not self.same}
 
 
-class TenFigures(NamedTuple):
+class _TenFigures(NamedTuple):
     """Ten sessions merged one by one.
 
     Attributes:
@@ -188,12 +186,12 @@ class TenFigures(NamedTuple):
         }
 
 
-def measure_overlap(task: MapTask) -> OverlapFigures:
+def _measure_overlap(task: MapTask) -> _OverlapFigures:
     """Merges one pair of sessions."""
     scenario = overlapping_sessions(task.seed)
     one, other = task.map_of(scenario.one), task.map_of(scenario.other)
     arrays = _merge(task, one, other)
-    return OverlapFigures(
+    return _OverlapFigures(
         task.seed,
         judge_join(arrays, len(one.arrays.truth), revisits=True),
         arrays.em,
@@ -202,25 +200,25 @@ def measure_overlap(task: MapTask) -> OverlapFigures:
     )
 
 
-def measure_different(task: MapTask) -> DifferentFigures:
+def _measure_different(task: MapTask) -> _DifferentFigures:
     """Merges the sessions of two mazes, and two of one maze."""
     one = task.map_of(ten_circuits(task.seed))
     earlier = len(one.arrays.truth)
     other, again = task.map_of(ten_circuits(task.seed + 1)), task.map_of(same_maze(task.seed, 1))
-    return DifferentFigures(
+    return _DifferentFigures(
         judge_join(_merge(task, one, other), earlier).joined,
         judge_join(_merge(task, one, again), earlier).joined,
     )
 
 
-def measure_ten(task: MapTask) -> TenFigures:
+def _measure_ten(task: MapTask) -> _TenFigures:
     """Merges ten sessions of one maze one by one."""
     maps = [task.map_of(same_maze(task.seed, number)) for number in range(SESSIONS)]
     merged = [maps[0]]
     with TemporaryDirectory() as folder:
         for number, one in enumerate(maps[1:], 1):
             merged.append(task.methods.merge([merged[-1], one], Path(folder) / str(number)))
-    return TenFigures(
+    return _TenFigures(
         union=np.array([one.arrays.em for one in merged]),
         frames=np.array([one.arrays.frames for one in merged]),
         alone=np.array([one.arrays.em for one in maps]),
@@ -229,7 +227,7 @@ def measure_ten(task: MapTask) -> TenFigures:
     )
 
 
-def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[str]:
+def _overlap_lines(found: Sequence[_OverlapFigures]) -> Iterator[str]:
     """The lines of sessions that overlap."""
     yield HEADER
     n = len(found)
@@ -252,7 +250,7 @@ def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[str]:
     yield table_line("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(each)} of each pair")
 
 
-def different_lines(found: Sequence[DifferentFigures]) -> Iterator[str]:
+def _different_lines(found: Sequence[_DifferentFigures]) -> Iterator[str]:
     """The lines of two mazes."""
     yield HEADER
     same = count([one.same for one in found])
@@ -261,7 +259,7 @@ def different_lines(found: Sequence[DifferentFigures]) -> Iterator[str]:
     )
 
 
-def ten_lines(found: Sequence[TenFigures]) -> Iterator[str]:
+def _ten_lines(found: Sequence[_TenFigures]) -> Iterator[str]:
     """The lines of ten sessions."""
     yield HEADER
     yield table_line("all sessions in one piece", "-", count([one.joined for one in found]), "-")
@@ -280,7 +278,7 @@ def ten_lines(found: Sequence[TenFigures]) -> Iterator[str]:
     )
 
 
-def draw_overlap(found: Sequence[OverlapFigures], png: Path) -> None:
+def _draw_overlap(found: Sequence[_OverlapFigures], png: Path) -> None:
     """Draws one pair of sessions, joined if there is one, and the Energy Metric of all."""
     one = next((each for each in found if each.join.joined), found[0])
     paths = PathPanel(
@@ -297,7 +295,7 @@ def draw_overlap(found: Sequence[OverlapFigures], png: Path) -> None:
     draw_panels(png, "Two sessions of one maze, merged", line, paths, panel)
 
 
-def draw_different(found: Sequence[DifferentFigures], png: Path) -> None:
+def _draw_different(found: Sequence[_DifferentFigures], png: Path) -> None:
     """Draws the shares of pairs that were joined."""
     dots = {
         "two mazes": [100 * float(np.mean([one.joined for one in found]))],
@@ -309,7 +307,7 @@ def draw_different(found: Sequence[DifferentFigures], png: Path) -> None:
     draw_panels(png, "Sessions of two mazes", line, None, panel)
 
 
-def draw_ten(found: Sequence[TenFigures], png: Path) -> None:
+def _draw_ten(found: Sequence[_TenFigures], png: Path) -> None:
     """Draws keyframes and Energy Metric over the sessions."""
     curves = {
         "Energy Metric": [one.union / one.union[0] for one in found],
@@ -327,7 +325,7 @@ def _merge(task: MapTask, *maps: StoredMap) -> MapArrays:
         return task.methods.merge(maps, Path(folder) / "merged").arrays
 
 
-def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
+def _growth(found: Sequence[_TenFigures]) -> tuple[list[float], list[float]]:
     """Energy Metric and keyframes after the last session, over those after the first."""
     return (
         [float(one.union[-1] / one.union[0]) for one in found],
@@ -336,10 +334,10 @@ def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
 
 
 OVERLAP = Figure(
-    "Merge two sessions that share half their cells", measure_overlap, overlap_lines, draw_overlap, 20
+    "Merge two sessions that share half their cells", _measure_overlap, _overlap_lines, _draw_overlap, 20
 )
-DIFFERENT = Figure("Merge sessions of two mazes", measure_different, different_lines, draw_different, 20)
-TEN = Figure("Merge ten sessions one by one", measure_ten, ten_lines, draw_ten, 3)
+DIFFERENT = Figure("Merge sessions of two mazes", _measure_different, _different_lines, _draw_different, 20)
+TEN = Figure("Merge ten sessions one by one", _measure_ten, _ten_lines, _draw_ten, 3)
 
 
 RECORDINGS = ("intel_laser", "tuc_lecture_hall")
@@ -351,15 +349,7 @@ FOUND, OFF = 0.8, 0.01
 off."""
 
 
-class Halves(NamedTuple):
-    """A recording and its two halves."""
-
-    whole: Recipe
-    first: Recipe
-    second: Recipe
-
-
-class HalvesFigures(NamedTuple):
+class _HalvesFigures(NamedTuple):
     """One recording.
 
     Attributes:
@@ -403,28 +393,35 @@ class HalvesFigures(NamedTuple):
         }
 
 
-def split_recording(name: str) -> Halves:
-    """The recording of a configuration in two halves.
+def split_recording(name: str) -> tuple[Recipe, Recipe, Recipe]:
+    """The recording of a configuration, and its two halves.
 
     Raises:
         InputError: the recording is missing or has no truth.
     """
     whole = Recipe(load_config(find_config(name)))
     middle = record(whole).log.length // 2
-    return Halves(whole, whole._replace(last=middle), whole._replace(first=middle))
+    return whole, whole._replace(last=middle), whole._replace(first=middle)
 
 
-def measure_halves(task: MapTask) -> HalvesFigures:
+def _measure_halves(task: MapTask) -> _HalvesFigures:
     """One recording."""
     name = RECORDINGS[task.seed]
     recipes = split_recording(name)
     whole, first, second = (task.map_of(recipe) for recipe in recipes)
-    recorded, steps = record(recipes.second), first.arrays.steps
+    recorded, steps = record(recipes[2]), first.arrays.steps
     truth = recorded.truth
     with TemporaryDirectory() as folder:
         merged = task.methods.merge([first, second], Path(folder) / "merged").arrays
     localised = task.methods.localise(first, recorded)
-    mixed = task.methods.localise(first, _shuffle(recorded))
+    # The control: views and place labels of the second half in random order.
+    log, label, views = recorded.log, recorded.log.label.copy(), recorded.log.views.copy()
+    random = stream(0, "atlas.halves.shuffled")
+    seen, given = np.flatnonzero(log.seen), np.flatnonzero(label >= 0)
+    views[seen] = views[random.permutation(seen)]
+    label[given] = label[random.permutation(given)]
+    log = replace(log, digest=f"{log.digest}+shuffled", views=views, label=label)
+    mixed = task.methods.localise(first, Recorded(recorded.config, log))
     again = is_revisited(steps, truth, BUILDING)
 
     def shares(found: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
@@ -438,7 +435,12 @@ def measure_halves(task: MapTask) -> HalvesFigures:
     nearest = nearest_steps(steps, truth, BUILDING.distance)
     perfect = compose(steps.pose[nearest], between(steps.truth[nearest], truth))
     at = localised.found
-    return HalvesFigures(
+    # Odometry from the first step with a true pose on.
+    known = np.isfinite(truth).all(axis=1)
+    true, path = truth[known], integrate(recorded.log.motion[:, :3])[known]
+    path = compose(compose(true[0], inverse(path[0])), path)
+    drifted = np.column_stack([np.hypot(*(path - true)[:, :2].T), np.abs(wrap(path[:, 2] - true[:, 2]))])
+    return _HalvesFigures(
         name=name,
         whole=whole.arrays.ate,
         merged=merged.ate,
@@ -449,13 +451,13 @@ def measure_halves(task: MapTask) -> HalvesFigures:
         off_by_map=shares(at, perfect)[1],
         off_nearby=float(exceeds(nearby, BUILDING)[at].mean()) if at.any() else 0.0,
         shuffled=shares(mixed.found, mixed.pose),
-        reckoned=_share_off_by_odometry(recorded),
+        reckoned=float(exceeds(drifted, BUILDING).mean()),
         paths=(steps.truth[:, :2], truth[:, :2], np.where(localised.found[:, None], said[:, :2], np.nan)),
         error=np.where(localised.found, error, np.nan),
     )
 
 
-def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[str]:
+def _halves_lines(found: Sequence[_HalvesFigures]) -> Iterator[str]:
     """The lines of each recording."""
     yield HEADER
     for one in found:
@@ -485,7 +487,7 @@ def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[str]:
         )
 
 
-def draw_halves(found: Sequence[HalvesFigures], png: Path) -> None:
+def _draw_halves(found: Sequence[_HalvesFigures], png: Path) -> None:
     """Draws the recording in which the robot is found most, and the errors while found in all."""
     one = max(found, key=lambda each: each.found)
     paths = PathPanel(
@@ -503,23 +505,4 @@ def draw_halves(found: Sequence[HalvesFigures], png: Path) -> None:
     draw_panels(png, "Buildings, each recording in two halves", line, paths, panel)
 
 
-def _shuffle(recorded: Recorded) -> Recorded:
-    """The session with its views and place labels in random order."""
-    log, label, views = recorded.log, recorded.log.label.copy(), recorded.log.views.copy()
-    random = stream(0, "atlas.halves.shuffled")
-    seen, given = np.flatnonzero(log.seen), np.flatnonzero(label >= 0)
-    views[seen] = views[random.permutation(seen)]
-    label[given] = label[random.permutation(given)]
-    return Recorded(recorded.config, replace(log, digest=f"{log.digest}+shuffled", views=views, label=label))
-
-
-def _share_off_by_odometry(recorded: Recorded) -> float:
-    """Share of the steps with a true pose that are off by odometry from the first such pose."""
-    known = np.isfinite(recorded.truth).all(axis=1)
-    truth, path = recorded.truth[known], integrate(recorded.log.motion[:, :3])[known]
-    path = compose(compose(truth[0], inverse(path[0])), path)
-    error = np.column_stack([np.hypot(*(path - truth)[:, :2].T), np.abs(wrap(path[:, 2] - truth[:, 2]))])
-    return float(exceeds(error, BUILDING).mean())
-
-
-HALVES = Figure("Buildings in two halves", measure_halves, halves_lines, draw_halves, RECORDINGS)
+HALVES = Figure("Buildings in two halves", _measure_halves, _halves_lines, _draw_halves, RECORDINGS)

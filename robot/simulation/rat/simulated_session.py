@@ -272,8 +272,8 @@ class RatSimulation(SimulatedSource):
         self.timeline = lay_out_phases(config.phases, config.box, pose[:, :2], rows, config.rate_hz)
         self.time = np.arange(rows) / config.rate_hz
         source, scale = self.timeline.source, self.timeline.scale
-        here = scale_poses(pose[source], scale)
-        before = scale_poses(pose[np.maximum(source - 1, 0)], scale)
+        here = _scale_poses(pose[source], scale)
+        before = _scale_poses(pose[np.maximum(source - 1, 0)], scale)
         self.truth = wrap_headings(here)
         motion = np.column_stack(
             [between(before, here)[:, :2], here[:, 2] - before[:, 2], np.full(rows, 1.0)]
@@ -314,7 +314,7 @@ class RatSimulation(SimulatedSource):
             yield observation(NO_ODOMETRY, view, view_shape=self.view_shape)
 
 
-def scale_poses(pose: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _scale_poses(pose: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """[N, 3] poses [N, 3] in a box whose width and height have changed by factors [N, 2]; headings remain the
     direction of motion and are not wrapped."""
     heading = pose[:, 2]
