@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,10 +72,11 @@ def add_commands(commands: Commands) -> None:
     )
     _add_tables(Commands(tables))
     real = names.add(
-        "real", _real, "figures on recordings of real whiskers and wheels",
+        "real", _figures, "figures on recordings of real whiskers and wheels",
         "reproduce real --rows contact -o runs/real",
     )  # fmt: skip
     _add_row_names(real, REAL)
+    real.set_defaults(page="real")
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         check=own_folder("real.md"),
@@ -86,7 +87,7 @@ def add_commands(commands: Commands) -> None:
     maps = _add_rows(names, "maps", _maps, title, MAPS, 32000)
     _add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
-    _add_rows(names, "cells", _cells, title, CELLS, 40000)
+    _add_rows(names, "cells", _figures, title, CELLS, 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -110,6 +111,7 @@ def _add_rows(
     example = f"reproduce {name} --rows {next(iter(rows))} --sessions 1 -o runs/{name}"
     parser = names.add(name, command, title, example)
     _add_row_names(parser, rows)
+    parser.set_defaults(page=name)
     parser.add_argument(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
@@ -197,36 +199,26 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _real(arguments: argparse.Namespace) -> int:
+def _figures(arguments: argparse.Namespace) -> int:
+    """The figures of pose cells, or those of real recordings."""
+    from evaluation.papers.tables.markdown import select_rows
     from evaluation.papers.tables.recordings import DATA, real_recordings
     from evaluation.papers.whiskers.recordings import UNPROVEN
 
-    data = real_recordings()
-    if data is None:
-        raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
-    return _write_page(arguments, "real", REAL, data, [UNPROVEN])
-
-
-def _cells(arguments: argparse.Namespace) -> int:
-    return _write_page(
-        arguments, "cells", CELLS, Task(arguments.first, arguments.sessions, arguments.workers)
-    )
-
-
-def _write_page(
-    arguments: argparse.Namespace,
-    name: str,
-    places: Mapping[str, str],
-    task: Task | Path,
-    ending: Sequence[str] = (),
-) -> int:
+    if arguments.page == "cells":
+        task: object = Task(arguments.first, arguments.sessions, arguments.workers)
+        places, ending = CELLS, []
+    else:
+        task, places, ending = real_recordings(), REAL, [UNPROVEN]
+        if task is None:
+            raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.tables.markdown import select_rows
+    names = select_rows(arguments.rows, places, tuple(places))
 
     def measure(name: str, figure: Figure) -> tuple[Sequence[str], Any]:
         return (), figure.measure(task)
 
-    names, page = select_rows(arguments.rows, places, tuple(places)), arguments.output / f"{name}.md"
+    page = arguments.output / f"{arguments.page}.md"
     for line in write_page(page, places, names, measure, ending):
         print(line, flush=True)
     print(f"wrote {page}")
@@ -259,18 +251,19 @@ BACKENDS = ("recall", "classic")
 SESSION_FILES = ("touch.csv", "buildings.csv")
 """Files of the sessions of tables, which may be in one folder."""
 
-Lines = Callable[[argparse.Namespace], Iterator[str]]
+TIMED = ("speed", "cycles", "batches")
+"""Tables of times."""
 
 
 def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
-    def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
+    def add(name: str, help: str, example: str) -> argparse.ArgumentParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
-        parser.set_defaults(lines=lines, file="")
+        parser.set_defaults(table=name, file="")
         return parser
 
-    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
+    touch = add("touch", "whisker sessions under many conditions", "--rows main --sessions 1")
     add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
     touch.add_argument(
         "--sessions",
@@ -280,21 +273,19 @@ def _add_tables(tables: Commands) -> None:
     )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     _add_session_file(touch, "touch.csv")
-    grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
+    grid = add("grid", "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
-    laser = add("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
+    laser = add("laser", "recordings with laser views or given places", "--rows square")
     add_count(laser, "--copies", 10, "perturbed copies per recording")
-    buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
+    buildings = add("buildings", "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
     _add_session_file(buildings, "buildings.csv")
-    health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
+    health = add("health", "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
-    closures = add(
-        "closures", _closures_lines, "fits and tests the log-odds of closure sequences", "--sessions 2"
-    )
+    closures = add("closures", "fits and tests the log-odds of closure sequences", "--sessions 2")
     add_count(closures, "--sessions", 6, "sessions per row")
     add_workers(closures)
     closures.add_argument(
@@ -304,16 +295,16 @@ def _add_tables(tables: Commands) -> None:
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
-    speed = add("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
+    speed = add("speed", "microseconds per pose-cell step by network size", "--rows 21 41")
     speed.add_argument(
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
-    cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
+    cycles = add("cycles", "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
     add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
-    batches = add("batches", _batch_lines, "many sets or sessions in one call, on a GPU too", "--steps 160")
+    batches = add("batches", "many sets or sessions in one call, on a GPU too", "--steps 160")
     add_count(batches, "--sets", 1000, "parameter sets in one call")
     add_count(batches, "--sessions", 256, "sessions in one call")
     add_count(batches, "--steps", 1600, "steps of a session")
@@ -340,86 +331,65 @@ def _add_against(parser: argparse.ArgumentParser, file: str) -> None:
 
 def _print_table(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    for line in arguments.lines(arguments):
+    lines = _timed_lines if arguments.table in TIMED else _table_lines
+    for line in lines(arguments.table, arguments):
         print(line, flush=True)
     if arguments.file and arguments.output is not None:
         print(f"\nwrote {arguments.output / arguments.file}")
     return 0
 
 
-def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
+    """The lines of a table, each as soon as it is measured; only the modules of that table are loaded."""
     from evaluation.papers.tables.comparison import Files
     from evaluation.papers.tables.markdown import select_rows
-    from evaluation.papers.tables.touch_table import DEFAULT_ROWS, ROWS, touch_table
 
-    rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
-    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
+    if name == "touch":
+        from evaluation.papers.tables import touch_table as touch
 
+        rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
+        files = Files(arguments.output, arguments.against)
+        first, sessions = arguments.first, arguments.sessions
+        return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
+    if name == "grid":
+        from evaluation.papers.tables import grid_table as grid
 
-def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.grid_table import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
-    from evaluation.papers.tables.markdown import select_rows
+        places = grid.DEFAULT_ROWS
+        if arguments.rows or arguments.worlds:
+            names = select_rows(arguments.rows, grid.ROWS, tuple(grid.ODOMETRY_ERRORS))
+            places = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
+        return grid.grid_table(places, arguments.arenas, arguments.first, arguments.workers)
+    if name in ("laser", "buildings"):
+        from evaluation.papers.tables import buildings
 
-    if arguments.rows or arguments.worlds:
-        names = select_rows(arguments.rows, ROWS, tuple(ODOMETRY_ERRORS))
-        rows = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
-    else:
-        rows = DEFAULT_ROWS
-    return grid_table(rows, arguments.arenas, arguments.first, arguments.workers)
+        copies, workers = arguments.copies, arguments.workers
+        if name == "laser":
+            rows = select_rows(arguments.rows, buildings.ROWS, tuple(buildings.ROWS))
+            return buildings.laser_table(rows, copies, workers)
+        files, rows = Files(arguments.output, arguments.against), buildings.choose_rows(arguments.rows)
+        return buildings.buildings_table(rows, copies, workers, files=files)
+    if name == "health":
+        from evaluation.papers.tables.health import health_table
 
-
-def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.buildings import ROWS, laser_table
-    from evaluation.papers.tables.markdown import select_rows
-
-    return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
-
-
-def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.buildings import buildings_table, choose_rows
-    from evaluation.papers.tables.comparison import Files
-
-    files = Files(arguments.output, arguments.against)
-    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers, files=files)
-
-
-def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.health import health_table
-
-    return health_table(arguments.sessions, arguments.workers)
-
-
-def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
+        return health_table(arguments.sessions, arguments.workers)
     from evaluation.papers.tables.closures import closures_table
 
     return closures_table(arguments.sessions, arguments.workers, arguments.output)
 
 
-def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.machine import one_core
-
-    with one_core():
-        from evaluation.papers.tables.speed import SIZES, speed_table
-
-        yield from speed_table(arguments.rows or SIZES, arguments.rounds)
-
-
-def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
+def _timed_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
+    """The lines of a table of times; the process is kept on one core before its modules are loaded."""
     from evaluation.studies.machine import one_core
 
     with one_core():
         from evaluation.papers.tables.cycles import cycle_table, profile_table
+        from evaluation.papers.tables.speed import SIZES, batch_table, speed_table
 
-        if arguments.profile:
+        if name == "speed":
+            yield from speed_table(arguments.rows or SIZES, arguments.rounds)
+        elif name == "batches":
+            yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
+        elif arguments.profile:
             yield from profile_table(arguments.rows)
         else:
             yield from cycle_table(arguments.rows, arguments.rounds)
-
-
-def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.machine import one_core
-
-    with one_core():
-        from evaluation.papers.tables.speed import batch_table
-
-        yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)

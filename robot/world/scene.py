@@ -1,6 +1,6 @@
 """The scene of a head session from its settings: maze, route, head trajectory, kidnaps and walls.
 
-Poses of the head over time along a route, with random variation between visits.
+The trajectory is the poses of the head over time along a route, with random variation between visits.
 """
 
 from __future__ import annotations

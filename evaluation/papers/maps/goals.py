@@ -49,7 +49,7 @@ from robot.live.live_config import GoalConfig, LiveConfig
 from robot.live.live_rig import ArmOdometry
 from robot.simulation.head.kinematic import HeadSetup, simulate_kinematic
 from robot.sources.source import Sample
-from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
+from robot.world.maze import Cell, Maze, cell_centre, wall_boxes
 from robot.world.scene import HeadPath, Scene, make_scene, maze_seed
 from robot.world.walls import Surroundings, Walls
 from tactile.base.random_streams import stream
@@ -332,7 +332,7 @@ def walls_of(made: _DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surro
     assert plan is not None
     maze = Maze(maze.across.copy(), maze.along.copy())
     if across is not None:
-        wall, place = between_cells(maze, *across)
+        wall, place = maze.between_cells(*across)
         wall[place] = True
     heights = stream(maze_seed(plan.maze, plan.seed), "maze.heights")
     return Surroundings(wall_boxes(maze, heights, plan.maze.heights), made.scene.surroundings.head)

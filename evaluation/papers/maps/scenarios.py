@@ -18,7 +18,7 @@ from evaluation.papers.trial_sessions import collect_session
 from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
-from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route, is_open, neighbours
+from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route
 from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -124,7 +124,7 @@ def _maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
     graph.add_node(start)
     while edge:
         here = edge.pop()
-        for cell in neighbours(maze, here):
+        for cell in maze.neighbours(here):
             if cell not in graph:
                 edge.append(cell)
             graph.add_edge(here, cell)
@@ -201,7 +201,7 @@ def _walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[C
         for b in ((x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)):
             inside = 0 <= b[0] < maze.columns and 0 <= b[1] < maze.rows
             known = (b, (x, y)) in pairs or frozenset(((x, y), b)) in steps
-            if inside and not known and is_open(maze, (x, y), b) != there:
+            if inside and not known and maze.is_open((x, y), b) != there:
                 pairs.append(((x, y), b))
     return pairs
 
@@ -407,7 +407,7 @@ def _enter(maze: Maze, parts: _TwoParts, random: np.random.Generator) -> list[Ce
         start = _turned(parts.one, random)[0]
         return exploration_route(maze, start, cells, random, parts.one)
     # Pairs of an outside cell and a cell of the part that no wall separates, in order.
-    doors = sorted((a, b) for a in parts.other for b in neighbours(maze, a) if b in parts.one)
+    doors = sorted((a, b) for a in parts.other for b in maze.neighbours(a) if b in parts.one)
     outside, inside = doors[int(random.integers(len(doors)))]
     before = exploration_route(maze, outside, lead, random, parts.other)[::-1] if lead > 1 else [outside]
     return [*before, *exploration_route(maze, inside, cells, random, parts.one)]

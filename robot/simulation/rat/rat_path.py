@@ -1,7 +1,4 @@
-"""The path of a rat, and its pose at even times.
-
-Odometry of a rat: its true motion with errors of speed and heading.
-"""
+"""The path of a rat, its poses at even times, and its odometry: the true motion with errors."""
 
 from __future__ import annotations
 
