@@ -366,8 +366,8 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
         if name == "laser":
             rows = select_rows(arguments.rows, buildings.ROWS, tuple(buildings.ROWS))
             return buildings.laser_table(rows, copies, workers)
-        files, rows = Files(arguments.output, arguments.against), buildings.choose_rows(arguments.rows)
-        return buildings.buildings_table(rows, copies, workers, files=files)
+        files = Files(arguments.output, arguments.against)
+        return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
     if name == "health":
         from evaluation.papers.tables.health import health_table
 
