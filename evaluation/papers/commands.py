@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from evaluation.papers.cells.reproduction import NAMES as CELL_ROWS
-from evaluation.papers.maps.reproduction import ROWS as MAP_ROWS
-from evaluation.papers.whiskers.reproduction import NAMES as REAL_ROWS
+from evaluation.papers.figure import CELLS, MAPS, REAL, Figure, Task, write_page
 from ratslam.cli.common import (
     INTERRUPTED,
     CommandParser,
@@ -58,7 +57,7 @@ def add_commands(commands: Commands) -> None:
     names = Commands(reproduce)
     for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
         for name, title in figures.items():
-            add_figure(names, name, f"{paper}: {title}")
+            _add_figure(names, name, f"{paper}: {title}")
     threshold = names.add(
         "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
         "reproduce threshold whisker_maze -o runs/threshold",
@@ -71,22 +70,24 @@ def add_commands(commands: Commands) -> None:
     tables = names.add(
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
-    add_tables(Commands(tables))
+    _add_tables(Commands(tables))
     real = names.add(
-        "real", _real, "figures on recordings of real whiskers and wheels",
+        "real", _figures, "figures on recordings of real whiskers and wheels",
         "reproduce real --rows contact -o runs/real",
     )  # fmt: skip
-    add_row_names(real, REAL_ROWS)
+    _add_row_names(real, REAL)
+    real.set_defaults(page="real")
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
         check=own_folder("real.md"),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
     title = "maps found again, continued, merged and changed"
-    maps = add_rows(names, "maps", _maps, title, MAP_ROWS, 32000)
-    add_against(maps, "maps.csv")
+    # Mazes 31000 to 31030, 32700 to 32707 and 33000 to 33059 were used to choose settings.
+    maps = _add_rows(names, "maps", _maps, title, MAPS, 32000)
+    _add_against(maps, "maps.csv")
     title = "pose cells: drift, anchoring, cues, maps, scores, with controls"
-    add_rows(names, "cells", _cells, title, CELL_ROWS, 40000)
+    _add_rows(names, "cells", _figures, title, CELLS, 40000)
     train = names.add(
         "templates", _train, "Fox et al.: strain templates of a simulated Create",
         "reproduce templates create_arena -o runs/templates.npz",
@@ -98,7 +99,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def add_rows(
+def _add_rows(
     names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
 ) -> CommandParser:
     """Registers a set of tables and figures, of which each is a row; its parser.
@@ -109,7 +110,8 @@ def add_rows(
     """
     example = f"reproduce {name} --rows {next(iter(rows))} --sessions 1 -o runs/{name}"
     parser = names.add(name, command, title, example)
-    add_row_names(parser, rows)
+    _add_row_names(parser, rows)
+    parser.set_defaults(page=name)
     parser.add_argument(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
@@ -124,13 +126,13 @@ def add_rows(
     return parser
 
 
-def add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
+def _add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
     """Registers `--rows`, whose help lists the names of all rows."""
     listed = ", ".join(f"'{name}'" if " " in name else name for name in rows)
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed} (default: all)")
 
 
-def add_figure(names: Commands, name: str, title: str) -> None:
+def _add_figure(names: Commands, name: str, title: str) -> None:
     """Registers a figure."""
     parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
     sets = SETS.get(name, USUAL_SETS)
@@ -197,30 +199,40 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _real(arguments: argparse.Namespace) -> int:
+def _figures(arguments: argparse.Namespace) -> int:
+    """The figures of pose cells, or those of real recordings."""
     from evaluation.papers.tables.markdown import select_rows
     from evaluation.papers.tables.recordings import DATA, real_recordings
-    from evaluation.papers.whiskers.reproduction import reproduce_real
+    from evaluation.papers.whiskers.recordings import UNPROVEN
 
-    data = real_recordings()
-    if data is None:
-        raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
+    if arguments.page == "cells":
+        task: object = Task(arguments.first, arguments.sessions, arguments.workers)
+        places, ending = CELLS, []
+    else:
+        task, places, ending = real_recordings(), REAL, [UNPROVEN]
+        if task is None:
+            raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
     prepare_jax(keep_compiled=False)
-    names = select_rows(arguments.rows, dict.fromkeys(REAL_ROWS), REAL_ROWS)
-    for line in reproduce_real(names, data, arguments.output):
+    names = select_rows(arguments.rows, places, tuple(places))
+
+    def measure(name: str, figure: Figure) -> tuple[Sequence[str], Any]:
+        return (), figure.measure(task)
+
+    page = arguments.output / f"{arguments.page}.md"
+    for line in write_page(page, places, names, measure, ending):
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'real.md'}")
+    print(f"wrote {page}")
     return 0
 
 
 def _maps(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.maps.reproduction import reproduce_maps
-    from evaluation.papers.maps.row import PRODUCT
+    from evaluation.papers.maps.operations import PRODUCT, reproduce_maps
     from evaluation.papers.tables.markdown import select_rows
 
-    names = select_rows(arguments.rows, MAP_ROWS, tuple(MAP_ROWS))
+    names = select_rows(arguments.rows, MAPS, tuple(MAPS))
     lines = reproduce_maps(
+        MAPS,
         names,
         PRODUCT,
         arguments.output,
@@ -235,36 +247,23 @@ def _maps(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _cells(arguments: argparse.Namespace) -> int:
-    prepare_jax(keep_compiled=False)
-    from evaluation.papers.cells.figure import CellTask
-    from evaluation.papers.cells.reproduction import reproduce_cells
-    from evaluation.papers.tables.markdown import select_rows
-
-    names = select_rows(arguments.rows, dict.fromkeys(CELL_ROWS), CELL_ROWS)
-    task = CellTask(arguments.first, arguments.sessions, arguments.workers)
-    for line in reproduce_cells(names, task, arguments.output):
-        print(line, flush=True)
-    print(f"wrote {arguments.output / 'cells.md'}")
-    return 0
-
-
 BACKENDS = ("recall", "classic")
 SESSION_FILES = ("touch.csv", "buildings.csv")
 """Files of the sessions of tables, which may be in one folder."""
 
-Lines = Callable[[argparse.Namespace], Iterator[str]]
+TIMED = ("speed", "cycles", "batches")
+"""Tables of times."""
 
 
-def add_tables(tables: Commands) -> None:
+def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
-    def add(name: str, lines: Lines, help: str, example: str) -> argparse.ArgumentParser:
+    def add(name: str, help: str, example: str) -> argparse.ArgumentParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
-        parser.set_defaults(lines=lines, file="")
+        parser.set_defaults(table=name, file="")
         return parser
 
-    touch = add("touch", _touch_lines, "whisker sessions under many conditions", "--rows main --sessions 1")
+    touch = add("touch", "whisker sessions under many conditions", "--rows main --sessions 1")
     add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
     touch.add_argument(
         "--sessions",
@@ -273,22 +272,20 @@ def add_tables(tables: Commands) -> None:
         help="sessions per row (default: of the row, 12 to 40)",
     )
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
-    add_session_file(touch, "touch.csv")
-    grid = add("grid", _grid_lines, "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
+    _add_session_file(touch, "touch.csv")
+    grid = add("grid", "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
     add_count(grid, "--arenas", 10, "arenas per row")
     add_count(grid, "--first", 9000, "seed of the first arena")
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
-    laser = add("laser", _laser_lines, "recordings with laser views or given places", "--rows square")
+    laser = add("laser", "recordings with laser views or given places", "--rows square")
     add_count(laser, "--copies", 10, "perturbed copies per recording")
-    buildings = add("buildings", _buildings_lines, "real buildings: map against odometry", "--copies 2")
+    buildings = add("buildings", "real buildings: map against odometry", "--copies 2")
     add_count(buildings, "--copies", 10, "perturbed copies per recording")
-    add_session_file(buildings, "buildings.csv")
-    health = add("health", _health_lines, "how well the health estimate detects bad maps", "--sessions 1")
+    _add_session_file(buildings, "buildings.csv")
+    health = add("health", "how well the health estimate detects bad maps", "--sessions 1")
     add_count(health, "--sessions", 2, "sessions per row")
     add_workers(health)
-    closures = add(
-        "closures", _closures_lines, "fits and tests the log-odds of closure sequences", "--sessions 2"
-    )
+    closures = add("closures", "fits and tests the log-odds of closure sequences", "--sessions 2")
     add_count(closures, "--sessions", 6, "sessions per row")
     add_workers(closures)
     closures.add_argument(
@@ -298,33 +295,33 @@ def add_tables(tables: Commands) -> None:
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
         add_workers(parser)
-    speed = add("speed", _speed_lines, "microseconds per pose-cell step by network size", "--rows 21 41")
+    speed = add("speed", "microseconds per pose-cell step by network size", "--rows 21 41")
     speed.add_argument(
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
     add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
-    cycles = add("cycles", _cycle_lines, "microseconds per whole cycle, map included", "--rows square")
+    cycles = add("cycles", "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
     add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
-    batches = add("batches", _batch_lines, "many sets or sessions in one call, on a GPU too", "--steps 160")
+    batches = add("batches", "many sets or sessions in one call, on a GPU too", "--steps 160")
     add_count(batches, "--sets", 1000, "parameter sets in one call")
     add_count(batches, "--sessions", 256, "sessions in one call")
     add_count(batches, "--steps", 1600, "steps of a session")
     add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
 
 
-def add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `-o` and `--against` of a table whose sessions are written to a file."""
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
         help=f"folder for {file}, the figures of each session as soon as it is done",
     )  # fmt: skip
-    add_against(parser, file)
+    _add_against(parser, file)
     parser.set_defaults(file=file)
 
 
-def add_against(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_against(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `--against`."""
     parser.add_argument(
         "--against", type=Path, metavar="DIR",
@@ -334,86 +331,65 @@ def add_against(parser: argparse.ArgumentParser, file: str) -> None:
 
 def _print_table(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    for line in arguments.lines(arguments):
+    lines = _timed_lines if arguments.table in TIMED else _table_lines
+    for line in lines(arguments.table, arguments):
         print(line, flush=True)
     if arguments.file and arguments.output is not None:
         print(f"\nwrote {arguments.output / arguments.file}")
     return 0
 
 
-def _touch_lines(arguments: argparse.Namespace) -> Iterator[str]:
+def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
+    """The lines of a table, each as soon as it is measured; only the modules of that table are loaded."""
     from evaluation.papers.tables.comparison import Files
     from evaluation.papers.tables.markdown import select_rows
-    from evaluation.papers.tables.touch_table import DEFAULT_ROWS, ROWS, touch_table
 
-    rows, files = select_rows(arguments.rows, ROWS, DEFAULT_ROWS), Files(arguments.output, arguments.against)
-    return touch_table(rows, arguments.first, arguments.sessions, arguments.workers, arguments.backend, files)
+    if name == "touch":
+        from evaluation.papers.tables import touch_table as touch
 
+        rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
+        files = Files(arguments.output, arguments.against)
+        first, sessions = arguments.first, arguments.sessions
+        return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
+    if name == "grid":
+        from evaluation.papers.tables import grid_table as grid
 
-def _grid_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.grid_table import DEFAULT_ROWS, ODOMETRY_ERRORS, ROWS, grid_table
-    from evaluation.papers.tables.markdown import select_rows
+        places = grid.DEFAULT_ROWS
+        if arguments.rows or arguments.worlds:
+            names = select_rows(arguments.rows, grid.ROWS, tuple(grid.ODOMETRY_ERRORS))
+            places = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
+        return grid.grid_table(places, arguments.arenas, arguments.first, arguments.workers)
+    if name in ("laser", "buildings"):
+        from evaluation.papers.tables import buildings
 
-    if arguments.rows or arguments.worlds:
-        names = select_rows(arguments.rows, ROWS, tuple(ODOMETRY_ERRORS))
-        rows = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
-    else:
-        rows = DEFAULT_ROWS
-    return grid_table(rows, arguments.arenas, arguments.first, arguments.workers)
+        copies, workers = arguments.copies, arguments.workers
+        if name == "laser":
+            rows = select_rows(arguments.rows, buildings.ROWS, tuple(buildings.ROWS))
+            return buildings.laser_table(rows, copies, workers)
+        files = Files(arguments.output, arguments.against)
+        return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
+    if name == "health":
+        from evaluation.papers.tables.health import health_table
 
-
-def _laser_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.buildings import ROWS, laser_table
-    from evaluation.papers.tables.markdown import select_rows
-
-    return laser_table(select_rows(arguments.rows, ROWS, tuple(ROWS)), arguments.copies, arguments.workers)
-
-
-def _buildings_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.buildings import buildings_table, choose_rows
-    from evaluation.papers.tables.comparison import Files
-
-    files = Files(arguments.output, arguments.against)
-    return buildings_table(choose_rows(arguments.rows), arguments.copies, arguments.workers, files=files)
-
-
-def _health_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.papers.tables.health import health_table
-
-    return health_table(arguments.sessions, arguments.workers)
-
-
-def _closures_lines(arguments: argparse.Namespace) -> Iterator[str]:
+        return health_table(arguments.sessions, arguments.workers)
     from evaluation.papers.tables.closures import closures_table
 
     return closures_table(arguments.sessions, arguments.workers, arguments.output)
 
 
-def _speed_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.machine import one_core
-
-    with one_core():
-        from evaluation.papers.tables.speed import SIZES, speed_table
-
-        yield from speed_table(arguments.rows or SIZES, arguments.rounds)
-
-
-def _cycle_lines(arguments: argparse.Namespace) -> Iterator[str]:
+def _timed_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
+    """The lines of a table of times; the process is kept on one core before its modules are loaded."""
     from evaluation.studies.machine import one_core
 
     with one_core():
         from evaluation.papers.tables.cycles import cycle_table, profile_table
+        from evaluation.papers.tables.speed import SIZES, batch_table, speed_table
 
-        if arguments.profile:
+        if name == "speed":
+            yield from speed_table(arguments.rows or SIZES, arguments.rounds)
+        elif name == "batches":
+            yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
+        elif arguments.profile:
             yield from profile_table(arguments.rows)
         else:
             yield from cycle_table(arguments.rows, arguments.rounds)
-
-
-def _batch_lines(arguments: argparse.Namespace) -> Iterator[str]:
-    from evaluation.studies.machine import one_core
-
-    with one_core():
-        from evaluation.papers.tables.speed import batch_table
-
-        yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)

@@ -33,7 +33,7 @@ from ratslam.core.session import CHUNK, Session
 from ratslam.places.change import Change, Touch, session_changes
 from ratslam.places.localiser import Localiser
 from robot.sources.source import SourceInfo
-from robot.world.arena import Arena, is_enclosed, is_occupied, read_arena, wall_segments
+from robot.world.arena import Arena, read_arena, wall_segments
 from robot.world.maze import read_maze, wall_boxes
 from tactile.base.errors import os_errors_of
 from tactile.base.files import require_new_file, write_atomically, write_text_atomically
@@ -185,7 +185,7 @@ def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
     ends = wall_segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
-    return GridTruth(is_occupied(arena, there), is_enclosed(arena, there), seen.reshape(-1, 4))
+    return GridTruth(arena.is_occupied(there), arena.is_enclosed(there), seen.reshape(-1, 4))
 
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:

@@ -14,8 +14,8 @@ from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.ur10.driver_config import ArmConfig
 from robot.simulation.create.simulated_session import CreateSimulationConfig
+from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.simulation.head.simulated_session import SimulationConfig
-from robot.sources.odometry import OdometryConfig
 from tactile.base.settings import Settings
 
 Point = tuple[float, float]

@@ -25,7 +25,8 @@ from robot.drivers.ur10.driver_config import pose_from_tcp, tcp_heading
 from robot.live.live_config import LiveConfig
 from robot.live.polling import TICK, HeadStream, OperatorStop, SessionFault, session_fault, wait_until
 from robot.live.recorder import LiveRecorder
-from robot.sources.odometry import MIDPOINT, OdometryErrors, from_velocities, motions_between
+from robot.simulation.head.odometry_errors import OdometryErrors, motions_between
+from robot.sources.odometry import MIDPOINT, from_velocities
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry

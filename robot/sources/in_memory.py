@@ -1,13 +1,13 @@
-"""A source held in memory as columns; samples are built during iteration.
+"""Sources held in memory as columns; samples are built during iteration.
 
-Base class of simulated sources, which compute all poses and odometry when they are made.
+`SimulatedSource` is the base class of simulations, which compute all poses and odometry when they are made.
 """
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import repeat
 from typing import Any
@@ -74,26 +74,20 @@ class InMemorySource(ClosedSource):
     def __iter__(self) -> Iterator[Sample]:
         shape, alive = self.view_shape, np.broadcast_to(self.alive, (self.length, self.whiskers))
         columns = (self.time.tolist(), self.motion, self.views, self.seen, self.label)
-        rows = zip(*columns, alive, self._truths(), self._contacts(), strict=True)
+        truths: Iterable[np.ndarray | None] = repeat(None, self.length)
+        if self.truth is not None:
+            truths = (None if np.isnan(truth).any() else truth.copy() for truth in self.truth)
+        touches: Iterable[dict[str, np.ndarray]] = repeat({}, self.length)
+        if self.contact is not None and self.point is not None:
+            pairs = zip(self.contact, self.point, strict=True)
+            touches = ({"contact": contact.copy(), "point": point.copy()} for contact, point in pairs)
+        rows = zip(*columns, alive, truths, touches, strict=True)
         for time, motion, view, seen, label, works, truth, touch in rows:
             picture = view if seen else None
             reading = observation(
                 Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
             )
             yield Sample(time, reading._replace(alive=works.copy(), **touch), truth)
-
-    def _contacts(self) -> Iterator[dict[str, np.ndarray]]:
-        if self.contact is None or self.point is None:
-            yield from repeat({}, self.length)
-        else:
-            rows = zip(self.contact, self.point, strict=True)
-            yield from ({"contact": contact.copy(), "point": point.copy()} for contact, point in rows)
-
-    def _truths(self) -> Iterator[np.ndarray | None]:
-        if self.truth is None:
-            yield from repeat(None, self.length)
-        else:
-            yield from (None if np.isnan(truth).any() else truth.copy() for truth in self.truth)
 
 
 def load_into_memory(source: Source) -> InMemorySource:

@@ -9,6 +9,9 @@ from pathlib import Path
 
 from tactile.base.errors import InputError, InputErrors
 
+MOST_NAMES = 12
+"""Existing names that an error lists."""
+
 
 def require_file(path: Path) -> None:
     """Checks that a file can be read and has content.
@@ -20,7 +23,12 @@ def require_file(path: Path) -> None:
         if path.is_dir():
             raise InputError(str(path), "is a folder", "a file")
         if not path.exists():
-            raise InputError(str(path), "no such file", "an existing file", _neighbours(path))
+            try:
+                close = get_close_matches(path.name, [other.name for other in path.parent.iterdir()], n=1)
+                cure = f"did you mean {close[0]!r}?" if close else ""
+            except OSError:
+                cure = f"the folder {path.parent} does not exist"
+            raise InputError(str(path), "no such file", "an existing file", cure)
         if not path.is_file():
             raise InputError(str(path), "is not a regular file", "a file")
         with path.open("rb") as file:
@@ -83,7 +91,10 @@ def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: s
     """
     close = get_close_matches(name, there, n=1)
     cure = f"did you mean {close[0]!r}?" if close else (f"name the {kind} with {key}" if key else "")
-    return InputError(where, f"no {kind} {name!r}", f"it among {_few(there)}", cure)
+    shown = ", ".join(map(repr, there[:MOST_NAMES])) or "(nothing)"
+    if len(there) > MOST_NAMES:
+        shown += f" and {len(there) - MOST_NAMES} more"
+    return InputError(where, f"no {kind} {name!r}", f"it among {shown}", cure)
 
 
 def raise_errors(errors: Sequence[InputError]) -> None:
@@ -92,16 +103,3 @@ def raise_errors(errors: Sequence[InputError]) -> None:
         raise errors[0]
     if errors:
         raise InputErrors(list(errors))
-
-
-def _few(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(map(repr, names[:most]))
-    return shown + (f" and {len(names) - most} more" if len(names) > most else "") if names else "(nothing)"
-
-
-def _neighbours(path: Path) -> str:
-    try:
-        close = get_close_matches(path.name, [other.name for other in path.parent.iterdir()], n=1)
-    except OSError:
-        return f"the folder {path.parent} does not exist"
-    return f"did you mean {close[0]!r}?" if close else ""

@@ -1,10 +1,8 @@
-"""The interface of every recording, simulator and live robot.
+"""The interface of every recording, simulator and live robot, `Source`, and its samples.
 
-Facts about a source: devices, world and origin, as one typed record.
-
-Description of readings that the caller brings, such as those of a robot or a simulator of one's own.
-
-Sources and recording formats of other packages.
+`SourceInfo` holds the facts about a source: devices, world and origin. `SourceDescription` describes readings
+that the caller brings, such as those of a robot or a simulator of one's own. `SOURCES` has the sources and
+recording formats of other packages.
 """
 
 from __future__ import annotations

@@ -7,10 +7,8 @@ As text: one item per line, lengths in m, angles in degrees, `#` before comments
     polygon 1.25 0.5  1.05 0.6  1.25 0.7    # corners of any other object
     start 0.3 0.3 90                        # of the robot, and its heading
 
-Random square arenas with square objects; the robot can reach all free space.
-
-An object either touches the wall or leaves a passage to the wall and to other objects wide enough for the
-robot.
+Random arenas are squares with square objects. An object either touches the wall or leaves a passage to the
+wall and to other objects wide enough for the robot, which can reach all free space.
 """
 
 from __future__ import annotations
@@ -63,34 +61,30 @@ class Arena(NamedTuple):
         """The larger extent of the outer wall along x and y, m."""
         return float(np.ptp(self.outer, axis=0).max())
 
+    def is_enclosed(self, points: np.ndarray) -> np.ndarray:
+        """[...] bool, whether points [..., 2] are inside the outer wall; objects are ignored."""
+        return polygon_contains(self.outer, points)
+
+    def in_free_space(self, points: np.ndarray) -> np.ndarray:
+        """[...] bool, whether points [..., 2] are in free space."""
+        free = self.is_enclosed(points)
+        for polygon in self.objects:
+            free &= ~polygon_contains(polygon, points)
+        return free
+
+    def is_occupied(self, centres: np.ndarray) -> np.ndarray:
+        """[...] bool, whether cells with these centres [..., 2] are in an object or outside the walls."""
+        return ~self.in_free_space(centres)
+
+    def has_clearance(self, places: np.ndarray, radius: float) -> np.ndarray:
+        """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
+        room = segment_distance(wall_segments(self), places).min(axis=-1)
+        return self.in_free_space(places) & (room >= radius)
+
 
 def wall_segments(arena: Arena) -> np.ndarray:
     """All wall segments [S, 4], x1, y1, x2, y2, m, those of objects included."""
     return np.vstack([polygon_edges(arena.outer), *(polygon_edges(polygon) for polygon in arena.objects)])
-
-
-def is_enclosed(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """[...] bool, whether points [..., 2] are inside the outer wall; objects are ignored."""
-    return polygon_contains(arena.outer, points)
-
-
-def in_free_space(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """[...] bool, whether points [..., 2] are in free space."""
-    free = is_enclosed(arena, points)
-    for polygon in arena.objects:
-        free &= ~polygon_contains(polygon, points)
-    return free
-
-
-def is_occupied(arena: Arena, centres: np.ndarray) -> np.ndarray:
-    """[...] bool, whether cells with these centres [..., 2] are in an object or outside the outer wall."""
-    return ~in_free_space(arena, centres)
-
-
-def has_clearance(arena: Arena, places: np.ndarray, radius: float) -> np.ndarray:
-    """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
-    room = segment_distance(wall_segments(arena), places).min(axis=-1)
-    return in_free_space(arena, places) & (room >= radius)
 
 
 def read_arena(path: File) -> Arena:
@@ -121,7 +115,7 @@ def read_arena(path: File) -> Arena:
             objects.append(polygon)
     x, y, heading = single["start"].values
     made = Arena(path.stem, outer, tuple(objects), np.array([x, y, np.radians(heading)]))
-    if not has_clearance(made, made.start[:2], START_CLEARANCE):
+    if not made.has_clearance(made.start[:2], START_CLEARANCE):
         found = f"a start at {x:g} {y:g} too close to a wall or object"
         expected = f"{START_CLEARANCE:g} m of free space around it"
         raise InputError(single["start"].places[1], found, expected)
@@ -341,5 +335,5 @@ def _draw_start(arena: Arena, room: float, random: np.random.Generator, tries: i
     low, high = arena.outer.min(axis=0), arena.outer.max(axis=0)
     places = random.uniform(low, high, (tries, 2))
     heading = random.uniform(-np.pi, np.pi)
-    there = np.flatnonzero(has_clearance(arena, places, room))
+    there = np.flatnonzero(arena.has_clearance(places, room))
     return None if not len(there) else np.array([*places[there[0]], heading])

@@ -1,12 +1,11 @@
 """Micromouse mazes with cells of 18 cm, random or from a text file.
 
-A cell is (column, row), counted from the south-west. A maze stores the walls between its cells; `walls`
+A cell is (column, row), counted from the south-west. A maze stores the walls between its cells; `wall_boxes`
 converts them to boxes. Text files have posts `o` or `+`, walls `---` and `|`.
 
-Routes through a maze as lists of cells: circuits around a loop, free exploration, a way through all cells.
-
-`CCCAAACACA` is the protocol of Salman & Pearson 2016: three circuits clockwise, three anticlockwise, then
-four in alternating directions.
+A route is a list of cells: circuits around a loop, free exploration, a way through all cells. `CCCAAACACA` is
+the protocol of Salman & Pearson 2016: three circuits clockwise, three anticlockwise, then four in alternating
+directions.
 """
 
 from __future__ import annotations
@@ -51,6 +50,32 @@ class Maze(NamedTuple):
     def rows(self) -> int:
         return self.along.shape[0]
 
+    def between_cells(self, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, int]]:
+        """The array and index of the wall between two neighbouring cells.
+
+        Raises:
+            ValueError: the cells are not neighbours.
+        """
+        (x, y), (u, v) = a, b
+        if abs(x - u) + abs(y - v) != 1:
+            raise ValueError(f"cells {a} and {b} are not neighbours")
+        return (self.along, (y, max(x, u))) if y == v else (self.across, (max(y, v), x))
+
+    def is_open(self, a: Cell, b: Cell) -> bool:
+        """Whether no wall separates two neighbouring cells."""
+        wall, place = self.between_cells(a, b)
+        return not wall[place]
+
+    def neighbours(self, cell: Cell) -> list[Cell]:
+        """Reachable neighbours of a cell, in the order east, north, west, south."""
+        x, y = cell
+        beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
+        return [b for b in beside if self.is_inside(b) and self.is_open(cell, b)]
+
+    def is_inside(self, cell: Cell) -> bool:
+        """Whether the maze has a cell."""
+        return 0 <= cell[0] < self.columns and 0 <= cell[1] < self.rows
+
 
 def closed_maze(columns: int, rows: int) -> Maze:
     """A maze with all walls."""
@@ -63,7 +88,7 @@ def random_maze(columns: int, rows: int, loop: list[Cell], share: float, random:
     maze.across[[0, -1]] = True
     maze.along[:, [0, -1]] = True
     for a, b in zip(loop, loop[1:] + loop[:1], strict=True):
-        wall, place = between_cells(maze, a, b)
+        wall, place = maze.between_cells(a, b)
         wall[place] = False
     return maze
 
@@ -76,13 +101,13 @@ def tree_maze(columns: int, rows: int, random: np.random.Generator) -> Maze:
     while way:
         column, row = way[-1]
         around = [(column + 1, row), (column, row + 1), (column - 1, row), (column, row - 1)]
-        onward = [cell for cell in around if is_inside(maze, cell) and cell not in seen]
+        onward = [cell for cell in around if maze.is_inside(cell) and cell not in seen]
         if not onward:
             way.pop()
             continue
         way.append(onward[int(random.integers(len(onward)))])
         seen.add(way[-1])
-        wall, place = between_cells(maze, *way[-2:])
+        wall, place = maze.between_cells(*way[-2:])
         wall[place] = False
     return maze
 
@@ -154,18 +179,6 @@ def _trace_outline(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
     return loop
 
 
-def between_cells(maze: Maze, a: Cell, b: Cell) -> tuple[np.ndarray, tuple[int, int]]:
-    """The array and index of the wall between two neighbouring cells.
-
-    Raises:
-        ValueError: the cells are not neighbours.
-    """
-    (x, y), (u, v) = a, b
-    if abs(x - u) + abs(y - v) != 1:
-        raise ValueError(f"cells {a} and {b} are not neighbours")
-    return (maze.along, (y, max(x, u))) if y == v else (maze.across, (max(y, v), x))
-
-
 def change_walls(
     maze: Maze, added: Sequence[tuple[Cell, Cell]], removed: Sequence[tuple[Cell, Cell]]
 ) -> Maze:
@@ -178,32 +191,14 @@ def change_walls(
     for name, pairs, there in (("added", added, False), ("removed", removed, True)):
         for number, (a, b) in enumerate(pairs):
             where, cells = f"simulation.maze.{name}[{number}]", f"cells {tuple(a)} and {tuple(b)}"
-            if not (is_inside(maze, a) and is_inside(maze, b)) or abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
+            if not (maze.is_inside(a) and maze.is_inside(b)) or abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
                 raise InputError(where, cells, "two neighbouring cells of the maze")
-            wall, place = between_cells(changed, a, b)
+            wall, place = changed.between_cells(a, b)
             if wall[place] != there:
                 found = f"{'no' if there else 'a'} wall between {cells}"
                 raise InputError(where, found, f"{'a' if there else 'no'} wall there")
             wall[place] = not there
     return changed
-
-
-def is_open(maze: Maze, a: Cell, b: Cell) -> bool:
-    """Whether no wall separates two neighbouring cells."""
-    wall, place = between_cells(maze, a, b)
-    return not wall[place]
-
-
-def neighbours(maze: Maze, cell: Cell) -> list[Cell]:
-    """Reachable neighbours of a cell, in the order east, north, west, south."""
-    x, y = cell
-    beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
-    return [b for b in beside if is_inside(maze, b) and is_open(maze, cell, b)]
-
-
-def is_inside(maze: Maze, cell: Cell) -> bool:
-    """Whether a maze has a cell."""
-    return 0 <= cell[0] < maze.columns and 0 <= cell[1] < maze.rows
 
 
 def cell_centre(cell: Cell) -> np.ndarray:
@@ -348,7 +343,7 @@ def exploration_route(
     way = [start]
     before: Cell | None = None
     while len(way) < cells:
-        options = [cell for cell in neighbours(maze, way[-1]) if not within or cell in within]
+        options = [cell for cell in maze.neighbours(way[-1]) if not within or cell in within]
         if not options:
             raise InputError("simulation.maze", f"cell {start} is walled in", "a way out of it")
         onward = [cell for cell in options if cell != before] or options
@@ -369,7 +364,7 @@ def winding_loop(columns: int, rows: int, random: np.random.Generator) -> list[C
         x, y = way[-1]
         right, up = 2 * (x % 2) - 1, 2 * (y % 2) - 1  # the side of its block on which the cell lies
         block = x // 2, y // 2
-        joined = neighbours(tree, block)
+        joined = tree.neighbours(block)
         beside = (x + right, y) if (block[0] + right, block[1]) in joined else (x, y - up)
         above = (x, y + up) if (block[0], block[1] + up) in joined else (x - right, y)
         way.append(above if way[-2:-1] == [beside] else beside)
@@ -401,14 +396,14 @@ def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.c
         InputError: the route is not possible; the error gives the step and the wall.
     """
     for number, cell in enumerate(way):
-        if not is_inside(maze, cell):
+        if not maze.is_inside(cell):
             expected = f"columns 0 to {maze.columns - 1} and rows 0 to {maze.rows - 1}"
             raise InputError(f"{where}[{number}]", f"cell {tuple(cell)}", expected)
     for number, (a, b) in enumerate(pairwise(way)):
         leg = f"{where}[{number}] to [{number + 1}]"
         if abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
             raise InputError(leg, f"from cell {tuple(a)} to {tuple(b)}", "a step to a neighbouring cell")
-        if not is_open(maze, a, b):
+        if not maze.is_open(a, b):
             found = f"a step through the wall between cells {tuple(a)} and {tuple(b)}"
             cure = "take the wall out of the maze or lead the path around it"
             raise InputError(leg, found, "a way around the walls", cure)

@@ -1,6 +1,6 @@
 """The scene of a head session from its settings: maze, route, head trajectory, kidnaps and walls.
 
-Poses of the head over time along a route, with random variation between visits.
+The trajectory is the poses of the head over time along a route, with random variation between visits.
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ def make_scene(
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
         path, jumps = add_kidnaps(path, when.tolist(), kidnaps.ahead)
     boxes = wall_boxes(maze, stream(maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
-    surroundings = check_surroundings(boxes, head, path)
+    surroundings = _check_surroundings(boxes, head, path)
     return Scene(maze, loop, path, duration, jumps, surroundings)
 
 
@@ -266,10 +266,10 @@ def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) 
     seed = maze_seed(config, seed)
     maze = _draw_walls(config, columns, rows, scene.loop, stream(seed, "later.walls"))
     boxes = wall_boxes(maze, stream(seed, "later.heights"), config.heights)
-    return check_surroundings(boxes, head, scene.path)
+    return _check_surroundings(boxes, head, scene.path)
 
 
-def check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings:
+def _check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings:
     """Walls for contact queries, after checking that no whisker at rest is inside a wall along the path.
 
     Raises:

@@ -32,8 +32,8 @@ from evaluation.cells.rate_map import (
     tuning_curves,
 )
 from evaluation.cells.recording import BinnedSums
-from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from tactile.base.errors import InputError
 
@@ -57,7 +57,7 @@ class Agreement(NamedTuple):
         return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
 
 
-def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
+def compare_scores(task: Task, seconds: float = SECONDS) -> list[Agreement]:
     """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps.
 
     Args:
@@ -133,9 +133,7 @@ def _numbers(values: Iterator[Any]) -> np.ndarray:
     return np.array([float(value) for value in values])
 
 
-FIGURE = CellFigure(
-    "Agreement with other packages", compare_scores, lambda result: list(agreement_table(result)), None
-)
+FIGURE = Figure("Agreement with other packages", compare_scores, agreement_table, None)
 
 
 HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}

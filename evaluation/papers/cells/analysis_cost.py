@@ -14,9 +14,10 @@ from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import shuffled_scores
-from evaluation.papers.cells.figure import CellFigure, Taken, median, on_one_core, time_call
+from evaluation.papers.cells.panels import Taken, median, on_one_core, time_call
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells
 from evaluation.papers.cells.shuffles import PLACE_SCORES, place_bins
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 
 CELLS, SHUFFLES, ROUNDS = 500, 100, 3
@@ -90,9 +91,9 @@ def analysis_table(result: AnalysisCost) -> Iterator[str]:
         yield markdown_row([name, *numbers, GOALS[name]])
 
 
-FIGURE = CellFigure(
+FIGURE = Figure(
     "What the analysis costs",
     lambda task: measure_analysis(task.sessions or CELLS, seed=task.first),
-    lambda result: list(analysis_table(result)),
+    analysis_table,
     None,
 )

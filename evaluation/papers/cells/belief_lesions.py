@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.papers.cells.figure import CellFigure, CellTask, head_panel, panel_grid, time_call
+from evaluation.papers.cells.panels import head_panel, panel_grid, time_call
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording
@@ -208,7 +209,7 @@ class LesionResult(NamedTuple):
 
 
 def measure_lesions(
-    task: CellTask, lesions: Sequence[str] = (*LESIONS, EXCHANGED), rows: Sequence[str] = ROWS
+    task: Task, lesions: Sequence[str] = (*LESIONS, EXCHANGED), rows: Sequence[str] = ROWS
 ) -> LesionResult:
     """The sessions of all lesions; those on Intel where it is at hand."""
     tasks = [
@@ -378,7 +379,7 @@ class SizeResult(NamedTuple):
 
 
 def measure_sizes(
-    task: CellTask,
+    task: Task,
     row: str = "exploration",
     sides: Sequence[int] = SIDES,
     sizes: Sequence[float] = SIZES,
@@ -501,7 +502,5 @@ def draw_sizes(result: SizeResult, png: Path) -> None:
     figure.savefig(png)
 
 
-FIGURES = {
-    "lesions": CellFigure("Lesions of the belief network", measure_lesions, table_lesions, draw_lesions),
-    "scale": CellFigure("Numbers and sizes of cells", measure_sizes, table_sizes, draw_sizes),
-}
+LESIONS_FIGURE = Figure("Lesions of the belief network", measure_lesions, table_lesions, draw_lesions)
+SCALE_FIGURE = Figure("Numbers and sizes of cells", measure_sizes, table_sizes, draw_sizes)

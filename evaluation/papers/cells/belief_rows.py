@@ -35,7 +35,8 @@ from evaluation.papers.cells.belief_world import (
     room_closures,
     see,
 )
-from evaluation.papers.cells.figure import CellFigure, CellTask, head_panel, panel_grid
+from evaluation.papers.cells.panels import head_panel, panel_grid
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
@@ -92,7 +93,7 @@ class PosteriorResult(NamedTuple):
     control: tuple[float, ...]
 
 
-def measure_posterior(task: CellTask, updates: int = UPDATES) -> PosteriorResult:
+def measure_posterior(task: Task, updates: int = UPDATES) -> PosteriorResult:
     """The scores of the network, of its references and of the control."""
     seeds = task.seeds(8)
     worlds = [random_world(seed, updates) for seed in seeds]
@@ -274,7 +275,7 @@ def alike_rooms(seed: int) -> World:
     return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
 
 
-def measure_rooms(task: CellTask, sessions: int = 3) -> RoomsResult:
+def measure_rooms(task: Task, sessions: int = 3) -> RoomsResult:
     """The probabilities of the two rooms, and closures of so many sessions of the whole product."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {}
     for seed in task.seeds(20):
@@ -390,7 +391,7 @@ def kidnap_world(seed: int) -> World:
     return World(poses, pace(np.ones(len(truth))), likelihood, novelty, truth, start)
 
 
-def measure_kidnaps(task: CellTask) -> KidnapResult:
+def measure_kidnaps(task: Task) -> KidnapResult:
     """Kidnaps of the network, of exact inference, and of both controls."""
     found: dict[str, list[tuple[float, np.ndarray]]] = {}
     for seed in task.seeds(40):
@@ -502,7 +503,7 @@ def conflict_world(seed: int, reliable: Sequence[float], sure: bool, angle: floa
     return World(poses, still, likelihood, np.ones(LONG), np.zeros(LONG, int), start)
 
 
-def measure_conflicts(task: CellTask) -> ConflictResult:
+def measure_conflicts(task: Task) -> ConflictResult:
     """Weights of the cues in all cases and at all angles; seeds turn the headings against the cells."""
     found: dict[tuple[str, int, str], list[np.ndarray]] = {}
     for (case, (reliable, sure)), angle, seed in product(CASES.items(), ANGLES, task.seeds(4)):
@@ -558,13 +559,9 @@ def draw_conflicts(result: ConflictResult, png: Path) -> None:
     figure.savefig(png)
 
 
-FIGURES = {
-    "posterior": CellFigure(
-        "Belief: score against exact inference", measure_posterior, table_posterior, draw_posterior
-    ),
-    "alike_rooms": CellFigure("Belief: two rooms that look alike", measure_rooms, table_rooms, draw_rooms),
-    "kidnap": CellFigure("Belief: kidnap", measure_kidnaps, table_kidnaps, draw_kidnaps),
-    "cue_conflict": CellFigure(
-        "Belief: cues in conflict", measure_conflicts, table_conflicts, draw_conflicts
-    ),
-}
+POSTERIOR_FIGURE = Figure(
+    "Belief: score against exact inference", measure_posterior, table_posterior, draw_posterior
+)
+ROOMS_FIGURE = Figure("Belief: two rooms that look alike", measure_rooms, table_rooms, draw_rooms)
+KIDNAP_FIGURE = Figure("Belief: kidnap", measure_kidnaps, table_kidnaps, draw_kidnaps)
+CONFLICT_FIGURE = Figure("Belief: cues in conflict", measure_conflicts, table_conflicts, draw_conflicts)

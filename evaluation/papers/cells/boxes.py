@@ -18,8 +18,8 @@ from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -177,7 +177,7 @@ class BoxResult(NamedTuple):
     torus: float
 
 
-def measure_boxes(task: CellTask, seconds: float = SECONDS, columns: int = COLUMNS) -> BoxResult:
+def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) -> BoxResult:
     """The fits of all sessions.
 
     Args:
@@ -320,7 +320,7 @@ def _range(fits: list[MapFit], field: str) -> str:
     return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
 
-FIGURE = CellFigure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
+FIGURE = Figure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
 
 
 SHOWN = 7

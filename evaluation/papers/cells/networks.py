@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from evaluation.papers.cells.figure import CellFigure, Taken, on_one_core, time_call
+from evaluation.papers.cells.panels import Taken, on_one_core, time_call
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.cell_study import cell_study, score_task, tasks_of
 from evaluation.studies.machine import peak_memory, reset_peak_memory
@@ -73,9 +74,9 @@ def network_table(result: NetworkCost) -> Iterator[str]:
         yield markdown_row([*row, f"{result.memory[name]:.0f}"])
 
 
-FIGURE = CellFigure(
+FIGURE = Figure(
     "Many networks",
     lambda task: measure_networks(task.sessions or MEASURED),
-    lambda result: list(network_table(result)),
+    network_table,
     None,
 )

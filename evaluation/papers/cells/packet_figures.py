@@ -19,9 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.papers.cells.figure import (
-    CellFigure,
-    CellTask,
+from evaluation.papers.cells.panels import (
     error_size,
     head_panel,
     panel_grid,
@@ -30,6 +28,7 @@ from evaluation.papers.cells.figure import (
     torus_error,
 )
 from evaluation.papers.cells.rat_sessions import RatRun, RatSessions, rat_config, rat_source, slice_start
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
@@ -91,7 +90,7 @@ class DriftResult(NamedTuple):
     added: np.ndarray
 
 
-def measure_drift(task: CellTask, times: tuple[int, ...] = TIMES) -> DriftResult:
+def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> DriftResult:
     """The errors of all seeds after the given times, s."""
     prepare_precision("float64")
     found = [_errors_of(seed, times) for seed in task.seeds(USUAL)]
@@ -214,7 +213,7 @@ def _odometry(study: StudyCourse) -> np.ndarray:
     return np.array(poses)
 
 
-DRIFT = CellFigure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
+DRIFT = Figure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
 
 
 """Steps and views per second."""
@@ -262,7 +261,7 @@ class AnchoringResult(NamedTuple):
         return np.median(self.error[path, test][:, rows].reshape(-1, 2), axis=0)
 
 
-def measure_anchoring(task: CellTask, schedule: Schedule | None = None) -> AnchoringResult:
+def measure_anchoring(task: Task, schedule: Schedule | None = None) -> AnchoringResult:
     """The errors of all paths, tests and seeds."""
     schedule = schedule or Schedule()
     sessions = RatSessions(
@@ -392,5 +391,4 @@ def _shuffled(source: Source, schedule: Schedule, seed: int) -> Source:
     return replace(log, views=views)
 
 
-ANCHORING = CellFigure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)
-FIGURES = {"drift": DRIFT, "anchoring": ANCHORING}
+ANCHORING = Figure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)

@@ -18,16 +18,9 @@ from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.figure import (
-    CellFigure,
-    CellTask,
-    head_panel,
-    panel_grid,
-    shortest,
-    spread_dots,
-    torus_error,
-)
+from evaluation.papers.cells.panels import head_panel, panel_grid, shortest, spread_dots, torus_error
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from tactile.base.se2 import wrap
@@ -124,7 +117,7 @@ class RotationResult(NamedTuple):
         return np.degrees([[getattr(each, kind) for each in seeds] for seeds in self.found])
 
 
-def measure_rotation(task: CellTask, schedule: Schedule | None = None) -> RotationResult:
+def measure_rotation(task: Task, schedule: Schedule | None = None) -> RotationResult:
     """The rotations of all conditions and seeds."""
     schedule = schedule or Schedule()
     sessions = RatSessions(
@@ -278,4 +271,4 @@ def _preferred_turn(recording: CellRecording, before: np.ndarray, late: np.ndarr
     return complex(np.exp(1j * (directions[1] - directions[0])[active]).mean())
 
 
-FIGURE = CellFigure("How far cue rotation is followed", measure_rotation, table_rotation, draw_rotation)
+FIGURE = Figure("How far cue rotation is followed", measure_rotation, table_rotation, draw_rotation)

@@ -27,8 +27,8 @@ from evaluation.cells.rate_map import (
 )
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
-from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat, with_active_cells
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.executor import run_tasks
 
@@ -71,7 +71,7 @@ class _Task(NamedTuple):
 
 
 def check_shuffles(
-    task: CellTask, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
+    task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
 ) -> ShuffleCheck:
     """Compares cells of a session with their shuffles, for every score and path.
 
@@ -129,7 +129,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-FIGURE = CellFigure("Shuffled controls", check_shuffles, lambda result: list(shuffle_table(result)), None)
+FIGURE = Figure("Shuffled controls", check_shuffles, shuffle_table, None)
 
 
 SMOOTHING = 1.5

@@ -29,8 +29,8 @@ from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
 from evaluation.papers.cells.boxes import choose_columns, one_of_each, sum_columns
-from evaluation.papers.cells.figure import CellFigure, CellTask
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -82,7 +82,7 @@ class TorusResult(NamedTuple):
 
 
 def measure_torus(
-    task: CellTask, seconds: tuple[float, float] = SECONDS, columns: int = COLUMNS, shuffles: int = SHUFFLES
+    task: Task, seconds: tuple[float, float] = SECONDS, columns: int = COLUMNS, shuffles: int = SHUFFLES
 ) -> TorusResult:
     """The figures of a session in each box; the path is that of the first seed.
 
@@ -230,7 +230,7 @@ def _counts(fields: np.ndarray) -> str:
     return ", ".join(f"{number}: {count} cells" for number, count in zip(numbers, cells, strict=True))
 
 
-FIGURE = CellFigure("A torus cell in boxes of two sizes", measure_torus, table_torus, draw_result)
+FIGURE = Figure("A torus cell in boxes of two sizes", measure_torus, table_torus, draw_result)
 
 
 SHOWN = 4

@@ -16,19 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, is_within, known_steps
 from evaluation.papers.maps.localising import Judged, judge
-from evaluation.papers.maps.row import (
-    Line,
-    Localised,
-    MapRow,
-    MapTask,
-    Panel,
-    count,
-    draw_panels,
-    median,
-    spread,
-)
+from evaluation.papers.maps.operations import Localised, MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, count, draw_panels, median, spread, table_line
 from evaluation.papers.maps.scenarios import draw_seed
 from evaluation.papers.tables.comparison import Record
 from evaluation.papers.trial_sessions import simulate_session
@@ -70,22 +62,40 @@ class ArenaFigures(NamedTuple):
     best: tuple[bool, bool]
     reckoned: np.ndarray
 
+    def record(self) -> Record:
+        """The figures of an unknown start by name; errors in m."""
+        return {
+            "missed_soon": self.session.whisks > SOON,
+            "missed": self.session.whisks > REPORTS,
+            "sure_and_wrong": bool(self.session.wrong.any()),
+            "reports": self.session.whisks,
+            "error": median(self.session.error[self.session.found, 0]),
+            "odometry_error": median(self.reckoned),
+            "best_wrong_soon": not self.best[0],
+            "best_wrong": not self.best[1],
+            "denied": bool(self.session.foreign[-1]),
+            "found_elsewhere_soon": bool(self.other[:SOON].any()),
+            "found_elsewhere": bool(self.other.any()),
+            "not_said": not self.foreign,
+            "shuffled_sure_and_wrong": bool(self.shuffled.wrong.any()),
+        }
 
-def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
+
+def _measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     """One unknown start in the map of an arena."""
-    made, drive = store_arena_map(task.seed, side, task.folder), drive_elsewhere(task.seed, side)
-    saved = read_map(made.path)
+    (path, steps), drive = store_arena_map(task.seed, side, task.folder), _drive_elsewhere(task.seed, side)
+    saved = read_map(path)
     session = build_session(localising(saved.config, saved), saved.source)
     known = _localise(session, drive)
     mixed = _localise(session, shuffled_contacts(drive, task.seed))
-    other = _localise(session, drive_elsewhere(task.seed + 1, side))
-    judged = judge(made.steps, known, drive.truth)
+    other = _localise(session, _drive_elsewhere(task.seed + 1, side))
+    judged = judge(steps, known, drive.truth)
     right = is_within(judged.error, RIGHT)
     reckoned = integrate(drive.motion, drive.truth[0]) - drive.truth
     return ArenaFigures(
         arena=task.seed,
         session=judged,
-        shuffled=judge(made.steps, mixed, drive.truth),
+        shuffled=judge(steps, mixed, drive.truth),
         other=other.found,
         foreign=bool(other.foreign[-1]),
         best=(bool(right[SOON - 1]), bool(right[-1])),
@@ -93,45 +103,29 @@ def measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     )
 
 
-def arena_record(one: ArenaFigures) -> Record:
-    """The figures of an unknown start by name; errors in m."""
-    return {
-        "missed_soon": one.session.whisks > SOON,
-        "missed": one.session.whisks > REPORTS,
-        "sure_and_wrong": bool(one.session.wrong.any()),
-        "reports": one.session.whisks,
-        "error": median(one.session.error[one.session.found, 0]),
-        "odometry_error": median(one.reckoned),
-        "best_wrong_soon": not one.best[0],
-        "best_wrong": not one.best[1],
-        "denied": bool(one.session.foreign[-1]),
-        "found_elsewhere_soon": bool(one.other[:SOON].any()),
-        "found_elsewhere": bool(one.other.any()),
-        "not_said": not one.foreign,
-        "shuffled_sure_and_wrong": bool(one.shuffled.wrong.any()),
-    }
-
-
-def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
+def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
     """The lines of unknown starts."""
+    yield HEADER
     n = len(found)
     reports = np.array([one.session.whisks for one in found])
     mixed = np.array([one.shuffled.whisks for one in found])
     for within in (SOON, REPORTS):
         goal = f"{int(np.ceil(0.95 * n))} of {n}" if within == SOON else "-"
         control = f"{count(mixed <= within)} with shuffled contacts"
-        yield Line(f"found and right within {within} reports", goal, count(reports <= within), control)
+        yield table_line(f"found and right within {within} reports", goal, count(reports <= within), control)
     median = f"{np.median(reports):.0f} ({reports.max():.0f})"
-    yield Line("reports until then, median (worst)", "-", median, "-")
+    yield table_line("reports until then, median (worst)", "-", median, "-")
     for k, within in enumerate((SOON, REPORTS)):
         right = count([one.best[k] for one in found])
-        yield Line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
-    wrong, control = (count([bool(one.wrong.any()) for one in each]) for each in _both(found))
-    yield Line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
+        yield table_line(f"most likely pose right after {within} reports, believed or not", "-", right, "-")
+    wrong, control = (
+        count([bool(getattr(one, name).wrong.any()) for one in found]) for name in ("session", "shuffled")
+    )
+    yield table_line("sure and wrong (> 0.18 m or 30 degrees)", f"0 of {n}", wrong, f"{control} shuffled")
     for within in (SOON, REPORTS):
         other = count([bool(one.other[:within].any()) for one in found])
-        yield Line(f"found in another arena within {within} reports", f"0 of {n}", other, "-")
-    yield Line(
+        yield table_line(f"found in another arena within {within} reports", f"0 of {n}", other, "-")
+    yield table_line(
         f"says after {REPORTS} reports that this is not the map",
         "-",
         f"{count([one.foreign for one in found])} in another arena",
@@ -139,7 +133,7 @@ def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
     )
     errors = [np.median(one.session.error[one.session.found, 0]) for one in found if one.session.found.any()]
     reckoned = spread([float(np.median(one.reckoned)) for one in found], 3)
-    yield Line(
+    yield table_line(
         "error while found, m, median of sessions (worst)",
         "-",
         spread(errors, 3),
@@ -147,7 +141,7 @@ def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[Line]:
     )
 
 
-def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
+def _draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
     """Draws the error of all sessions over the reports."""
     curves = {"sessions": [np.where(one.session.found, one.session.error[:, 0], np.nan) for one in found]}
     limits = {"right": RIGHT.distance, "wrong": WRONG.distance}
@@ -156,10 +150,6 @@ def draw_arenas(found: Sequence[ArenaFigures], png: Path) -> None:
     other = count([bool(one.other.any()) for one in found])
     line = f"Unknown start: found and right in {known}; found in another arena: {other}."
     draw_panels(png, "Waking up in a known arena", line, None, panel)
-
-
-def _both(found: Sequence[ArenaFigures]) -> tuple[list[Judged], list[Judged]]:
-    return [one.session for one in found], [one.shuffled for one in found]
 
 
 def _localise(session: Session, drive: ArenaDrive) -> Localised:
@@ -172,16 +162,9 @@ def _localise(session: Session, drive: ArenaDrive) -> Localised:
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
-GRID = MapRow(
-    "Localise in a grid map from an unknown start", 20, measure_arena, arena_record, arena_lines, draw_arenas
-)
-GRID_LARGE = MapRow(
-    "The same in arenas of 2.5 m",
-    6,
-    partial(measure_arena, side=LARGE),
-    arena_record,
-    arena_lines,
-    draw_arenas,
+GRID = Figure("Localise in a grid map from an unknown start", _measure_arena, arena_lines, _draw_arenas, 20)
+GRID_LARGE = Figure(
+    "The same in arenas of 2.5 m", partial(_measure_arena, side=LARGE), arena_lines, _draw_arenas, 6
 )
 
 
@@ -199,14 +182,7 @@ class ArenaDrive(NamedTuple):
     motion: np.ndarray
 
 
-class ArenaMap(NamedTuple):
-    """A grid map on the disk, and its steps."""
-
-    path: Path
-    steps: MapSteps
-
-
-def arena_config(arena: int, side: float, seed: int) -> RunConfig:
+def _arena_config(arena: int, side: float, seed: int) -> RunConfig:
     """The configuration of a session in an arena.
 
     Args:
@@ -224,9 +200,9 @@ def arena_config(arena: int, side: float, seed: int) -> RunConfig:
     )
 
 
-def drive_elsewhere(arena: int, side: float) -> ArenaDrive:
+def _drive_elsewhere(arena: int, side: float) -> ArenaDrive:
     """A further session in an arena, from another start."""
-    config = arena_config(arena, side, draw_seed(arena, "arena start"))
+    config = _arena_config(arena, side, draw_seed(arena, "arena start"))
     assert config.create_simulation is not None
     session = simulate_session(config.create_simulation)
     touch = complete(config, session.source).touch
@@ -246,13 +222,13 @@ def shuffled_contacts(drive: ArenaDrive, seed: int) -> ArenaDrive:
     return drive._replace(observations=mixed)
 
 
-def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
-    """The map of an arena; made and written to `folder` unless the same code has done that."""
+def store_arena_map(arena: int, side: float, folder: Path) -> tuple[Path, MapSteps]:
+    """The file of the map of an arena, and its steps; made in `folder` unless the same code has done that."""
     path = folder / f"arena_{arena}_{side:g}-{code_digest()}.npz"
     beside = path.with_suffix(".steps.npz")
     if not (path.exists() and beside.exists()):
         folder.mkdir(parents=True, exist_ok=True)
-        with open_observations(arena_config(arena, side, arena)) as (config, source):
+        with open_observations(_arena_config(arena, side, arena)) as (config, source):
             samples = list(source)
             session = build_session(config, source)
             for _ in session.replay(observation_of(sample) for sample in samples):
@@ -263,4 +239,4 @@ def store_arena_map(arena: int, side: float, folder: Path) -> ArenaMap:
         np.savez(unfinished, trajectory=session.map.trajectory(), truth=truth)
         unfinished.replace(beside)
     with np.load(beside) as saved:
-        return ArenaMap(path, known_steps(saved["trajectory"], saved["truth"]))
+        return path, known_steps(saved["trajectory"], saved["truth"])

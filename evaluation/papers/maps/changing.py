@@ -1,6 +1,7 @@
-"""Rows: a wall that was moved, a door that was closed.
+"""Figures: a wall that was moved, a door that was closed, and a robot that was carried away or kidnapped.
 
-Rows: a robot that is carried away between two sessions, or kidnapped within one.
+A robot is carried away between two sessions, of which the second continues the map of the first, and
+kidnapped within one session.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.run_metrics import unjoined_share
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import true_places
 from evaluation.papers.maps.localising import Judged, judge
 from evaluation.papers.maps.merged_maps import Join, judge_join, shown_paths
-from evaluation.papers.maps.row import Line, MapRow, MapTask, Panel, PathPanel, count, draw_panels, spread
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, PathPanel, count, draw_panels, spread, table_line
 from evaluation.papers.maps.scenarios import (
     LOCALISED,
     REENTERED,
@@ -38,7 +41,7 @@ from evaluation.papers.trial_sessions import apply_control
 from robot.world.maze import CELL_SIDE
 
 
-class ChangeFigures(NamedTuple):
+class _ChangeFigures(NamedTuple):
     """One changed maze.
 
     Attributes:
@@ -62,15 +65,27 @@ class ChangeFigures(NamedTuple):
         """Whether the surest place is within a cell of a true one."""
         return bool(len(self.distance)) and bool(self.distance[0] <= CELL_SIDE)
 
+    def record(self) -> Record:
+        """The figures of a changed maze by name."""
+        return {
+            "missed": self.after.whisks > LOCALISED,
+            "sure_and_wrong": bool(self.after.wrong.any()),
+            "missed_before": self.before.whisks > LOCALISED,
+            "sure_and_wrong_before": bool(self.before.wrong.any()),
+            "not_named": not self.is_named,
+            "far_places": int((self.distance > CELL_SIDE).sum()),
+            "false_alarm": self.unchanged > 0,
+        }
 
-def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigures:
+
+def _measure_change(change: Callable[[int], Change], task: MapTask) -> _ChangeFigures:
     """One changed maze in the map of ten circuits."""
     made, scenario = task.map_of(ten_circuits(task.seed)), change(task.seed)
     before, after = record(unknown_start(task.seed)), record(scenario.after)
     again = record(Recipe(same_maze(task.seed, 1).config, 0, after.log.length))
     steps, methods = made.arrays.steps, task.methods
     named = true_places(steps, methods.changes(made, after).reshape(-1, 2))
-    return ChangeFigures(
+    return _ChangeFigures(
         seed=task.seed,
         before=judge(steps, methods.localise(made, before), before.truth),
         after=judge(steps, methods.localise(made, after), after.truth),
@@ -82,45 +97,33 @@ def measure_change(change: Callable[[int], Change], task: MapTask) -> ChangeFigu
     )
 
 
-def change_record(one: ChangeFigures) -> Record:
-    """The figures of a changed maze by name."""
-    return {
-        "missed": one.after.whisks > LOCALISED,
-        "sure_and_wrong": bool(one.after.wrong.any()),
-        "missed_before": one.before.whisks > LOCALISED,
-        "sure_and_wrong_before": bool(one.before.wrong.any()),
-        "not_named": not one.is_named,
-        "far_places": int((one.distance > CELL_SIDE).sum()),
-        "false_alarm": one.unchanged > 0,
-    }
-
-
-def change_lines(found: Sequence[ChangeFigures]) -> Iterator[Line]:
+def _change_lines(found: Sequence[_ChangeFigures]) -> Iterator[str]:
     """The lines of changed mazes."""
+    yield HEADER
     n = len(found)
     before, after = (
         [getattr(one, name).whisks <= LOCALISED for one in found] for name in ("before", "after")
     )
-    yield Line(
+    yield table_line(
         f"found and right within {LOCALISED} whisks after the change",
         f"{int(np.ceil(0.9 * n))} of {n}",
         count(after),
         f"{count(before)} before it",
     )
-    yield Line(
+    yield table_line(
         "sure and wrong at some whisk after the change",
         "-",
         count([bool(one.after.wrong.any()) for one in found]),
         f"{count([bool(one.before.wrong.any()) for one in found])} before it",
     )
-    yield Line(
+    yield table_line(
         "surest place named within a cell of the change",
         f"{int(np.ceil(0.8 * n))} of {n}",
         count([one.is_named for one in found]),
         f"{count([one.unchanged > 0 for one in found])} name a place in an unchanged maze",
     )
     farther = [float((one.distance > CELL_SIDE).sum()) for one in found]
-    yield Line(
+    yield table_line(
         "places named farther away, median (worst)",
         "-",
         spread(farther, 0),
@@ -128,7 +131,7 @@ def change_lines(found: Sequence[ChangeFigures]) -> Iterator[Line]:
     )
 
 
-def draw_change(title: str, found: Sequence[ChangeFigures], png: Path) -> None:
+def _draw_change(title: str, found: Sequence[_ChangeFigures], png: Path) -> None:
     """Draws one changed maze with the places named, and their distances in all."""
     one = found[0]
     paths = PathPanel(
@@ -147,21 +150,19 @@ def draw_change(title: str, found: Sequence[ChangeFigures], png: Path) -> None:
     draw_panels(png, title, line, paths, panel)
 
 
-WALL = MapRow(
+WALL = Figure(
     "A wall moved",
+    partial(_measure_change, moved_wall),
+    _change_lines,
+    partial(_draw_change, "A wall moved"),
     10,
-    partial(measure_change, moved_wall),
-    change_record,
-    change_lines,
-    partial(draw_change, "A wall moved"),
 )
-DOOR = MapRow(
+DOOR = Figure(
     "A door closed",
+    partial(_measure_change, closed_door),
+    _change_lines,
+    partial(_draw_change, "A door closed"),
     10,
-    partial(measure_change, closed_door),
-    change_record,
-    change_lines,
-    partial(draw_change, "A door closed"),
 )
 
 
@@ -169,7 +170,7 @@ ENERGY = 0.15
 """Goal of the Energy Metric within pieces, m^2 + rad^2."""
 
 
-class CarriedFigures(NamedTuple):
+class _CarriedFigures(NamedTuple):
     """One map, continued in its known part and in an unknown part.
 
     Attributes:
@@ -184,8 +185,18 @@ class CarriedFigures(NamedTuple):
     shuffled: Join
     paths: tuple[np.ndarray, np.ndarray]
 
+    def record(self) -> Record:
+        """The figures of a carried robot by name; the error in m, where it was tied on."""
+        return {
+            "not_tied": not self.known.right,
+            "wrong_tie": self.known.wrong or self.unknown.wrong,
+            "tied_unknown": int(self.unknown.joined),  # no failure where it is right
+            "error": float(self.known.error[0]) if self.known.joined else np.nan,
+            "shuffled_tied": self.shuffled.joined,
+        }
 
-class KidnapFigures(NamedTuple):
+
+class _KidnapFigures(NamedTuple):
     """One session with kidnaps.
 
     Attributes:
@@ -198,8 +209,18 @@ class KidnapFigures(NamedTuple):
     over_all: float
     unjoined: float
 
+    def record(self) -> Record:
+        """The figures of a kidnapped robot by name; Energy Metrics in m^2 + rad^2."""
+        return {
+            "above_goal": self.within > ENERGY,
+            "em_within_pieces": self.within,
+            "em": self.over_all,
+            "unjoined": self.unjoined,
+            "pieces": self.pieces,
+        }
 
-def measure_carried(task: MapTask) -> CarriedFigures:
+
+def _measure_carried(task: MapTask) -> _CarriedFigures:
     """Continues one map three times."""
     scenario = carried_sessions(task.seed)
     made = task.map_of(scenario.first)
@@ -210,7 +231,7 @@ def measure_carried(task: MapTask) -> CarriedFigures:
     def extend(recorded: Recorded, entry: int) -> Join:
         return judge_join(task.methods.extend(made, recorded), earlier, entry)
 
-    return CarriedFigures(
+    return _CarriedFigures(
         task.seed,
         extend(known, scenario.entry),
         extend(unknown, 0),
@@ -219,79 +240,59 @@ def measure_carried(task: MapTask) -> CarriedFigures:
     )
 
 
-def measure_kidnaps(task: MapTask) -> KidnapFigures:
+def _measure_kidnaps(task: MapTask) -> _KidnapFigures:
     """Maps a session with kidnaps."""
     arrays = task.map_of(kidnapped(task.seed)).arrays
-    return KidnapFigures(
+    return _KidnapFigures(
         len(np.unique(arrays.piece)), arrays.em_within_pieces, arrays.em, unjoined_share(arrays.piece)
     )
 
 
-def carried_record(one: CarriedFigures) -> Record:
-    """The figures of a carried robot by name; the error in m, where it was tied on."""
-    return {
-        "not_tied": not one.known.right,
-        "wrong_tie": one.known.wrong or one.unknown.wrong,
-        "tied_unknown": int(one.unknown.joined),  # no failure where it is right
-        "error": float(one.known.error[0]) if one.known.joined else np.nan,
-        "shuffled_tied": one.shuffled.joined,
-    }
-
-
-def kidnap_record(one: KidnapFigures) -> Record:
-    """The figures of a kidnapped robot by name; Energy Metrics in m^2 + rad^2."""
-    return {
-        "above_goal": one.within > ENERGY,
-        "em_within_pieces": one.within,
-        "em": one.over_all,
-        "unjoined": one.unjoined,
-        "pieces": one.pieces,
-    }
-
-
-def carried_lines(found: Sequence[CarriedFigures]) -> Iterator[Line]:
+def _carried_lines(found: Sequence[_CarriedFigures]) -> Iterator[str]:
     """The lines of carried robots."""
+    yield HEADER
     n = len(found)
-    yield Line(
+    yield table_line(
         f"tied on rightly after {REENTERED} whisks in the known part",
         f"{int(np.ceil(0.9 * n))} of {n}",
         count([one.known.right for one in found]),
         f"{count([one.shuffled.right for one in found])} with shuffled images",
     )
     wrong = [one.known.wrong for one in found] + [one.unknown.wrong for one in found]
-    yield Line(
+    yield table_line(
         "wrong ties, known and unknown part",
         f"0 of {2 * n}",
         count(wrong),
         f"{count([one.shuffled.wrong for one in found])} with shuffled images",
     )
-    yield Line(
+    yield table_line(
         "ties in the unknown part, never re-entered", "-", count([one.unknown.joined for one in found]), "-"
     )
     errors = [one.known.error[0] for one in found if one.known.joined]
-    yield Line("error of tied sessions, m, median (worst)", "-", spread(errors, 3), "-")
+    yield table_line("error of tied sessions, m, median (worst)", "-", spread(errors, 3), "-")
 
 
-def kidnap_lines(found: Sequence[KidnapFigures]) -> Iterator[Line]:
+def _kidnap_lines(found: Sequence[_KidnapFigures]) -> Iterator[str]:
     """The lines of kidnapped robots."""
+    yield HEADER
     n = len(found)
-    yield Line(
+    yield table_line(
         f"EM within pieces up to {ENERGY}",
         f"{int(np.ceil(10 / 12 * n))} of {n}",
         count([one.within <= ENERGY for one in found]),
         f"{count([one.over_all <= ENERGY for one in found])} over all pairs",
     )
-    yield Line(
+    yield table_line(
         "EM within pieces, median (worst)",
         "-",
         spread([one.within for one in found], 3),
         f"{spread([one.over_all for one in found])} over all pairs",
     )
-    yield Line("share outside the largest piece", "-", spread([one.unjoined for one in found]), "-")
-    yield Line("pieces", "-", spread([one.pieces for one in found], 0), "-")
+    yield table_line("share outside the largest piece", "-", spread([one.unjoined for one in found]), "-")
+    yield table_line("pieces", "-", spread([one.pieces for one in found], 0), "-")
 
 
-def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
+def _draw_carried(found: Sequence[_CarriedFigures], png: Path) -> None:
     """Draws one session that was carried and, if there is one, tied on, and the errors of all."""
     one = next((each for each in found if each.known.joined), found[0])
     paths = PathPanel(
@@ -310,7 +311,7 @@ def draw_carried(found: Sequence[CarriedFigures], png: Path) -> None:
     draw_panels(png, "Carried away, and continued", line, paths, panel)
 
 
-def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
+def _draw_kidnaps(found: Sequence[_KidnapFigures], png: Path) -> None:
     """Draws the errors of all sessions."""
     dots = {"within pieces": [one.within for one in found], "over all pairs": [one.over_all for one in found]}
     panel = Panel("Energy Metric, m² + rad²", "pairs of steps", dots=dots, limits={"goal": ENERGY})
@@ -319,7 +320,5 @@ def draw_kidnaps(found: Sequence[KidnapFigures], png: Path) -> None:
     draw_panels(png, "Eight kidnaps in ten circuits", line, None, panel)
 
 
-CARRIED = MapRow(
-    "Continue after being carried", 20, measure_carried, carried_record, carried_lines, draw_carried
-)
-KIDNAPS_ROW = MapRow("Eight kidnaps", 12, measure_kidnaps, kidnap_record, kidnap_lines, draw_kidnaps)
+CARRIED = Figure("Continue after being carried", _measure_carried, _carried_lines, _draw_carried, 20)
+KIDNAPS_ROW = Figure("Eight kidnaps", _measure_kidnaps, _kidnap_lines, _draw_kidnaps, 12)

@@ -1,14 +1,10 @@
-"""Row: an emulated arm drives to goals on a map, and finds a wall in its way.
-
-Drives an emulated arm to goals on a map made in replay, in closed loop and in virtual time.
+"""Figure: an emulated arm drives to goals on a map made in replay, in closed loop and in virtual time.
 
 Each goal is an experience drawn at random at most 1 m away along driven cells; a drive starts where the one
 before ended. In further drives a wall is put across the way.
 
-An emulated arm with its whisker head in virtual time: whisks as fast as they are computed.
-
 The arm is the emulator's, each move is checked and planned as for a real one, and the head gives contact
-features (`robot.simulation.head.kinematic`). No sockets, processes or clocks.
+features (`robot.simulation.head.kinematic`): no sockets, processes or clocks.
 """
 
 from __future__ import annotations
@@ -20,17 +16,18 @@ from typing import NamedTuple
 import networkx
 import numpy as np
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, localisation_errors, true_places
-from evaluation.papers.maps.row import (
-    Line,
-    MapRow,
-    MapTask,
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import (
+    HEADER,
     Panel,
     PathPanel,
     count,
     draw_panels,
     median,
     spread,
+    table_line,
 )
 from evaluation.papers.maps.scenarios import Recipe, open_world, ten_circuits
 from evaluation.papers.maps.stored_maps import StoredMap
@@ -52,7 +49,7 @@ from robot.live.live_config import GoalConfig, LiveConfig
 from robot.live.live_rig import ArmOdometry
 from robot.simulation.head.kinematic import HeadSetup, simulate_kinematic
 from robot.sources.source import Sample
-from robot.world.maze import Cell, Maze, between_cells, cell_centre, wall_boxes
+from robot.world.maze import Cell, Maze, cell_centre, wall_boxes
 from robot.world.scene import HeadPath, Scene, make_scene, maze_seed
 from robot.world.walls import Surroundings, Walls
 from tactile.base.random_streams import stream
@@ -186,7 +183,7 @@ class Drive(NamedTuple):
         return self.state is DriveState.REACHED
 
 
-class DrivenMap(NamedTuple):
+class _DrivenMap(NamedTuple):
     """A map with the world in which it was made.
 
     Attributes:
@@ -203,29 +200,26 @@ class DrivenMap(NamedTuple):
         return self.stored.arrays.truth[-1]
 
 
-def driven_map(recipe: Recipe, stored: StoredMap) -> DrivenMap:
+def driven_map(recipe: Recipe, stored: StoredMap) -> _DrivenMap:
     """The map of a session in a simulated maze."""
     plan = recipe.config.simulation
     assert plan is not None
     head = ur10_head(recipe.config.touch.head)
     scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
-    return DrivenMap(recipe.config, scene, stored)
-
-
-def live_config(config: RunConfig) -> LiveConfig:
-    """The arm's session in the world of a simulated one, with its odometry errors."""
-    plan = config.simulation
-    assert plan is not None
-    settings = {"plan": plan.model_dump(), "noise": plan.odometry.model_dump(), "seed": plan.seed}
-    return LiveConfig.model_validate(settings)
+    return _DrivenMap(recipe.config, scene, stored)
 
 
 class ClosedLoop:
     """The arm in its maze, its mapper and its drives, one after the other."""
 
-    def __init__(self, made: DrivenMap) -> None:
+    def __init__(self, made: _DrivenMap) -> None:
         self._made = made
-        self._live = live_config(made.config)
+        # The arm's session in the world of the simulated one, with its odometry errors.
+        plan = made.config.simulation
+        assert plan is not None
+        self._live = LiveConfig.model_validate(
+            {"plan": plan.model_dump(), "noise": plan.odometry.model_dump(), "seed": plan.seed}
+        )
         # Localises a robot that stands where a map ended, in that map.
         saved = read_map(made.stored.path)
         self._slam = Slam(localising(saved.config, saved, "here"), saved.source)
@@ -265,8 +259,12 @@ class ClosedLoop:
 
     def drive(self, experience: int) -> Drive:
         """Drives to an experience."""
-        drive, first, whisks = self._begin(experience), len(self._arm.poses) - 1, 0
-        assert self._route is not None
+        goal = GoalConfig(map=self._made.stored.path, to=(experience,))
+        planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
+        drive, first, whisks = GoalDrive(goal, planner, self._cell, 1), len(self._arm.poses) - 1, 0
+        if self._route is None:
+            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast, self._contacts)
+        self._route.drive = drive
         while whisks < LONGEST and not self._route.advance(self._arm):
             self._route.see(*self._sight())
             whisks += 1
@@ -281,15 +279,6 @@ class ClosedLoop:
             not (walls.contact(poses).angle <= 0).any(),
             path,
         )  # fmt: skip
-
-    def _begin(self, experience: int) -> GoalDrive:
-        goal = GoalConfig(map=self._made.stored.path, to=(experience,))
-        planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
-        drive = GoalDrive(goal, planner, self._cell, 1)
-        if self._route is None:
-            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast, self._contacts)
-        self._route.drive = drive
-        return drive
 
     def _errors(self, experience: int) -> tuple[float, float, float]:
         """True distance from an experience now; that of where odometry, and of where the exact motion of the
@@ -314,31 +303,21 @@ class ClosedLoop:
         return pose, points, sample.truth, self.pose
 
 
-def drive_pairs(
-    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
-) -> Iterator[Drive]:
-    """Drives to goals drawn at random, each from where the last one ended."""
-    for _ in range(count):
-        yield loop.drive(draw_goal(loop, made, random))
+def _drive_blocked(loop: ClosedLoop, made: _DrivenMap, random: np.random.Generator) -> Drive:
+    """A drive with a wall across the shortest way, half-way; it is taken away afterwards."""
+    while True:
+        goal = _draw_goal(loop, made, random)
+        cells = cells_between(made.scene.loop, loop.pose[:2], loop.place_of(goal))
+        if len(cells) >= 2:  # the wall is between centres that the way passes
+            break
+    middle = len(cells) // 2
+    loop.put_walls(walls_of(made, (cells[middle - 1], cells[middle])))
+    drive = loop.drive(goal)
+    loop.put_walls(walls_of(made))
+    return drive
 
 
-def drive_blocked(
-    loop: ClosedLoop, made: DrivenMap, count: int, random: np.random.Generator
-) -> Iterator[Drive]:
-    """The same with a wall across the shortest way, half-way; it is taken away after each drive."""
-    for _ in range(count):
-        while True:
-            goal = draw_goal(loop, made, random)
-            cells = cells_between(made.scene.loop, loop.pose[:2], loop.place_of(goal))
-            if len(cells) >= 2:  # the wall is between centres that the way passes
-                break
-        middle = len(cells) // 2
-        loop.put_walls(walls_of(made, (cells[middle - 1], cells[middle])))
-        yield loop.drive(goal)
-        loop.put_walls(walls_of(made))
-
-
-def draw_goal(loop: ClosedLoop, made: DrivenMap, random: np.random.Generator) -> int:
+def _draw_goal(loop: ClosedLoop, made: _DrivenMap, random: np.random.Generator) -> int:
     """An experience in the range of goals from the present true pose."""
     far = {
         place: shortest_driven(made.scene.loop, loop.pose[:2], loop.place_of(place))
@@ -347,13 +326,13 @@ def draw_goal(loop: ClosedLoop, made: DrivenMap, random: np.random.Generator) ->
     return int(random.choice([place for place, length in far.items() if NEAREST <= length <= FARTHEST]))
 
 
-def walls_of(made: DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surroundings:
+def walls_of(made: _DrivenMap, across: tuple[Cell, Cell] | None = None) -> Surroundings:
     """The walls of the maze, with one more between two neighbouring cells."""
     maze, plan = made.scene.maze, made.config.simulation
     assert plan is not None
     maze = Maze(maze.across.copy(), maze.along.copy())
     if across is not None:
-        wall, place = between_cells(maze, *across)
+        wall, place = maze.between_cells(*across)
         wall[place] = True
     heights = stream(maze_seed(plan.maze, plan.seed), "maze.heights")
     return Surroundings(wall_boxes(maze, heights, plan.maze.heights), made.scene.surroundings.head)
@@ -411,42 +390,36 @@ class GoalFigures(NamedTuple):
     mapped: np.ndarray
     clearance: float
 
+    def record(self) -> Record:
+        """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
+        drives, done = self.free + self.walled, [drive for drive in self.free if drive.said_reached]
+        lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
+        return {
+            "not_reached": sum(not drive.reached for drive in self.free),
+            "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
+            "error": median(np.array([drive.error for drive in done])),
+            "path_ratio": lengths[0] / lengths[1] if done else np.nan,
+            "clearance": min(drive.clearance for drive in drives),
+            "in_wall": sum(not drive.clear for drive in drives),
+            "seconds": self.seconds,
+            "wall_not_solved": sum(not _is_solved(drive) for drive in self.walled),
+        }
 
-def measure_goals(task: MapTask) -> GoalFigures:
+
+def _measure_goals(task: MapTask) -> GoalFigures:
     """Drives on one map, each from where the last one ended."""
-    return measure_drives(task, PAIRS, WALLS)
-
-
-def measure_drives(task: MapTask, pairs: int, walls: int) -> GoalFigures:
-    """The same with these numbers of drives."""
     recipe = ten_circuits(task.seed)
     made = driven_map(recipe, task.map_of(recipe))
     loop, random = ClosedLoop(made), stream(task.seed, "atlas.goals")
     mapped = made.stored.arrays.steps.truth[:, :2]
     return GoalFigures(
         seed=task.seed,
-        free=list(drive_pairs(loop, made, pairs, random)),
-        walled=list(drive_blocked(loop, made, walls, random)),
+        free=[loop.drive(_draw_goal(loop, made, random)) for _ in range(PAIRS)],
+        walled=[_drive_blocked(loop, made, random) for _ in range(WALLS)],
         seconds=loop.time,
         mapped=mapped,
         clearance=clearance(made.scene.surroundings.walls, mapped),
     )
-
-
-def goal_record(one: GoalFigures) -> Record:
-    """The figures of the drives on a map by name: numbers of drives, and lengths in m."""
-    drives, done = one.free + one.walled, [drive for drive in one.free if drive.said_reached]
-    lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
-    return {
-        "not_reached": sum(not drive.reached for drive in one.free),
-        "wrongly_reached": sum(drive.said_reached and not drive.reached for drive in drives),
-        "error": median(np.array([drive.error for drive in done])),
-        "path_ratio": lengths[0] / lengths[1] if done else np.nan,
-        "clearance": min(drive.clearance for drive in drives),
-        "in_wall": sum(not drive.clear for drive in drives),
-        "seconds": one.seconds,
-        "wall_not_solved": sum(not _is_solved(drive) for drive in one.walled),
-    }
 
 
 def _is_solved(drive: Drive) -> bool:
@@ -454,24 +427,25 @@ def _is_solved(drive: Drive) -> bool:
     return drive.state is DriveState.BLOCKED or (drive.replans > 0 and drive.reached)
 
 
-def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
+def goal_lines(found: Sequence[GoalFigures]) -> Iterator[str]:
     """The lines of drives to goals."""
-    free, walled = all_free(found), all_walled(found)
+    yield HEADER
+    free, walled = ([drive for one in found for drive in getattr(one, name)] for name in ("free", "walled"))
     n, done = len(free), [one for one in free if one.said_reached]
-    yield Line(
+    yield table_line(
         f"reached (truly within {RIGHT.distance:g} m)",
         f"{n} of {n}",
         count([one.reached for one in free]),
         f"{count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone, "
         f"{count([one.by_arm <= RIGHT.distance for one in free])} by the arm's exact motion alone",
     )
-    yield Line(
+    yield table_line(
         "said to be reached at a wrong place",
         f"0 of {n + len(walled)}",
         count([one.said_reached and not one.reached for one in free + walled]),
         "-",
     )
-    yield Line(
+    yield table_line(
         "error where reached, m, median (worst)",
         "-",
         spread([one.error for one in done], 3),
@@ -480,28 +454,24 @@ def goal_lines(found: Sequence[GoalFigures]) -> Iterator[Line]:
     )
     short = np.array([one.shortest for one in done])
     ratio = np.array([one.length for one in done]).sum() / max(short.sum(), 1e-9)
-    yield Line("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-")
+    yield table_line("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-")
     least = min((one.clearance for one in free + walled), default=np.nan)
     mapping = min(one.clearance for one in found)
-    yield Line(
+    yield table_line(
         "least distance of the head's axis from a wall, m",
         "-",
         f"{least:.3f}",
         f"{mapping:.3f} while mapping",
     )
-    yield Line(
+    yield table_line(
         "no whisker at rest inside a wall on the way",
         f"{n + len(walled)} of {n + len(walled)}",
         count([one.clear for one in free + walled]),
         "-",
     )
     minutes = max(one.seconds for one in found) / 60
-    yield Line("duration of all drives, min", f"{MINUTES}", f"{minutes:.0f}", "-")
-    yield _wall_line(free, walled)
-
-
-def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> Line:
-    return Line(
+    yield table_line("duration of all drives, min", f"{MINUTES}", f"{minutes:.0f}", "-")
+    yield table_line(
         "wall in the way: reached by a new way, or blocked",
         f"{len(walled)} of {len(walled)}",
         count([_is_solved(one) for one in walled]),
@@ -509,23 +479,15 @@ def _wall_line(free: Sequence[Drive], walled: Sequence[Drive]) -> Line:
     )
 
 
-def all_free(found: Sequence[GoalFigures]) -> list[Drive]:
-    """Drives without a wall in the way."""
-    return [drive for one in found for drive in one.free]
-
-
-def all_walled(found: Sequence[GoalFigures]) -> list[Drive]:
-    """Drives with one."""
-    return [drive for one in found for drive in one.walled]
-
-
 def draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
     """Draws the drives of one maze, and how far from the goals all of them ended."""
-    one, free = found[0], all_free(found)
+    one, free = found[0], [drive for one in found for drive in one.free]
+    gap = np.full((1, 2), np.nan)  # between the paths of two drives
+    driven = np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in one.free)])
     paths = PathPanel(
         "drives to goals, without a wall in the way",
         open_world(one.seed).maze,
-        {"map": one.mapped, "drives": _joined(one.free)},
+        {"map": one.mapped, "drives": driven},
         goals=np.array([drive.goal for drive in one.free]).reshape(-1, 2),
     )
     dots = {
@@ -538,10 +500,4 @@ def draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
     draw_panels(png, "Driving to goals on a map of touch", line, paths, panel)
 
 
-def _joined(drives: Sequence[Drive]) -> np.ndarray:
-    """[n, 2] the paths with rows of NaN between them."""
-    gap = np.full((1, 2), np.nan)
-    return np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in drives)])
-
-
-GOALS = MapRow("Drive to goals on a map", 1, measure_goals, goal_record, goal_lines, draw_goals)
+GOALS = Figure("Drive to goals on a map", _measure_goals, goal_lines, draw_goals, 1)

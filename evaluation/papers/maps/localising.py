@@ -1,4 +1,4 @@
-"""Rows: a robot that wakes up somewhere in a known maze, and in a maze that it does not know."""
+"""Figures: a robot that wakes up somewhere in a known maze, and in a maze that it does not know."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import (
     RIGHT,
     WRONG,
@@ -18,17 +19,16 @@ from evaluation.papers.maps.localisation_metrics import (
     is_within,
     localisation_errors,
 )
-from evaluation.papers.maps.row import (
-    Line,
-    Localised,
-    MapRow,
-    MapTask,
+from evaluation.papers.maps.operations import Localised, MapTask
+from evaluation.papers.maps.pictures import (
+    HEADER,
     Panel,
     PathPanel,
     count,
     draw_panels,
     median,
     spread,
+    table_line,
 )
 from evaluation.papers.maps.scenarios import (
     FOREIGN,
@@ -67,7 +67,7 @@ class Judged(NamedTuple):
         return int(np.argmax(self.right)) + 1 if self.right.any() else np.inf
 
 
-class StartFigures(NamedTuple):
+class _StartFigures(NamedTuple):
     """One unknown start.
 
     Attributes:
@@ -82,8 +82,22 @@ class StartFigures(NamedTuple):
     reckoned: np.ndarray
     paths: tuple[np.ndarray, np.ndarray, np.ndarray]
 
+    def record(self) -> Record:
+        """The figures of an unknown start by name; errors in m, while found."""
+        found = self.session.found
+        return {
+            "missed": self.session.whisks > LOCALISED,
+            "sure_and_wrong": bool(self.session.wrong.any()),
+            "whisks": self.session.whisks,
+            "error": median(self.session.error[found, 0]),
+            "error_aligned": median(self.session.aligned[found, 0]),
+            "odometry_error": median(self.reckoned),
+            "shuffled_found": self.shuffled.whisks <= LOCALISED,
+            "shuffled_sure_and_wrong": bool(self.shuffled.wrong.any()),
+        }
 
-class ForeignFigures(NamedTuple):
+
+class _ForeignFigures(NamedTuple):
     """One session in another maze, and one in the maze of the map.
 
     Attributes:
@@ -96,6 +110,15 @@ class ForeignFigures(NamedTuple):
     said: bool
     known_found: int
     known_said: bool
+
+    def record(self) -> Record:
+        """The figures of a session in another maze by name."""
+        return {
+            "found_elsewhere": self.found > 0,
+            "not_said": not self.said,
+            "known_missed": self.known_found == 0,
+            "known_denied": self.known_said,
+        }
 
 
 def judge(steps: MapSteps, localised: Localised, truth: np.ndarray) -> Judged:
@@ -111,7 +134,7 @@ def judge(steps: MapSteps, localised: Localised, truth: np.ndarray) -> Judged:
     )
 
 
-def measure_start(task: MapTask) -> StartFigures:
+def _measure_start(task: MapTask) -> _StartFigures:
     """One unknown start in the map of ten circuits."""
     made, recorded = task.map_of(ten_circuits(task.seed)), record(unknown_start(task.seed))
     steps, truth = made.arrays.steps, recorded.truth
@@ -119,7 +142,7 @@ def measure_start(task: MapTask) -> StartFigures:
     mixed = Recorded(recorded.config, apply_control(recorded.log, "shuffled", task.seed))
     reckoned = integrate(recorded.log.motion[:, :3], truth[0])
     said = compose(align(steps.pose, steps.truth), localised.pose)
-    return StartFigures(
+    return _StartFigures(
         seed=task.seed,
         session=judge(steps, localised, truth),
         shuffled=judge(steps, task.methods.localise(made, mixed), truth),
@@ -128,12 +151,12 @@ def measure_start(task: MapTask) -> StartFigures:
     )
 
 
-def measure_foreign(task: MapTask) -> ForeignFigures:
+def _measure_foreign(task: MapTask) -> _ForeignFigures:
     """One session in another maze."""
     made = task.map_of(ten_circuits(task.seed))
     other = task.methods.localise(made, record(other_maze(task.seed)))
     known = task.methods.localise(made, record(unknown_start(task.seed)))
-    return ForeignFigures(
+    return _ForeignFigures(
         task.seed,
         int(other.found.sum()),
         bool(other.foreign[-1]),
@@ -142,52 +165,28 @@ def measure_foreign(task: MapTask) -> ForeignFigures:
     )
 
 
-def start_record(one: StartFigures) -> Record:
-    """The figures of an unknown start by name; errors in m, while found."""
-    found = one.session.found
-    return {
-        "missed": one.session.whisks > LOCALISED,
-        "sure_and_wrong": bool(one.session.wrong.any()),
-        "whisks": one.session.whisks,
-        "error": median(one.session.error[found, 0]),
-        "error_aligned": median(one.session.aligned[found, 0]),
-        "odometry_error": median(one.reckoned),
-        "shuffled_found": one.shuffled.whisks <= LOCALISED,
-        "shuffled_sure_and_wrong": bool(one.shuffled.wrong.any()),
-    }
-
-
-def foreign_record(one: ForeignFigures) -> Record:
-    """The figures of a session in another maze by name."""
-    return {
-        "found_elsewhere": one.found > 0,
-        "not_said": not one.said,
-        "known_missed": one.known_found == 0,
-        "known_denied": one.known_said,
-    }
-
-
-def start_lines(found: Sequence[StartFigures]) -> Iterator[Line]:
+def _start_lines(found: Sequence[_StartFigures]) -> Iterator[str]:
     """The lines of unknown starts."""
+    yield HEADER
     n = len(found)
     whisks = np.array([one.session.whisks for one in found])
     mixed = np.array([one.shuffled.whisks for one in found])
-    yield Line(
+    yield table_line(
         f"found and right within {LOCALISED} whisks",
         f"{int(np.ceil(0.95 * n))} of {n}",
         count(whisks <= LOCALISED),
         f"{count(mixed <= LOCALISED)} with shuffled images",
     )
     median = np.median(whisks)
-    yield Line("whisks until then, median (worst)", "25", f"{median:.0f} ({whisks.max():.0f})", "-")
-    yield Line(
+    yield table_line("whisks until then, median (worst)", "25", f"{median:.0f} ({whisks.max():.0f})", "-")
+    yield table_line(
         "sure and wrong (> 0.18 m or 30 degrees)",
         f"0 of {n}",
         count([bool(one.session.wrong.any()) for one in found]),
         f"{count([bool(one.shuffled.wrong.any()) for one in found])} with shuffled images",
     )
     errors = [np.median(one.session.error[one.session.found, 0]) for one in found if one.session.found.any()]
-    yield Line(
+    yield table_line(
         "error while found, m, median of sessions (worst)",
         "-",
         spread(errors, 3),
@@ -196,19 +195,20 @@ def start_lines(found: Sequence[StartFigures]) -> Iterator[Line]:
     aligned = [
         np.median(one.session.aligned[one.session.found, 0]) for one in found if one.session.found.any()
     ]
-    yield Line("the same after the alignment of the map", "-", spread(aligned, 3), "-")
+    yield table_line("the same after the alignment of the map", "-", spread(aligned, 3), "-")
 
 
-def foreign_lines(found: Sequence[ForeignFigures]) -> Iterator[Line]:
+def _foreign_lines(found: Sequence[_ForeignFigures]) -> Iterator[str]:
     """The lines of sessions in other mazes."""
+    yield HEADER
     n = len(found)
-    yield Line(
+    yield table_line(
         f"found in another maze, {FOREIGN} whisks",
         f"0 of {n}",
         count([one.found > 0 for one in found]),
         f"{count([one.known_found > 0 for one in found])} in the maze of the map, {LOCALISED} whisks",
     )
-    yield Line(
+    yield table_line(
         "says at the end that this is not the map",
         "-",
         count([one.said for one in found]),
@@ -216,7 +216,7 @@ def foreign_lines(found: Sequence[ForeignFigures]) -> Iterator[Line]:
     )
 
 
-def draw_start(found: Sequence[StartFigures], png: Path) -> None:
+def _draw_start(found: Sequence[_StartFigures], png: Path) -> None:
     """Draws one session in its maze, and the error of all over the whisks."""
     one = found[0]
     paths = PathPanel(
@@ -242,7 +242,7 @@ def draw_start(found: Sequence[StartFigures], png: Path) -> None:
     )
 
 
-def draw_foreign(found: Sequence[ForeignFigures], png: Path) -> None:
+def _draw_foreign(found: Sequence[_ForeignFigures], png: Path) -> None:
     """Draws how long robots believed that they were found, in another maze and in that of the map."""
     dots = {
         "another maze": [100 * one.found / FOREIGN for one in found],
@@ -254,7 +254,5 @@ def draw_foreign(found: Sequence[ForeignFigures], png: Path) -> None:
     draw_panels(png, "A maze that is not in the map", line, None, panel)
 
 
-START = MapRow("Localise from an unknown start", 20, measure_start, start_record, start_lines, draw_start)
-FOREIGN_ROW = MapRow(
-    "Localise in another maze", 20, measure_foreign, foreign_record, foreign_lines, draw_foreign
-)
+START = Figure("Localise from an unknown start", _measure_start, _start_lines, _draw_start, 20)
+FOREIGN_ROW = Figure("Localise in another maze", _measure_foreign, _foreign_lines, _draw_foreign, 20)

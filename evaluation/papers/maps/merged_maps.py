@@ -1,8 +1,6 @@
-"""Rows: sessions of one maze merged, of two mazes, and ten of one maze one by one.
+"""Figures: maps merged of sessions of one maze, of two mazes, of ten sessions and of buildings in two halves.
 
-Whether two sessions of one map are joined, and rightly.
-
-Row: recordings of buildings in two halves, merged, and the second found in the first.
+Merging is judged by whether sessions are joined in one piece, and rightly, and by the errors of the whole.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align
+from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import (
     BUILDING,
     RIGHT,
@@ -29,7 +28,8 @@ from evaluation.papers.maps.localisation_metrics import (
     localisation_errors,
     nearest_steps,
 )
-from evaluation.papers.maps.row import Line, MapRow, MapTask, Panel, PathPanel, count, draw_panels, spread
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import HEADER, Panel, PathPanel, count, draw_panels, spread, table_line
 from evaluation.papers.maps.scenarios import (
     Recipe,
     Recorded,
@@ -118,7 +118,7 @@ SESSIONS = 10
 """Number of sessions that are merged one by one."""
 
 
-class OverlapFigures(NamedTuple):
+class _OverlapFigures(NamedTuple):
     """Two sessions that share half their cells.
 
     Attributes:
@@ -133,8 +133,19 @@ class OverlapFigures(NamedTuple):
     alone: float
     paths: tuple[np.ndarray, np.ndarray]
 
+    def record(self) -> Record:
+        """The figures of two sessions that overlap by name; Energy Metrics in m^2 + rad^2, the error in m,
+        where they are joined."""
+        return {
+            "not_joined": not self.join.right,
+            "wrong_join": self.join.wrong,
+            "em_union": self.union if self.join.joined else np.nan,
+            "em_alone": self.alone,
+            "error": float(self.join.error[0]) if self.join.joined else np.nan,
+        }
 
-class DifferentFigures(NamedTuple):
+
+class _DifferentFigures(NamedTuple):
     """Sessions of two mazes, and control sessions of the first maze.
 
     Attributes:
@@ -144,8 +155,12 @@ class DifferentFigures(NamedTuple):
     joined: bool
     same: bool
 
+    def record(self) -> Record:
+        """The figures of two mazes by name."""
+        return {"mazes_joined": self.joined, "maze_not_joined": not self.same}
 
-class TenFigures(NamedTuple):
+
+class _TenFigures(NamedTuple):
     """Ten sessions merged one by one.
 
     Attributes:
@@ -160,13 +175,23 @@ class TenFigures(NamedTuple):
     separate: np.ndarray
     joined: bool
 
+    def record(self) -> Record:
+        """The figures of ten sessions by name; the Energy Metric in m^2 + rad^2."""
+        (growth,), (frames,) = _growth([self])
+        return {
+            "not_joined": not self.joined,
+            "em_union": float(self.union[-1]),
+            "em_growth": growth,
+            "frames_growth": frames,
+        }
 
-def measure_overlap(task: MapTask) -> OverlapFigures:
+
+def _measure_overlap(task: MapTask) -> _OverlapFigures:
     """Merges one pair of sessions."""
     scenario = overlapping_sessions(task.seed)
     one, other = task.map_of(scenario.one), task.map_of(scenario.other)
     arrays = _merge(task, one, other)
-    return OverlapFigures(
+    return _OverlapFigures(
         task.seed,
         judge_join(arrays, len(one.arrays.truth), revisits=True),
         arrays.em,
@@ -175,25 +200,25 @@ def measure_overlap(task: MapTask) -> OverlapFigures:
     )
 
 
-def measure_different(task: MapTask) -> DifferentFigures:
+def _measure_different(task: MapTask) -> _DifferentFigures:
     """Merges the sessions of two mazes, and two of one maze."""
     one = task.map_of(ten_circuits(task.seed))
     earlier = len(one.arrays.truth)
     other, again = task.map_of(ten_circuits(task.seed + 1)), task.map_of(same_maze(task.seed, 1))
-    return DifferentFigures(
+    return _DifferentFigures(
         judge_join(_merge(task, one, other), earlier).joined,
         judge_join(_merge(task, one, again), earlier).joined,
     )
 
 
-def measure_ten(task: MapTask) -> TenFigures:
+def _measure_ten(task: MapTask) -> _TenFigures:
     """Merges ten sessions of one maze one by one."""
     maps = [task.map_of(same_maze(task.seed, number)) for number in range(SESSIONS)]
     merged = [maps[0]]
     with TemporaryDirectory() as folder:
         for number, one in enumerate(maps[1:], 1):
             merged.append(task.methods.merge([merged[-1], one], Path(folder) / str(number)))
-    return TenFigures(
+    return _TenFigures(
         union=np.array([one.arrays.em for one in merged]),
         frames=np.array([one.arrays.frames for one in merged]),
         alone=np.array([one.arrays.em for one in maps]),
@@ -202,42 +227,15 @@ def measure_ten(task: MapTask) -> TenFigures:
     )
 
 
-def overlap_record(one: OverlapFigures) -> Record:
-    """The figures of two sessions that overlap by name; Energy Metrics in m^2 + rad^2, the error in m, where
-    they are joined."""
-    return {
-        "not_joined": not one.join.right,
-        "wrong_join": one.join.wrong,
-        "em_union": one.union if one.join.joined else np.nan,
-        "em_alone": one.alone,
-        "error": float(one.join.error[0]) if one.join.joined else np.nan,
-    }
-
-
-def different_record(one: DifferentFigures) -> Record:
-    """The figures of two mazes by name."""
-    return {"mazes_joined": one.joined, "maze_not_joined": not one.same}
-
-
-def ten_record(one: TenFigures) -> Record:
-    """The figures of ten sessions by name; the Energy Metric in m^2 + rad^2."""
-    (growth,), (frames,) = _growth([one])
-    return {
-        "not_joined": not one.joined,
-        "em_union": float(one.union[-1]),
-        "em_growth": growth,
-        "frames_growth": frames,
-    }
-
-
-def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[Line]:
+def _overlap_lines(found: Sequence[_OverlapFigures]) -> Iterator[str]:
     """The lines of sessions that overlap."""
+    yield HEADER
     n = len(found)
     goal = f"{int(np.ceil(0.9 * n))} of {n}"
-    yield Line("joined rightly", goal, count([one.join.right for one in found]), "row of two mazes")
-    yield Line("wrong joins", f"0 of {n}", count([one.join.wrong for one in found]), "row of two mazes")
+    yield table_line("joined rightly", goal, count([one.join.right for one in found]), "row of two mazes")
+    yield table_line("wrong joins", f"0 of {n}", count([one.join.wrong for one in found]), "row of two mazes")
     joined = [one for one in found if one.join.joined]
-    yield Line(
+    yield table_line(
         "EM of the union, median (worst), of joined",
         "-",
         spread([one.union for one in joined], 3),
@@ -249,26 +247,30 @@ def overlap_lines(found: Sequence[OverlapFigures]) -> Iterator[Line]:
         else np.nan
     )
     each = [one.union / one.alone for one in joined]
-    yield Line("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(each)} of each pair")
+    yield table_line("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(each)} of each pair")
 
 
-def different_lines(found: Sequence[DifferentFigures]) -> Iterator[Line]:
+def _different_lines(found: Sequence[_DifferentFigures]) -> Iterator[str]:
     """The lines of two mazes."""
+    yield HEADER
     same = count([one.same for one in found])
-    yield Line("joined", f"0 of {len(found)}", count([one.joined for one in found]), f"{same} of one maze")
+    yield table_line(
+        "joined", f"0 of {len(found)}", count([one.joined for one in found]), f"{same} of one maze"
+    )
 
 
-def ten_lines(found: Sequence[TenFigures]) -> Iterator[Line]:
+def _ten_lines(found: Sequence[_TenFigures]) -> Iterator[str]:
     """The lines of ten sessions."""
-    yield Line("all sessions in one piece", "-", count([one.joined for one in found]), "-")
+    yield HEADER
+    yield table_line("all sessions in one piece", "-", count([one.joined for one in found]), "-")
     growth, frames = _growth(found)
-    yield Line(
+    yield table_line(
         "EM after ten sessions, over that after one",
         f"{GROWTH}",
         spread(growth),
         f"{spread([np.median(one.alone) / one.alone[0] for one in found])} sessions by themselves",
     )
-    yield Line(
+    yield table_line(
         "keyframes after ten sessions, over those after one",
         f"{FRAMES}",
         spread(frames),
@@ -276,7 +278,7 @@ def ten_lines(found: Sequence[TenFigures]) -> Iterator[Line]:
     )
 
 
-def draw_overlap(found: Sequence[OverlapFigures], png: Path) -> None:
+def _draw_overlap(found: Sequence[_OverlapFigures], png: Path) -> None:
     """Draws one pair of sessions, joined if there is one, and the Energy Metric of all."""
     one = next((each for each in found if each.join.joined), found[0])
     paths = PathPanel(
@@ -293,7 +295,7 @@ def draw_overlap(found: Sequence[OverlapFigures], png: Path) -> None:
     draw_panels(png, "Two sessions of one maze, merged", line, paths, panel)
 
 
-def draw_different(found: Sequence[DifferentFigures], png: Path) -> None:
+def _draw_different(found: Sequence[_DifferentFigures], png: Path) -> None:
     """Draws the shares of pairs that were joined."""
     dots = {
         "two mazes": [100 * float(np.mean([one.joined for one in found]))],
@@ -305,7 +307,7 @@ def draw_different(found: Sequence[DifferentFigures], png: Path) -> None:
     draw_panels(png, "Sessions of two mazes", line, None, panel)
 
 
-def draw_ten(found: Sequence[TenFigures], png: Path) -> None:
+def _draw_ten(found: Sequence[_TenFigures], png: Path) -> None:
     """Draws keyframes and Energy Metric over the sessions."""
     curves = {
         "Energy Metric": [one.union / one.union[0] for one in found],
@@ -323,7 +325,7 @@ def _merge(task: MapTask, *maps: StoredMap) -> MapArrays:
         return task.methods.merge(maps, Path(folder) / "merged").arrays
 
 
-def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
+def _growth(found: Sequence[_TenFigures]) -> tuple[list[float], list[float]]:
     """Energy Metric and keyframes after the last session, over those after the first."""
     return (
         [float(one.union[-1] / one.union[0]) for one in found],
@@ -331,18 +333,11 @@ def _growth(found: Sequence[TenFigures]) -> tuple[list[float], list[float]]:
     )
 
 
-OVERLAP = MapRow(
-    "Merge two sessions that share half their cells",
-    20,
-    measure_overlap,
-    overlap_record,
-    overlap_lines,
-    draw_overlap,
+OVERLAP = Figure(
+    "Merge two sessions that share half their cells", _measure_overlap, _overlap_lines, _draw_overlap, 20
 )
-DIFFERENT = MapRow(
-    "Merge sessions of two mazes", 20, measure_different, different_record, different_lines, draw_different
-)
-TEN = MapRow("Merge ten sessions one by one", 3, measure_ten, ten_record, ten_lines, draw_ten)
+DIFFERENT = Figure("Merge sessions of two mazes", _measure_different, _different_lines, _draw_different, 20)
+TEN = Figure("Merge ten sessions one by one", _measure_ten, _ten_lines, _draw_ten, 3)
 
 
 RECORDINGS = ("intel_laser", "tuc_lecture_hall")
@@ -354,15 +349,7 @@ FOUND, OFF = 0.8, 0.01
 off."""
 
 
-class Halves(NamedTuple):
-    """A recording and its two halves."""
-
-    whole: Recipe
-    first: Recipe
-    second: Recipe
-
-
-class HalvesFigures(NamedTuple):
+class _HalvesFigures(NamedTuple):
     """One recording.
 
     Attributes:
@@ -390,29 +377,51 @@ class HalvesFigures(NamedTuple):
     paths: tuple[np.ndarray, np.ndarray, np.ndarray]
     error: np.ndarray
 
+    def record(self) -> Record:
+        """The figures of a recording by name: ATEs, m, and shares."""
+        return {
+            "not_joined": not self.joined,
+            "ate_merged": self.merged,
+            "ate_whole": self.whole,
+            "found": self.found,
+            "off": self.off,
+            "off_by_map": self.off_by_map,
+            "off_nearby": self.off_nearby,
+            "off_by_odometry": self.reckoned,
+            "shuffled_found": self.shuffled[0],
+            "shuffled_off": self.shuffled[1],
+        }
 
-def split_recording(name: str) -> Halves:
-    """The recording of a configuration in two halves.
+
+def split_recording(name: str) -> tuple[Recipe, Recipe, Recipe]:
+    """The recording of a configuration, and its two halves.
 
     Raises:
         InputError: the recording is missing or has no truth.
     """
     whole = Recipe(load_config(find_config(name)))
     middle = record(whole).log.length // 2
-    return Halves(whole, whole._replace(last=middle), whole._replace(first=middle))
+    return whole, whole._replace(last=middle), whole._replace(first=middle)
 
 
-def measure_halves(task: MapTask) -> HalvesFigures:
+def _measure_halves(task: MapTask) -> _HalvesFigures:
     """One recording."""
     name = RECORDINGS[task.seed]
     recipes = split_recording(name)
     whole, first, second = (task.map_of(recipe) for recipe in recipes)
-    recorded, steps = record(recipes.second), first.arrays.steps
+    recorded, steps = record(recipes[2]), first.arrays.steps
     truth = recorded.truth
     with TemporaryDirectory() as folder:
         merged = task.methods.merge([first, second], Path(folder) / "merged").arrays
     localised = task.methods.localise(first, recorded)
-    mixed = task.methods.localise(first, _shuffle(recorded))
+    # The control: views and place labels of the second half in random order.
+    log, label, views = recorded.log, recorded.log.label.copy(), recorded.log.views.copy()
+    random = stream(0, "atlas.halves.shuffled")
+    seen, given = np.flatnonzero(log.seen), np.flatnonzero(label >= 0)
+    views[seen] = views[random.permutation(seen)]
+    label[given] = label[random.permutation(given)]
+    log = replace(log, digest=f"{log.digest}+shuffled", views=views, label=label)
+    mixed = task.methods.localise(first, Recorded(recorded.config, log))
     again = is_revisited(steps, truth, BUILDING)
 
     def shares(found: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
@@ -426,7 +435,12 @@ def measure_halves(task: MapTask) -> HalvesFigures:
     nearest = nearest_steps(steps, truth, BUILDING.distance)
     perfect = compose(steps.pose[nearest], between(steps.truth[nearest], truth))
     at = localised.found
-    return HalvesFigures(
+    # Odometry from the first step with a true pose on.
+    known = np.isfinite(truth).all(axis=1)
+    true, path = truth[known], integrate(recorded.log.motion[:, :3])[known]
+    path = compose(compose(true[0], inverse(path[0])), path)
+    drifted = np.column_stack([np.hypot(*(path - true)[:, :2].T), np.abs(wrap(path[:, 2] - true[:, 2]))])
+    return _HalvesFigures(
         name=name,
         whole=whole.arrays.ate,
         merged=merged.ate,
@@ -437,58 +451,43 @@ def measure_halves(task: MapTask) -> HalvesFigures:
         off_by_map=shares(at, perfect)[1],
         off_nearby=float(exceeds(nearby, BUILDING)[at].mean()) if at.any() else 0.0,
         shuffled=shares(mixed.found, mixed.pose),
-        reckoned=_share_off_by_odometry(recorded),
+        reckoned=float(exceeds(drifted, BUILDING).mean()),
         paths=(steps.truth[:, :2], truth[:, :2], np.where(localised.found[:, None], said[:, :2], np.nan)),
         error=np.where(localised.found, error, np.nan),
     )
 
 
-def halves_record(one: HalvesFigures) -> Record:
-    """The figures of a recording by name: ATEs, m, and shares."""
-    return {
-        "not_joined": not one.joined,
-        "ate_merged": one.merged,
-        "ate_whole": one.whole,
-        "found": one.found,
-        "off": one.off,
-        "off_by_map": one.off_by_map,
-        "off_nearby": one.off_nearby,
-        "off_by_odometry": one.reckoned,
-        "shuffled_found": one.shuffled[0],
-        "shuffled_off": one.shuffled[1],
-    }
-
-
-def halves_lines(found: Sequence[HalvesFigures]) -> Iterator[Line]:
+def _halves_lines(found: Sequence[_HalvesFigures]) -> Iterator[str]:
     """The lines of each recording."""
+    yield HEADER
     for one in found:
         ratio = f"{metres(one.merged)} m, {one.merged / one.whole:.2f} times"
         joined = "" if one.joined else ", halves not joined"
-        yield Line(
+        yield table_line(
             f"{one.name}: ATE of the merged halves",
             f"{RATIO} times",
             ratio + joined,
             f"{metres(one.whole)} m whole",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: found at {one.revisited} revisits",
             f"{FOUND:.0%}",
             f"{one.found:.1%}",
             f"{one.shuffled[0]:.1%} in random order",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: found and off by 2 m or 30 degrees",
             f"{OFF:.0%}",
             f"{one.off:.1%}",
             f"{one.off_by_map:.1%} a perfect localiser there; {one.shuffled[1]:.1%} in random order; "
             f"{one.reckoned:.1%} odometry from the true start",
         )
-        yield Line(
+        yield table_line(
             f"{one.name}: the same against the nearest step of the map", "-", f"{one.off_nearby:.1%}", "-"
         )
 
 
-def draw_halves(found: Sequence[HalvesFigures], png: Path) -> None:
+def _draw_halves(found: Sequence[_HalvesFigures], png: Path) -> None:
     """Draws the recording in which the robot is found most, and the errors while found in all."""
     one = max(found, key=lambda each: each.found)
     paths = PathPanel(
@@ -506,31 +505,4 @@ def draw_halves(found: Sequence[HalvesFigures], png: Path) -> None:
     draw_panels(png, "Buildings, each recording in two halves", line, paths, panel)
 
 
-def _shuffle(recorded: Recorded) -> Recorded:
-    """The session with its views and place labels in random order."""
-    log, label, views = recorded.log, recorded.log.label.copy(), recorded.log.views.copy()
-    random = stream(0, "atlas.halves.shuffled")
-    seen, given = np.flatnonzero(log.seen), np.flatnonzero(label >= 0)
-    views[seen] = views[random.permutation(seen)]
-    label[given] = label[random.permutation(given)]
-    return Recorded(recorded.config, replace(log, digest=f"{log.digest}+shuffled", views=views, label=label))
-
-
-def _share_off_by_odometry(recorded: Recorded) -> float:
-    """Share of the steps with a true pose that are off by odometry from the first such pose."""
-    known = np.isfinite(recorded.truth).all(axis=1)
-    truth, path = recorded.truth[known], integrate(recorded.log.motion[:, :3])[known]
-    path = compose(compose(truth[0], inverse(path[0])), path)
-    error = np.column_stack([np.hypot(*(path - truth)[:, :2].T), np.abs(wrap(path[:, 2] - truth[:, 2]))])
-    return float(exceeds(error, BUILDING).mean())
-
-
-HALVES = MapRow(
-    "Buildings in two halves",
-    len(RECORDINGS),
-    measure_halves,
-    halves_record,
-    halves_lines,
-    draw_halves,
-    RECORDINGS,
-)
+HALVES = Figure("Buildings in two halves", _measure_halves, _halves_lines, _draw_halves, RECORDINGS)

@@ -1,9 +1,7 @@
-"""Sessions of one maze, each derived from the seed of the maze alone.
+"""Sessions of one maze, each derived from the seed of the maze alone, as recipes that are recorded on demand.
 
 The map is that of ten circuits of the touch table. Later sessions have random streams of their own: another
 calibration of the odometry, other noise, another start.
-
-A session as a recipe, and the recorded session that it makes.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from evaluation.papers.trial_sessions import collect_session
 from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
-from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route, is_open, neighbours
+from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route
 from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -112,28 +110,28 @@ SMALLEST = 4
 """Fewest cells of a part."""
 
 
-class TwoParts(NamedTuple):
+class _TwoParts(NamedTuple):
     """Two lists of cells of a maze, each connected, in order of growth."""
 
     one: tuple[Cell, ...]
     other: tuple[Cell, ...]
 
 
-def maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
+def _maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
     """The cells that can be reached from `start`, with an edge between neighbours without a wall."""
     graph: networkx.Graph = networkx.Graph()
     edge = [start]
     graph.add_node(start)
     while edge:
         here = edge.pop()
-        for cell in neighbours(maze, here):
+        for cell in maze.neighbours(here):
             if cell not in graph:
                 edge.append(cell)
             graph.add_edge(here, cell)
     return graph
 
 
-def grow_part(
+def _grow_part(
     graph: networkx.Graph,
     part: Sequence[Cell],
     count: int,
@@ -151,7 +149,7 @@ def grow_part(
     return grown
 
 
-def overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> TwoParts:
+def _overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> _TwoParts:
     """Two connected parts of equal size that share half the cells of each, as large as they are found to fit.
 
     Raises:
@@ -161,15 +159,15 @@ def overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> Two
     for half in range(len(cells) // 3, SMALLEST // 2 - 1, -1):
         for _ in range(TRIES):
             first = cells[int(random.integers(len(cells)))]
-            shared = grow_part(graph, [first], half - 1, (), random)
-            one = shared and grow_part(graph, shared, half, (), random)
-            other = one and shared and grow_part(graph, shared, half, one[half:], random)
+            shared = _grow_part(graph, [first], half - 1, (), random)
+            one = shared and _grow_part(graph, shared, half, (), random)
+            other = one and shared and _grow_part(graph, shared, half, one[half:], random)
             if one and other:
-                return TwoParts(tuple(one), tuple(other))
+                return _TwoParts(tuple(one), tuple(other))
     raise InputError("simulation.maze", f"{len(cells)} cells", "room for two parts that overlap")
 
 
-def separate_parts(graph: networkx.Graph, random: np.random.Generator) -> TwoParts:
+def _separate_parts(graph: networkx.Graph, random: np.random.Generator) -> _TwoParts:
     """Two connected parts without a common cell that hold all cells: a random spanning tree, divided at the
     edge that leaves the parts most equal.
 
@@ -178,23 +176,15 @@ def separate_parts(graph: networkx.Graph, random: np.random.Generator) -> TwoPar
     """
     for _ in range(TRIES):
         tree = networkx.random_spanning_tree(graph, seed=int(random.integers(1 << 31)))
-        sizes = {edge: _side(tree, edge) for edge in sorted(map(tuple, map(sorted, tree.edges)))}
-        side = min(sizes.values(), key=lambda part: abs(2 * len(part) - len(graph)))
+        sides = []  # the cells on the first cell's side of each edge
+        for edge in sorted(map(tuple, map(sorted, tree.edges))):
+            without = networkx.restricted_view(tree, [], [edge])
+            sides.append(set(networkx.node_connected_component(without, edge[0])))
+        side = min(sides, key=lambda part: abs(2 * len(part) - len(graph)))
         rest = sorted(set(graph) - side)
         if min(len(side), len(rest)) >= SMALLEST:
-            return TwoParts(tuple(sorted(side)), tuple(rest))
+            return _TwoParts(tuple(sorted(side)), tuple(rest))
     raise InputError("simulation.maze", f"{len(graph)} cells", "room for two separate parts")
-
-
-def _side(tree: networkx.Graph, edge: tuple[Cell, Cell]) -> set[Cell]:
-    """The cells on the first cell's side of an edge of a tree."""
-    without = networkx.restricted_view(tree, [], [edge])
-    return set(networkx.node_connected_component(without, edge[0]))
-
-
-def entrance(maze: Maze, part: Collection[Cell], outside: Collection[Cell]) -> list[tuple[Cell, Cell]]:
-    """Pairs of an outside cell and a cell of the part that no wall separates, in order."""
-    return sorted((a, b) for a in outside for b in neighbours(maze, a) if b in part)
 
 
 def wall_middle(a: Cell, b: Cell) -> np.ndarray:
@@ -202,7 +192,7 @@ def wall_middle(a: Cell, b: Cell) -> np.ndarray:
     return (cell_centre(a) + cell_centre(b)) / 2
 
 
-def walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[Cell, Cell]]:
+def _walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[Cell, Cell]]:
     """Pairs of neighbouring cells with (or without) a wall between them, the first on the loop, but not the
     steps of the loop."""
     steps = {frozenset(step) for step in zip(loop, [*loop[1:], loop[0]], strict=True)}
@@ -211,7 +201,7 @@ def walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[Ce
         for b in ((x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)):
             inside = 0 <= b[0] < maze.columns and 0 <= b[1] < maze.rows
             known = (b, (x, y)) in pairs or frozenset(((x, y), b)) in steps
-            if inside and not known and is_open(maze, (x, y), b) != there:
+            if inside and not known and maze.is_open((x, y), b) != there:
                 pairs.append(((x, y), b))
     return pairs
 
@@ -238,7 +228,7 @@ class Overlap(NamedTuple):
     one: Recipe
     other: Recipe
     both: Recipe
-    parts: TwoParts
+    parts: _TwoParts
 
 
 class Carried(NamedTuple):
@@ -254,7 +244,7 @@ class Carried(NamedTuple):
     known: Recipe
     entry: int
     unknown: Recipe
-    parts: TwoParts
+    parts: _TwoParts
 
 
 class Change(NamedTuple):
@@ -310,7 +300,7 @@ def overlapping_sessions(maze: int) -> Overlap:
     """Explorations of two parts that share half their cells, and one as long as both together over both."""
     random = stream(maze, "atlas.overlap.parts")
     world = open_world(maze)
-    parts = overlapping_parts(maze_graph(world.maze, world.loop[0]), random)
+    parts = _overlapping_parts(_maze_graph(world.maze, world.loop[0]), random)
     union = tuple(dict.fromkeys(parts.one + parts.other))
     lengths = {"one": (parts.one, PART), "other": (parts.other, PART), "both": (union, 2 * PART)}
     sessions = {
@@ -324,13 +314,13 @@ def carried_sessions(maze: int) -> Carried:
     """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place."""
     random = stream(maze, "atlas.carried.parts")
     world = open_world(maze)
-    parts = separate_parts(maze_graph(world.maze, world.loop[0]), random)
+    parts = _separate_parts(_maze_graph(world.maze, world.loop[0]), random)
     if random.integers(2):
-        parts = TwoParts(parts.other, parts.one)
+        parts = _TwoParts(parts.other, parts.one)
     way = _enter(world.maze, parts, random)
     config = _later(maze, "carried known", {"path": {"cells": way}})
     truth = record(Recipe(config)).truth
-    entry = first_step_in(truth, parts.one)
+    entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts.one), len(truth))
     path = {"explore": float(LOCALISED), "within": _turned(parts.other, random)}
     return Carried(
         first=_explore_all(maze, world, "carried first", parts.one, PART),
@@ -349,7 +339,7 @@ def moved_wall(maze: int) -> Change:
     """
     random = stream(maze, "atlas.wall")
     world = open_world(maze)
-    walls, gaps = (walls_beside(world.maze, world.loop, there) for there in (True, False))
+    walls, gaps = (_walls_beside(world.maze, world.loop, there) for there in (True, False))
     moves = [
         (wall, gap)
         for wall in walls
@@ -384,12 +374,6 @@ def kidnapped(maze: int) -> Recipe:
     return Recipe(touch_config(maze, maze % 100, KIDNAPS, {"may_be_carried": True}))
 
 
-def first_step_in(truth: np.ndarray, cells: Collection[Cell]) -> int:
-    """The first step of true poses [T, 3] in one of the cells; T if there is none."""
-    inside = [cell in cells for cell in cells_of(truth)]
-    return inside.index(True) if any(inside) else len(truth)
-
-
 def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     """The configuration of a further session of the maze."""
     return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
@@ -416,13 +400,14 @@ def _turned(cells: tuple[Cell, ...], random: np.random.Generator) -> tuple[Cell,
     return cells[first:] + cells[:first]
 
 
-def _enter(maze: Maze, parts: TwoParts, random: np.random.Generator) -> list[Cell]:
+def _enter(maze: Maze, parts: _TwoParts, random: np.random.Generator) -> list[Cell]:
     """A route of 0 to `LEAD` unknown cells and then known ones, longer than `REENTERED` whisks there."""
     lead, cells = int(random.integers(LEAD + 1)), REENTERED // 4
     if not lead:
         start = _turned(parts.one, random)[0]
         return exploration_route(maze, start, cells, random, parts.one)
-    doors = entrance(maze, parts.one, parts.other)
+    # Pairs of an outside cell and a cell of the part that no wall separates, in order.
+    doors = sorted((a, b) for a in parts.other for b in maze.neighbours(a) if b in parts.one)
     outside, inside = doors[int(random.integers(len(doors)))]
     before = exploration_route(maze, outside, lead, random, parts.other)[::-1] if lead > 1 else [outside]
     return [*before, *exploration_route(maze, inside, cells, random, parts.one)]

@@ -32,7 +32,7 @@ from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.odometry import OdometryConfig
+from robot.simulation.head.odometry_errors import OdometryConfig
 
 FIRST_MAZE = 31000
 RIDGE = 2.0

@@ -35,8 +35,8 @@ from ratslam.core.session import Session
 from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.baseline import HALL_BASELINE
+from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.sources.in_memory import InMemorySource, load_into_memory
-from robot.sources.odometry import OdometryConfig
 
 FIRST_MAZE = 31100
 SUCCESS = 0.25

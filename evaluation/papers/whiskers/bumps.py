@@ -1,9 +1,8 @@
 """A real Create that knows walls by its bumpers only: the grid filter against overhead truth.
 
 A bumper tells two things: that there is a wall, and that the wheels turn while the robot stands still. Errors
-are ATE, m. The pose is that of the final map and, in brackets, as estimated at the time.
-
-Distance from a robot to the nearest wall when its bumper is pressed.
+are ATE, m. The pose is that of the final map and, in brackets, as estimated at the time. Beside them stands
+the distance from the robot to the nearest wall when its bumper is pressed.
 """
 
 from __future__ import annotations
@@ -14,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align, ate
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
@@ -108,7 +108,12 @@ def measure(folder: Path) -> BumpsResult:
         InputError: a recording is missing or damaged.
     """
     walls = require_recordings(folder, *(f"data/create_lab_{name}.csv" for name in FILES))[-1]
-    drive = _read_drive(walls)
+    with open_observations(load_config(CONFIG)) as (_, source):
+        samples = list(source)
+    unknown = np.full(3, np.nan)
+    truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
+    segments = np.loadtxt(walls, delimiter=",", skiprows=1, ndmin=2)
+    drive = Recorded([observation_of(sample) for sample in samples], truth, segments)
     final, online = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, settings in VARIANTS.items():
         with open_observations(load_config(CONFIG, settings)) as (config, source):
@@ -117,10 +122,20 @@ def measure(folder: Path) -> BumpsResult:
         final[name], online[name] = (np.array([run[part] for run in runs]) for part in range(2))
         if name == "grid filter":
             middle = runs[int(np.argsort(final[name])[len(runs) // 2])]
+    # Least-squares ratio of the true advance to that of the odometry, in pressed steps and in others.
+    odometry = np.array([each.odometry.dx for each in drive.observations])[1:]
+    true = between(truth[:-1], truth[1:])[:, 0]
+    known, pressed = np.isfinite(true), _pressed_steps(drive)[1:]
+    first, second = (
+        float(true[rows] @ odometry[rows] / (odometry[rows] @ odometry[rows]))
+        for rows in (known & pressed, known & ~pressed)
+    )
+    touching, known = np.array([each.contact.any() for each in drive.observations]), _known(truth)
     return BumpsResult(
-        final, online, _odometry_errors(drive), _advances(drive), _wall_distances(drive),
-        drive.truth,
-        _aligned(_dead_reckoning(drive.observations), drive.truth), *_drawn(middle, drive.truth), drive.walls,
+        final, online, _odometry_errors(drive), (first, second),
+        wall_distances(truth[known, :2], touching[known], segments).contact,
+        truth, _aligned(_dead_reckoning(drive.observations), truth), _aligned(middle[2], truth),
+        (middle[3], align(middle[2][known], truth[known])), segments,
     )  # fmt: skip
 
 
@@ -174,15 +189,6 @@ def draw(result: BumpsResult, file: Path) -> None:
     axes.set(aspect="equal", xlim=(-4.4, 3.6), ylim=(-2.9, 2.9), facecolor="#cdcdcd")
     style.name_axes(axes, "x, m", "y, m")
     figure.savefig(file)
-
-
-def _read_drive(walls: Path) -> Recorded:
-    with open_observations(load_config(CONFIG)) as (_, source):
-        samples = list(source)
-    unknown = np.full(3, np.nan)
-    truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
-    segments = np.loadtxt(walls, delimiter=",", skiprows=1, ndmin=2)
-    return Recorded([observation_of(sample) for sample in samples], truth, segments)
 
 
 def _treat(name: str, observations: list[Observation], seed: int) -> list[Observation]:
@@ -240,22 +246,6 @@ def _pressed_steps(drive: Recorded) -> np.ndarray:
     )
 
 
-def _advances(drive: Recorded) -> tuple[float, float]:
-    """Least-squares ratio of the true advance to that of the odometry, in pressed steps and in others."""
-    odometry = np.array([each.odometry.dx for each in drive.observations])[1:]
-    true = between(drive.truth[:-1], drive.truth[1:])[:, 0]
-    known, pressed = np.isfinite(true), _pressed_steps(drive)[1:]
-    among = known & pressed, known & ~pressed
-    first, second = (float(true[rows] @ odometry[rows] / (odometry[rows] @ odometry[rows])) for rows in among)
-    return first, second
-
-
-def _wall_distances(drive: Recorded) -> np.ndarray:
-    """[n] m, from the true position at the first reading of each contact to the nearest wall."""
-    touching, known = np.array([each.contact.any() for each in drive.observations]), _known(drive.truth)
-    return wall_distances(drive.truth[known, :2], touching[known], drive.walls).contact
-
-
 def _dead_reckoning(observations: list[Observation]) -> np.ndarray:
     return integrate(np.array([each.odometry[:3] for each in observations]))
 
@@ -272,12 +262,4 @@ def _aligned(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return compose(align(path[_known(truth)], truth[_known(truth)]), path)
 
 
-def _drawn(
-    run: tuple[float, float, np.ndarray, GridDrawing], truth: np.ndarray
-) -> tuple[np.ndarray, tuple[GridDrawing, np.ndarray]]:
-    """The aligned path of a run, and its map with the pose of the map's frame."""
-    known = _known(truth)
-    return _aligned(run[2], truth), (run[3], align(run[2][known], truth[known]))
-
-
-FIGURE = RealFigure("A real Create and its bumpers", measure, table, draw)
+FIGURE = Figure("A real Create and its bumpers", measure, table, draw)

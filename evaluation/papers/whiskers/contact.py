@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.whiskers.drift import (
     Decide,
     Snippet,
@@ -25,7 +26,7 @@ from evaluation.papers.whiskers.drift import (
     score_stream,
     simulate_stream,
 )
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
 from tactile.base.errors import InputError
@@ -139,7 +140,7 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
 
-class MarkResult(NamedTuple):
+class _MarkResult(NamedTuple):
     """Scores against two annotators.
 
     Attributes:
@@ -155,7 +156,7 @@ class MarkResult(NamedTuple):
     pooled: dict[str, Score]
 
 
-class ContactResult(NamedTuple):
+class _ContactResult(NamedTuple):
     """Contacts of T rows of W whiskers.
 
     Attributes:
@@ -177,23 +178,16 @@ class ContactResult(NamedTuple):
     never: np.ndarray
     tripled: dict[str, StreamScore]
     hours: dict[int, dict[str, StreamScore]]
-    marks: MarkResult | None
+    marks: _MarkResult | None
 
 
-def list_contacts(result: ContactResult) -> list[str]:
+def _list_contacts(result: _ContactResult) -> list[str]:
     """The tables of the page."""
-    return [
-        *_whisker_table(result),
-        "",
-        *_hour_table(result),
-        "",
-        *_mark_table(result),
-        "",
-        *_sentences(result),
-    ]
+    parts = (_whisker_table(result), _hour_table(result), _mark_table(result), _sentences(result))
+    return [line for part in parts for line in ("", *part)][1:]
 
 
-def _whisker_table(result: ContactResult) -> list[str]:
+def _whisker_table(result: _ContactResult) -> list[str]:
     half = len(result.contact) // 2
     halves = [part.mean(axis=0) for part in (result.contact[:half], result.contact[half:])]
     lines = [
@@ -208,7 +202,7 @@ def _whisker_table(result: ContactResult) -> list[str]:
     return lines
 
 
-def _remark(result: ContactResult, whisker: int) -> str:
+def _remark(result: _ContactResult, whisker: int) -> str:
     """What is to be said about a whisker: dirty, bent, away at the end, or never touching."""
     parts = [f"dirty: {one.reason}" for one in result.free.dirty if one.whisker == whisker]
     if result.bent[whisker]:
@@ -222,7 +216,7 @@ def _remark(result: ContactResult, whisker: int) -> str:
     return "; ".join(parts)
 
 
-def _hour_table(result: ContactResult) -> list[str]:
+def _hour_table(result: _ContactResult) -> list[str]:
     lines = [
         "| stream | rule | contacts longer than 0.1 s | missed | false contacts | share of free rows |",
         "|---|---|---|---|---|---|",
@@ -240,7 +234,7 @@ def _stream_line(stream: str, rule: str, score: StreamScore) -> str:
     return f"| {stream} | {rule} | {score.contacts} | {score.missed} | {score.false} | {share} |"
 
 
-def _mark_table(result: ContactResult) -> list[str]:
+def _mark_table(result: _ContactResult) -> list[str]:
     marks = result.marks
     if marks is None:
         return ["Precision and recall: not annotated."]
@@ -264,7 +258,7 @@ def _mark_line(name: str, rule: str, score: Score) -> str:
     return f"| {name} | {rule} | {score.unclear:.1%} | {shown} |"
 
 
-def _sentences(result: ContactResult) -> list[str]:
+def _sentences(result: _ContactResult) -> list[str]:
     seconds = len(result.contact) / result.config.rate
     return [
         f"One record of {seconds:.0f} s at an assumed {result.config.rate:.0f} Hz. Settings were chosen on "
@@ -283,7 +277,7 @@ def _sentences(result: ContactResult) -> list[str]:
     ]
 
 
-def draw_contacts(result: ContactResult, png: Path) -> None:
+def _draw_contacts(result: _ContactResult, png: Path) -> None:
     """Draws contacts of all whiskers by both rules, a whisker let go, and a drifting one."""
     line = "magnetic whiskers on an arm; 20 sd: rule of Salman & Pearson 2016, mean and sd of the first 0.5 s"
     figure = style.new_figure(7.6, "Contact on an arm in clutter", line)
@@ -293,7 +287,7 @@ def draw_contacts(result: ContactResult, png: Path) -> None:
     figure.savefig(png)
 
 
-def _draw_rows(axes: Axes, result: ContactResult) -> None:
+def _draw_rows(axes: Axes, result: _ContactResult) -> None:
     """Stretches in contact of every whisker, by both rules."""
     rate = result.config.rate
     colours = (style.BLUE, style.VERMILLION)
@@ -310,7 +304,7 @@ def _draw_rows(axes: Axes, result: ContactResult) -> None:
         axes.text(across, 1.02, f"■ {name}", color=colour, fontsize=9, transform=axes.transAxes)
 
 
-def _draw_release(axes: Axes, result: ContactResult) -> None:
+def _draw_release(axes: Axes, result: _ContactResult) -> None:
     """The channel of the strongest signal of the first whisker that is let go, around that time."""
     whisker = int(np.argmax(~result.never & ~result.contact[-1]))
     end = true_runs(result.contact[:, whisker])[0][1]
@@ -332,7 +326,7 @@ def _draw_release(axes: Axes, result: ContactResult) -> None:
     style.name_axes(axes, "time, s", "departure, sd of the noise")
 
 
-def _draw_drift(axes: Axes, result: ContactResult) -> None:
+def _draw_drift(axes: Axes, result: _ContactResult) -> None:
     """The channel that drifts most among the whiskers that never touch, and its tracked baseline."""
     scaled = (result.record.signal - result.free.mean) / result.free.noise
     base = (result.baseline - result.free.mean) / result.free.noise
@@ -347,7 +341,7 @@ def _draw_drift(axes: Axes, result: ContactResult) -> None:
     style.name_axes(axes, "time, s", "departure, sd of the noise")
 
 
-def measure_contacts(data: Path) -> ContactResult:
+def _measure_contacts(data: Path) -> _ContactResult:
     """Contacts of the record, by the tracked baseline and by the 20-sd rule.
 
     Raises:
@@ -364,7 +358,7 @@ def measure_contacts(data: Path) -> ContactResult:
     never = (away < CONTACT_SDS).all(axis=1)
     contact = touch == Touch.CONTACT
     marks = read_annotators(FOLDER, WHISKERS, len(signal))
-    return ContactResult(
+    return _ContactResult(
         whiskers=WHISKERS,
         config=config,
         record=record,
@@ -473,13 +467,13 @@ def _cut(signal: np.ndarray, mean: np.ndarray, noise: np.ndarray) -> list[Snippe
 
 def _score_marks(
     marks: dict[str, np.ndarray], contacts: dict[str, np.ndarray], touching: np.ndarray
-) -> MarkResult | None:
+) -> _MarkResult | None:
     """Scores against the marks of two annotators; None unless there are two."""
     if len(marks) != 2:
         return None
     one, other = marks.values()
     agreed = merge_marks(one, other)
-    return MarkResult(
+    return _MarkResult(
         annotators=tuple(marks),
         agreement=float((one == other).mean()),
         unclear=float((agreed == Label.UNCLEAR).mean()),
@@ -494,6 +488,6 @@ def _score_marks(
     )
 
 
-FIGURE = RealFigure(
-    "Contact on an arm in clutter, 14 whiskers", measure_contacts, list_contacts, draw_contacts
+FIGURE = Figure(
+    "Contact on an arm in clutter, 14 whiskers", _measure_contacts, _list_contacts, _draw_contacts
 )

@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import align, ate
-from evaluation.papers.tables.buildings import BuildingsRow, buildings_rows
+from evaluation.papers.figure import Figure
+from evaluation.papers.tables.buildings import buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import metres
 from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
 from evaluation.papers.whiskers.bumps import WallDistances, wall_distances
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
@@ -68,25 +69,21 @@ class Variant(NamedTuple):
     revisits: float
 
 
-def create_rows() -> dict[str, BuildingsRow]:
-    """The sessions by keyframes: half, once and twice the cell size and sector width of the configuration."""
-    return {name: row for name, row in buildings_rows().items() if row.section == "create"}
-
-
-def run_variants(folder: Path) -> Iterator[tuple[str, RecordingRun]]:
-    """The sessions of `create_rows`, and one by the classic method.
+def _run_variants(folder: Path) -> Iterator[tuple[str, RecordingRun]]:
+    """A session by the classic method, and those by keyframes: with half, once and twice the cell size and
+    sector width of the configuration.
 
     Args:
         folder: of the repository, which holds `configs`.
     """
-    rows = create_rows()
+    rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
     default = rows[DEFAULT].recording
     yield "classic", run_recording(default.configuration(folder, "backend=classic"))
     for name, row in rows.items():
         yield name, run_recording(row.configuration(folder))
 
 
-def measure_variant(run: RecordingRun) -> Variant:
+def _measure_variant(run: RecordingRun) -> Variant:
     """The figures of a session."""
     claims, slam_map = closure_claims(run), run.session.map
     false = (claims.distance > FALSE_DISTANCE) | (claims.turn > FALSE_TURN)
@@ -100,11 +97,11 @@ def measure_variant(run: RecordingRun) -> Variant:
         false=int((false & claims.accepted).sum()),
         candidates=len(false),
         right=int((~false).sum()),
-        revisits=revisits_ate(run, slam_map) if isinstance(slam_map, KeyframeMap) else float("nan"),
+        revisits=_revisits_ate(run, slam_map) if isinstance(slam_map, KeyframeMap) else float("nan"),
     )
 
 
-def revisits_ate(run: RecordingRun, slam_map: KeyframeMap) -> float:
+def _revisits_ate(run: RecordingRun, slam_map: KeyframeMap) -> float:
     """ATE of the keyframes with the true revisits as closures in the same graph, m: what recall could give
     if it recognised every revisit, with the sectors' resolution, and nothing else."""
     graph, steps = slam_map.keyframes().copy(), slam_map.keyframe_steps()
@@ -133,7 +130,7 @@ def true_revisits(graph: KeyframeGraph, truth: np.ndarray) -> Iterator[Candidate
             yield Candidate(k, match, shift, 1.0, REVISIT_SCORE)
 
 
-def true_turns_ate(run: RecordingRun) -> float:
+def _true_turns_ate(run: RecordingRun) -> float:
     """ATE of odometry whose turns are replaced by the true ones, m: what is left if headings were known."""
     known = np.isfinite(run.truth).all(axis=1)
     odometry, truth = run.odometry[known], run.truth[known]
@@ -162,42 +159,38 @@ class CreateResult(NamedTuple):
     distances: WallDistances
 
 
-def measure_create(folder: Path) -> CreateResult:
+def _measure_create(folder: Path) -> CreateResult:
     """Runs all sessions; in the folder of the repository, which holds `configs`.
 
     Raises:
         InputError: a recording is missing.
     """
-    truth, bumps, walls, depth = (
+    seen, bumps, walls, depth = (
         np.genfromtxt(path, delimiter=",", names=True) for path in require_recordings(folder, *FILES)
     )
     segments = np.stack([walls[name] for name in ("x1", "y1", "x2", "y2")], axis=1)
     pressed = np.any([bumps[name] > 0 for name in BUMPERS], axis=0)
-    distances = wall_distances(np.stack([truth["x"], truth["y"]], axis=1), pressed, segments)
+    distances = wall_distances(np.stack([seen["x"], seen["y"]], axis=1), pressed, segments)
     variants = {}
-    for name, run in run_variants(Path()):
-        variants[name] = measure_variant(run)
+    for name, run in _run_variants(Path()):
+        variants[name] = _measure_variant(run)
         if name == DEFAULT:
             default = run
     known = np.isfinite(default.truth).all(axis=1)
     error = np.unwrap((default.odometry - default.truth)[known, 2])
+    # The estimates after the rigid motions that bring them nearest to the truth.
+    truth = default.truth[known]
+    estimates = {"odometry": default.odometry[known], "map": default.session.map.map_trajectory()[known]}
+    paths = {name: compose(align(poses, truth), poses) for name, poses in estimates.items()}
     return CreateResult(
         variants=variants,
-        true_turns=true_turns_ate(default),
+        true_turns=_true_turns_ate(default),
         drift=float(np.ptp(error)),
         latency=float(np.median(depth["latency"])),
-        paths=_aligned_paths(default),
+        paths=paths | {"truth": truth},
         walls=segments,
         distances=distances,
     )
-
-
-def _aligned_paths(run: RecordingRun) -> dict[str, np.ndarray]:
-    """The estimates after the rigid motions that bring them nearest to the truth, and the truth."""
-    known = np.isfinite(run.truth).all(axis=1)
-    truth = run.truth[known]
-    estimates = {"odometry": run.odometry[known], "map": run.session.map.map_trajectory()[known]}
-    return {name: compose(align(poses, truth), poses) for name, poses in estimates.items()} | {"truth": truth}
 
 
 def create_table(result: CreateResult) -> list[str]:
@@ -206,7 +199,11 @@ def create_table(result: CreateResult) -> list[str]:
     odometry = next(iter(result.variants.values())).odometry
     lines.append(markdown_row(["odometry (control)", metres(odometry), metres(odometry), *["-"] * 6]))
     for name, variant in result.variants.items():
-        lines.append(markdown_row([_label(name), *_cells(variant)]))
+        label = f"{name} (control)"
+        if name.startswith("create "):
+            _, cell, sector = name.split()
+            label = f"recall, cell x {cell}, sector x {sector}" + " (defaults)" * (name == DEFAULT)
+        lines.append(markdown_row([label, *_cells(variant)]))
     lines.append(markdown_row(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7]))
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
     return [*lines, "", _summary(result), "", *_wall_table(result.distances), "", caveats]
@@ -218,14 +215,6 @@ CAVEATS = (
     "{drift:.1f} rad over the session. A depth reading is {latency:.2f} s older than its time (median of the "
     "file's column)."
 )
-
-
-def _label(name: str) -> str:
-    if not name.startswith("create "):
-        return f"{name} (control)"
-    _, cell, sector = name.split()
-    settings = f"recall, cell x {cell}, sector x {sector}"
-    return f"{settings} (defaults)" if name == DEFAULT else settings
 
 
 def _cells(variant: Variant) -> list[str]:
@@ -300,4 +289,4 @@ def draw_create(result: CreateResult, png: Path) -> None:
     figure.savefig(png)
 
 
-FIGURE = RealFigure("A real Create: recall with nine depth rays", measure_create, create_table, draw_create)
+FIGURE = Figure("A real Create: recall with nine depth rays", _measure_create, create_table, draw_create)

@@ -4,9 +4,8 @@ The magnetic whiskers of an arm in clutter are divided: the settings of `HALL_BA
 and compared with those of `CHECK`. Beside them stand the simulator's noise with these settings and without
 (white), and a whisker read by a camera.
 
-Hours of drifting whiskers made from a short record.
-
-Drift and noise are fitted to its free whiskers, and its contacts are spliced in at known times.
+`simulate_stream` makes hours of drifting whiskers from a short record: drift and noise are fitted to its free
+whiskers, and its contacts are spliced in at known times.
 """
 
 from __future__ import annotations
@@ -19,8 +18,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
+from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from robot.recordings.real_whiskers import read_columns, read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
 from tactile.base.random_streams import stream
@@ -36,16 +36,10 @@ SETTLING = 0.3
 """Time after a contact in which a whisker swings, s."""
 
 
-class Part(NamedTuple):
-    """Whiskers by their place in the record: free ones, and those that bend and are free again at the end."""
-
-    free: tuple[int, ...]
-    bent: tuple[int, ...]
-
-
-FIT = Part(free=(4, 5), bent=(0, 1, 3))
-"""Left 4 and 5; left 0, 1 and 3."""
-CHECK = Part(free=(6, 7), bent=(8, 9, 10))
+FIT = (4, 5), (0, 1, 3)
+"""Whiskers by their place in the record: free ones (left 4 and 5), and those that bend and are free again at
+the end (left 0, 1 and 3)."""
+CHECK = (6, 7), (8, 9, 10)
 """Left 6 and 7; right 0, 1 and 2."""
 LAGS = np.arange(1, 11)
 """Lags of the autocorrelation, in samples."""
@@ -65,7 +59,7 @@ SIMULATED, COPIES = 200, 20
 """Simulated free whiskers, and simulated copies of each real whisker that bends."""
 
 
-class FreeFigures(NamedTuple):
+class _FreeFigures(NamedTuple):
     """Figures of free whiskers, pooled over their channels.
 
     Attributes:
@@ -82,7 +76,7 @@ class FreeFigures(NamedTuple):
     range: tuple[float, float]
 
 
-class CreepFigures(NamedTuple):
+class _CreepFigures(NamedTuple):
     """Figures of whiskers after their last contact.
 
     Attributes:
@@ -97,11 +91,8 @@ class CreepFigures(NamedTuple):
     offset: np.ndarray
 
 
-class DriftResult(NamedTuple):
-    """Figures of free whiskers and after contacts, by source."""
-
-    free: dict[str, FreeFigures]
-    creep: dict[str, CreepFigures]
+DriftResult = tuple[dict[str, _FreeFigures], dict[str, _CreepFigures]]
+"""Figures of free whiskers and after contacts, by source."""
 
 
 def measure_drift(folder: Path) -> DriftResult:
@@ -112,28 +103,28 @@ def measure_drift(folder: Path) -> DriftResult:
     """
     reach, camera = require_recordings(folder, REACH, CAMERA)
     signal = read_reach(reach).signal
-    free: dict[str, FreeFigures] = {}
-    creep: dict[str, CreepFigures] = {}
-    for name, part in (("fitted", FIT), ("checked", CHECK)):
-        free[name] = free_figures(signal[:, part.free].reshape(len(signal), -1), RATE)
-        creep[name] = creep_figures(signal[:, part.bent], None if name == "fitted" else creep["fitted"].time)
+    free: dict[str, _FreeFigures] = {}
+    creep: dict[str, _CreepFigures] = {}
+    for name, (untouched, bending) in (("fitted", FIT), ("checked", CHECK)):
+        free[name] = free_figures(signal[:, untouched].reshape(len(signal), -1), RATE)
+        creep[name] = creep_figures(signal[:, bending], None if name == "fitted" else creep["fitted"].time)
     for name, config in (("simulated", HALL_BASELINE), ("control: white noise", BaselineConfig())):
         noise = simulate_free(config, len(signal))
         free[name] = free_figures(noise.reshape(len(signal), -1), RATE)
-        bent = np.repeat(signal[:, FIT.bent + CHECK.bent], COPIES, axis=1)
-        creep[name] = creep_figures(simulate_bent(config, bent), creep["fitted"].time)
+        bent = np.repeat(signal[:, FIT[1] + CHECK[1]], COPIES, axis=1)
+        creep[name] = creep_figures(_simulate_bent(config, bent), creep["fitted"].time)
     held, _ = read_columns(camera, ("Time", "dx", "dy"))
     held = held[(held[:, 0] > 19) & (held[:, 0] < 23.5)]  # pressed without moving
     free["camera"] = free_figures(held[:, 1:], len(held) / np.ptp(held[:, 0]))
-    return DriftResult(free, creep)
+    return free, creep
 
 
-def mean_change(record: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Half the mean square change over each lag, [L, C], of records [T, C]."""
+def _mean_change(record: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """[L, C] half the mean square change over each lag of records [T, C]."""
     return np.array([((record[lag:] - record[:-lag]) ** 2).mean(axis=0) / 2 for lag in lags])
 
 
-def free_figures(record: np.ndarray, rate: float) -> FreeFigures:
+def free_figures(record: np.ndarray, rate: float) -> _FreeFigures:
     """The figures of whiskers that touch nothing.
 
     Args:
@@ -141,21 +132,21 @@ def free_figures(record: np.ndarray, rate: float) -> FreeFigures:
     """
     quick = record - uniform_filter1d(record, TRACKED, axis=0, mode="nearest")
     noise = quick.var(axis=0)
-    correlation = np.median(1 - mean_change(quick, LAGS) / noise, axis=1)
+    correlation = np.median(1 - _mean_change(quick, LAGS) / noise, axis=1)
     span = np.array([min(round(GROWTH * rate), len(record) // 2)])
-    grown = (2 * mean_change(record, span)[0] / noise - 2).mean() * rate / span[0]
+    grown = (2 * _mean_change(record, span)[0] / noise - 2).mean() * rate / span[0]
     level = uniform_filter1d(record, BLOCK, axis=0)[BLOCK // 2 : -BLOCK // 2] / np.sqrt(noise)
     extent, spans = np.ptp(level, axis=0), SPANS[: np.searchsorted(SPANS, len(record) // 2)]
-    return FreeFigures(
+    return _FreeFigures(
         correlation=correlation,
-        change=np.sqrt(np.mean(2 * mean_change(record, spans) / noise, axis=1)),
+        change=np.sqrt(np.mean(2 * _mean_change(record, spans) / noise, axis=1)),
         time=float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None,
         drift=float(np.sqrt(max(grown, 0.0))),
         range=(float(extent.min()), float(extent.max())),
     )
 
 
-def creep_figures(signal: np.ndarray, time: float | None) -> CreepFigures:
+def creep_figures(signal: np.ndarray, time: float | None) -> _CreepFigures:
     """The figures of whiskers after their last contact: a fit of creep, level and slope to their free end.
 
     Args:
@@ -169,7 +160,7 @@ def creep_figures(signal: np.ndarray, time: float | None) -> CreepFigures:
     shares = np.array([fit[0] for fit in fits[best]])
     offset = [fit[2] for fit in fits[best]]
     length = min(map(len, offset))
-    return CreepFigures(
+    return _CreepFigures(
         float(np.median(shares)), float(times[best]), shares, np.array([row[:length] for row in offset])
     )
 
@@ -198,7 +189,7 @@ def simulate_free(config: BaselineConfig, count: int) -> np.ndarray:
     return (sensor.colour(white) + sensor.wander(np.zeros_like(white)))[0]
 
 
-def simulate_bent(config: BaselineConfig, signal: np.ndarray) -> np.ndarray:
+def _simulate_bent(config: BaselineConfig, signal: np.ndarray) -> np.ndarray:
     """[T, W, 3] simulated whiskers, bent as real ones [T, W, 3] are while they touch, in noise sds."""
     noise = signal[:START].std(axis=0)
     deviation = (signal - signal[:START].mean(axis=0)) / noise
@@ -234,11 +225,11 @@ CAVEATS = (
 def drift_table(result: DriftResult) -> list[str]:
     """The lines of the table."""
     lines = [markdown_header(COLUMNS)]
-    for name, free in result.free.items():
+    for name, free in result[0].items():
         cells = [LABELS.get(name, name), f"{free.correlation[0]:.2f}"]
         cells += ["white" if free.time is None else f"{1000 * free.time:.1f} ms", f"{free.drift:.2f}"]
         cells.append("{:.1f}-{:.1f}".format(*free.range))
-        if creep := result.creep.get(name):
+        if creep := result[1].get(name):
             cells.append(f"{creep.share:.3f} ({creep.shares.min():.3f}-{creep.shares.max():.3f})")
             cells.append(f"{creep.time:.2f} s")
         lines.append(markdown_row([*cells, *["-"] * (len(COLUMNS) - len(cells))]))
@@ -258,10 +249,10 @@ def draw_drift(result: DriftResult, png: Path) -> None:
         "control: white noise": {"color": "grey", "linestyle": "--", "label": "simulated, white noise"},
     }
     for name, style in styles.items():
-        free = result.free[name]
+        free = result[0][name]
         colours.plot(1000 * LAGS / RATE, free.correlation, marker=".", **style)
         drift.semilogx(SPANS[: len(free.change)] / RATE, free.change, **style)
-        offset = 100 * np.median(result.creep[name].offset, axis=0)
+        offset = 100 * np.median(result[1][name].offset, axis=0)
         smooth = np.convolve(offset, np.ones(20) / 20, "valid")
         creep.plot((np.arange(len(smooth)) + 10) / RATE, smooth, **style)
     colours.set(xlabel="lag (ms)", ylabel="autocorrelation", title="Noise of free whiskers")
@@ -275,7 +266,7 @@ def draw_drift(result: DriftResult, png: Path) -> None:
     figure.savefig(png, dpi=130)
 
 
-FIGURE = RealFigure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)
+FIGURE = Figure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)
 
 
 Decide = Callable[[np.ndarray], np.ndarray]
@@ -307,13 +298,8 @@ class Snippet(NamedTuple):
     last: int
 
 
-class Plant(NamedTuple):
-    """A snippet in a block of a stream: its first and last sample, and its contact's; ends are exclusive."""
-
-    first: int
-    last: int
-    begin: int
-    end: int
+Plant = tuple[slice, slice]
+"""The samples of a snippet in a block of a stream, and of its contact."""
 
 
 class StreamScore(NamedTuple):
@@ -369,7 +355,8 @@ def simulate_stream(
             length = len(snippet.deviation)
             first = int(random.integers(block - length))
             noise[first : first + length, whisker] = snippet.deviation
-            planted.append(Plant(first, first + length, first + snippet.first, first + snippet.last))
+            contact = slice(first + snippet.first, first + snippet.last)
+            planted.append((slice(first, first + length), contact))
         yield walk + noise, planted
 
 
@@ -380,22 +367,18 @@ def score_stream(
     scores = dict.fromkeys(rules, StreamScore(0, 0, 0, 0, 0))
     for samples, planted in blocks:
         for name, decide in rules.items():
-            scores[name] = add_scores(scores[name], _score_block(decide(samples), planted))
+            contact = decide(samples)
+            free, missed = np.ones_like(contact), 0
+            for whisker, (snippet, touching) in enumerate(planted):
+                missed += int(contact[touching, whisker].mean() < 0.5)
+                free[snippet, whisker] = False
+            wrong = contact & free
+            false = np.count_nonzero(np.diff(wrong.astype(np.int8), prepend=0, axis=0) == 1)
+            block = StreamScore(len(planted), missed, int(false), int(wrong.sum()), int(free.sum()))
+            scores[name] = add_scores(scores[name], block)
     return scores
 
 
 def add_scores(*scores: StreamScore) -> StreamScore:
     """The score of several parts of a stream together."""
     return StreamScore(*(sum(column) for column in zip(*scores, strict=True)))
-
-
-def _score_block(contact: np.ndarray, planted: list[Plant]) -> StreamScore:
-    """Scores [T, W] contacts of a block."""
-    free = np.ones_like(contact)
-    missed = 0
-    for whisker, plant in enumerate(planted):
-        missed += int(contact[plant.begin : plant.end, whisker].mean() < 0.5)
-        free[plant.first : plant.last, whisker] = False
-    wrong = contact & free
-    false = np.count_nonzero(np.diff(wrong.astype(np.int8), prepend=0, axis=0) == 1)
-    return StreamScore(len(planted), missed, int(false), int(wrong.sum()), int(free.sum()))

@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
-from evaluation.papers.whiskers.figure import REACH, RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
 from ratslam.service.rig_fit import WheelFit, fit_wheels
 from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
-from robot.sources.odometry import UNCORRECTED, OdometryCorrection, correct_motions
+from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
 from tactile.rig_signals import SignalFit, SignalRecord, fit_signals
@@ -33,10 +34,10 @@ RECORDS = {
 CREATE, MAPPED = "real Create", ("Intel lab", "ACES")
 """The record that is drawn; those whose revisits are compared with the truth."""
 VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
-"""The quantities of the table, and what is assumed."""
+"""The quantities of the _table, and what is assumed."""
 
 
-class RecordResult(NamedTuple):
+class _RecordResult(NamedTuple):
     """The wheels of a record: fitted on all of it and on each half; ATE of dead reckoning of the two halves
     (m), as recorded and corrected by the other half; from revisits, where the record was mapped."""
 
@@ -47,23 +48,23 @@ class RecordResult(NamedTuple):
     revisits: RevisitFit | None
 
 
-class FitResult(NamedTuple):
+class _FitResult(NamedTuple):
     """All records, the paths of the Create's halves (truth, as recorded, corrected), the arm's whiskers."""
 
-    records: dict[str, RecordResult]
+    records: dict[str, _RecordResult]
     paths: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
     signals: SignalRecord
     whiskers: SignalFit
 
 
-def measure(folder: Path) -> FitResult:
+def _measure(folder: Path) -> _FitResult:
     """Fits all records below the folder of the real recordings.
 
     Raises:
         InputError: a record is missing or damaged.
     """
     require_recordings(folder, REACH, *(file for _, file in RECORDS.values()))
-    records = dict[str, RecordResult]()
+    records = dict[str, _RecordResult]()
     for name in RECORDS:
         records[name] = _measure_wheels(name, _log(name, folder), folder)
     create = _pairs(_log(CREATE, folder), records[CREATE])
@@ -71,7 +72,7 @@ def measure(folder: Path) -> FitResult:
     signals = read_signals_of_reach(
         PluginConfig(plugin="whisker_reach", settings={"file": str(folder / REACH)})
     )
-    return FitResult(records, paths, signals, fit_signals(signals))
+    return _FitResult(records, paths, signals, fit_signals(signals))
 
 
 def _log(name: str, folder: Path) -> InMemorySource:
@@ -95,15 +96,20 @@ def _assignments(name: str, folder: Path) -> list[str]:
     return [f"recording.file={folder / file}", *named, *relations]
 
 
-def _measure_wheels(name: str, log: InMemorySource, folder: Path) -> RecordResult:
-    whole, *halves = (_fit(part) for part in (log, *_halves(log)))
-    first, second = halves
-    result = RecordResult(whole, (first, second), (0.0, 0.0), (0.0, 0.0), None)
-    pairs = _pairs(log, result)
-    before, after = (
-        tuple(_ate(half, UNCORRECTED if plain else fit.correction) for half, fit in pairs)
-        for plain in (True, False)
-    )
+def _measure_wheels(name: str, log: InMemorySource, folder: Path) -> _RecordResult:
+    fits = []
+    for part in (log, *_halves(log)):
+        assert part.truth is not None
+        fits.append(fit_wheels(part.time, part.motion[:, :3], part.truth))
+    whole, first, second = fits
+    result = _RecordResult(whole, (first, second), (0.0, 0.0), (0.0, 0.0), None)
+    before, after = list[float](), list[float]()  # ATE of dead reckoning, m
+    for half, fit in _pairs(log, result):
+        assert half.truth is not None
+        known = np.isfinite(half.truth).all(axis=1)
+        for found, correction in ((before, UNCORRECTED), (after, fit.correction)):
+            path = integrate(correct_motions(correction, half.motion[:, :3]))
+            found.append(ate(path[known], half.truth[known]))
     revisits = None
     if name in MAPPED:
         revisits = fit_revisits(load_config(RECORDS[name][0], _assignments(name, folder)))
@@ -115,21 +121,9 @@ def _halves(log: InMemorySource) -> tuple[InMemorySource, InMemorySource]:
     return select_rows(log, np.arange(half)), select_rows(log, np.arange(half, log.length))
 
 
-def _pairs(log: InMemorySource, result: RecordResult) -> list[tuple[InMemorySource, WheelFit]]:
+def _pairs(log: InMemorySource, result: _RecordResult) -> list[tuple[InMemorySource, WheelFit]]:
     """Each half with the fit of the other."""
     return list(zip(_halves(log), result.halves[::-1], strict=True))
-
-
-def _fit(log: InMemorySource) -> WheelFit:
-    assert log.truth is not None
-    return fit_wheels(log.time, log.motion[:, :3], log.truth)
-
-
-def _ate(log: InMemorySource, correction: OdometryCorrection) -> float:
-    """ATE of dead reckoning, m."""
-    assert log.truth is not None
-    known = np.isfinite(log.truth).all(axis=1)
-    return ate(integrate(correct_motions(correction, log.motion[:, :3]))[known], log.truth[known])
 
 
 def _paths(log: InMemorySource, fit: WheelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,7 +139,7 @@ def _paths(log: InMemorySource, fit: WheelFit) -> tuple[np.ndarray, np.ndarray, 
     return truth, plain, corrected
 
 
-def table(result: FitResult) -> list[str]:
+def _table(result: _FitResult) -> list[str]:
     """The wheels by record and half, dead reckoning before and after, and the whiskers of the arm."""
     lines = [
         "Wheels: each quantity of the whole record, and of its first and second half.",
@@ -173,7 +167,7 @@ def table(result: FitResult) -> list[str]:
     return [*lines, "", *_whisker_lines(result)]
 
 
-def _whisker_lines(result: FitResult) -> list[str]:
+def _whisker_lines(result: _FitResult) -> list[str]:
     fit, names = result.whiskers, result.signals.names
     unit = result.signals.unit
     lines = [
@@ -211,7 +205,7 @@ def _pair(found: tuple[float, float] | None) -> str:
     return "unknown" if found is None else f"{found[0]:.3f} ± {found[1]:.3f}"
 
 
-def draw(result: FitResult, png: Path) -> None:
+def _draw(result: _FitResult, png: Path) -> None:
     """The quantities with their intervals, dead reckoning before and after, two paths, and the whiskers."""
     title = "What a record tells of its rig"
     line = "Wheels against truth, half against half; noise of the whiskers of an arm in clutter"
@@ -232,7 +226,7 @@ def draw(result: FitResult, png: Path) -> None:
     figure.savefig(png)
 
 
-def _draw_intervals(axes: style.Axes, result: FitResult, key: str, assumed: float, named: bool) -> None:
+def _draw_intervals(axes: style.Axes, result: _FitResult, key: str, assumed: float, named: bool) -> None:
     axes.axvline(assumed, color=style.GREY, lw=1)
     colours = (style.INK, style.BLUE, style.VERMILLION)
     for row, record in enumerate(result.records.values()):
@@ -276,7 +270,7 @@ def _draw_paths(axes: style.Axes, paths: tuple[np.ndarray, ...], label: str) -> 
     )  # fmt: skip
 
 
-def _draw_ate(axes: style.Axes, result: FitResult) -> None:
+def _draw_ate(axes: style.Axes, result: _FitResult) -> None:
     """Dead reckoning of both halves, before against after."""
     before = np.array([record.before for record in result.records.values()])
     after = np.array([record.after for record in result.records.values()])
@@ -290,7 +284,7 @@ def _draw_ate(axes: style.Axes, result: FitResult) -> None:
     style.name_axes(axes, "ATE as recorded, m", "ATE corrected, m")
 
 
-def _draw_whiskers(axes: style.Axes, result: FitResult) -> None:
+def _draw_whiskers(axes: style.Axes, result: _FitResult) -> None:
     fit, names = result.whiskers, result.signals.names
     dirty = {one.whisker for one in fit.dirty}
     at = np.arange(len(names))
@@ -313,4 +307,4 @@ def _draw_whiskers(axes: style.Axes, result: FitResult) -> None:
     axes.legend(frameon=False, fontsize=8.5, loc="upper left", ncols=2)
 
 
-FIGURE = RealFigure("The rig from a record", measure, table, draw)
+FIGURE = Figure("The rig from a record", _measure, _table, _draw)

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import expit, logit
 
 from evaluation.metrics.statistics import auc, expected_calibration_error
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream
@@ -32,7 +33,7 @@ PAIRS = 4000
 BINS = 10
 
 
-class ImageSet(NamedTuple):
+class _ImageSet(NamedTuple):
     """N recorded images of objects.
 
     Attributes:
@@ -45,7 +46,7 @@ class ImageSet(NamedTuple):
     run: np.ndarray
 
 
-class HeldOut(NamedTuple):
+class _HeldOut(NamedTuple):
     """Comparisons of H held-out images with M others.
 
     Attributes:
@@ -68,103 +69,74 @@ DISTANCES = {
 """Order of the norm, and whether it is of the signed roots."""
 
 
-class LikenessResult(NamedTuple):
+class _LikenessResult(NamedTuple):
     """Held-out comparisons: of each block of the whiskers, and of all contacts of the taxels."""
 
-    blocks: list[HeldOut]
-    contacts: list[HeldOut]
+    blocks: list[_HeldOut]
+    contacts: list[_HeldOut]
 
 
-def measure(folder: Path) -> LikenessResult:
+def _measure(folder: Path) -> _LikenessResult:
     """Compares all held-out images.
 
     Raises:
         InputError: a recording is missing or damaged.
     """
     objects, taxels = require_recordings(folder, OBJECTS, TAXELS)
-    whiskers, contacts = read_whisker_images(objects), read_taxel_images(taxels)
-    return LikenessResult(
-        [hold_out(whiskers, whiskers.run == block) for block in np.unique(whiskers.run)],
-        [hold_out(contacts, np.arange(len(contacts.run)) == k) for k in range(len(contacts.run))],
+    # The touches of all objects, in runs of 30; and an image of each contact, its mean pressures.
+    views = [read_object(path).images.reshape(-1, 128) for path in sorted(objects.glob("*.csv"))]
+    count = [len(rows) for rows in views]
+    run = np.concatenate([np.arange(rows) // BLOCK for rows in count])
+    whiskers = _ImageSet(np.concatenate(views), np.repeat(np.arange(len(views)), count), run)
+    felt = read_contacts(taxels)
+    pressures = np.stack([contact.pressure.mean(axis=0).reshape(-1) for contact in felt])
+    contacts = _ImageSet(pressures, np.array([contact.object for contact in felt]), np.arange(len(felt)))
+    return _LikenessResult(
+        [_hold_out(whiskers, whiskers.run == block) for block in np.unique(whiskers.run)],
+        [_hold_out(contacts, np.arange(len(contacts.run)) == k) for k in range(len(contacts.run))],
     )
 
 
-def read_whisker_images(folder: Path) -> ImageSet:
-    """The touches of all objects in a folder, in blocks of 30."""
-    views = [read_object(path).images.reshape(-1, 128) for path in sorted(folder.glob("*.csv"))]
-    count = [len(rows) for rows in views]
-    run = np.concatenate([np.arange(rows) // BLOCK for rows in count])
-    return ImageSet(np.concatenate(views), np.repeat(np.arange(len(views)), count), run)
-
-
-def read_taxel_images(file: Path) -> ImageSet:
-    """An image of each contact, its mean pressures."""
-    contacts = read_contacts(file)
-    views = np.stack([contact.pressure.mean(axis=0).reshape(-1) for contact in contacts])
-    return ImageSet(views, np.array([contact.object for contact in contacts]), np.arange(len(contacts)))
-
-
-def hold_out(images: ImageSet, held: np.ndarray) -> HeldOut:
+def _hold_out(images: _ImageSet, held: np.ndarray) -> _HeldOut:
     """Learns from the images that are not held out (`held` [N] bool) and compares the others with them."""
-    rest = ImageSet(*(column[~held] for column in images))
+    rest = _ImageSet(*(column[~held] for column in images))
     alive = np.ones(images.views.shape[1], bool)
     stored = stored_image(rest.views, alive)
-    one, other, apart = training_pairs(rest)
-    model = learn(stored, ImagePairs(stored[one], stored[other]), apart)
+    # Numbers of images: pairs of one object in different runs, [P] and [P], and pairs of two, [Q, 2].
+    a, b = stream(0, "training pairs").integers(len(rest.run), size=(2, 50 * PAIRS))
+    alike = rest.thing[a] == rest.thing[b]
+    one = np.flatnonzero(alike & (rest.run[a] != rest.run[b]))[:PAIRS]
+    two = np.flatnonzero(~alike)[: 5 * PAIRS]
+    pairs, apart = ImagePairs(stored[a[one]], stored[b[one]]), np.column_stack([a[two], b[two]])
+    model = learn(stored, pairs, apart)
     known = project(model, stored.T)
     found = project(model, stored_image(images.views[held], alive).T)
     odds = np.stack([log_odds(model, image[:, None], known) for image in found.T])
     thing = images.thing[held]
     recognised = {"log-odds": float((rest.thing[odds.argmax(axis=1)] == thing).mean())}
-    distances = [distance_of(images.views[held], rest.views, *kind) for kind in DISTANCES.values()]
-    for name, distance in zip(DISTANCES, distances, strict=True):
-        recognised[name] = float((rest.thing[distance.argmin(axis=1)] == thing).mean())
-    return HeldOut(odds, thing[:, None] == rest.thing, recognised, distances[0])
+    distances = []  # [H, M] sums of the absolute differences, to a power, of the images or of their roots
+    for name, (order, roots) in DISTANCES.items():
+        seen, old = images.views[held], rest.views
+        if roots:
+            seen, old = (np.sign(views) * np.sqrt(np.abs(views)) for views in (seen, old))
+        distances.append(np.stack([(np.abs(old - view) ** order).sum(axis=1) for view in seen]))
+        recognised[name] = float((rest.thing[distances[-1].argmin(axis=1)] == thing).mean())
+    return _HeldOut(odds, thing[:, None] == rest.thing, recognised, distances[0])
 
 
-def training_pairs(images: ImageSet) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of images: pairs of one object in different runs, [P] and [P], and pairs of two, [Q, 2]."""
-    random = stream(0, "training pairs")
-    a, b = random.integers(len(images.run), size=(2, 50 * PAIRS))
-    same = images.thing[a] == images.thing[b]
-    one = np.flatnonzero(same & (images.run[a] != images.run[b]))[:PAIRS]
-    two = np.flatnonzero(~same)[: 5 * PAIRS]
-    return a[one], b[one], np.column_stack([a[two], b[two]])
-
-
-def distance_of(found: np.ndarray, known: np.ndarray, order: int, roots: bool) -> np.ndarray:
-    """[H, M] sums of the absolute differences, to a power, of images [H, D] and [M, D] or of their roots."""
-    if roots:
-        found, known = (np.sign(views) * np.sqrt(np.abs(views)) for views in (found, known))
-    return np.stack([(np.abs(known - view) ** order).sum(axis=1) for view in found])
-
-
-def probabilities(odds: np.ndarray, same: np.ndarray) -> np.ndarray:
+def _probabilities(odds: np.ndarray, same: np.ndarray) -> np.ndarray:
     """Probabilities [P] that pairs are of one object, from their log-odds and the share of such pairs."""
     return np.asarray(expit(odds + logit(same.mean())))
 
 
-def reliability(chance: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """[10, 2] mean probability of one object, and share of pairs that are of one, in bins of equally many
-    pairs [P] in order of their probability."""
-    order = np.argsort(chance, kind="stable")
-    parts = [(chance[part].mean(), same[part].mean()) for part in np.array_split(order, BINS)]
-    return np.array(parts)
-
-
-def _auc(score: np.ndarray, same: np.ndarray) -> float:
-    """Probability that a pair of one object has a larger score than a pair of two."""
-    return auc(score[~same], score[same])
-
-
-def pooled(parts: list[HeldOut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pooled(parts: list[_HeldOut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-odds, whether of one object, and distances, of all pairs of some comparisons."""
     odds = np.concatenate([part.odds.ravel() for part in parts])
     same = np.concatenate([part.same.ravel() for part in parts])
     return odds, same, np.concatenate([part.distance.ravel() for part in parts])
 
 
-def table(result: LikenessResult) -> list[str]:
+def _table(result: _LikenessResult) -> list[str]:
     """The lines of the table."""
     blocks = result.blocks
     chosen = [block for k, block in enumerate(blocks) if k in DEVELOPED]
@@ -175,25 +147,25 @@ def table(result: LikenessResult) -> list[str]:
         + " | ".join(names) + " | chance |",
         "|---|" + "---|" * (len(names) + 4),
     ]  # fmt: skip
-    rows: list[tuple[str, list[HeldOut], bool]] = [
+    rows: list[tuple[str, list[_HeldOut], bool]] = [
         ("8 whiskers, 10 objects, blocks 1-3 (model chosen on these)", chosen, True),
         ("the same, blocks 4-6 (confirming)", confirmed, True),
         ("the same, all six blocks", blocks, True),
         ("3 x 22 taxels, 6 objects, one contact left out (same model)", result.contacts, False),
     ]
     for label, parts, by_block in rows:
-        odds, same, distance = pooled(parts)
-        least = f" ({min(_auc(*pooled([part])[:2]) for part in parts):.3f})" if by_block else ""
-        cells = [f"{_auc(odds, same):.3f}{least}", f"{_auc(-distance, same):.3f}"]
-        cells += [f"{expected_calibration_error(probabilities(odds, same), same, BINS):.3f}"]
+        odds, same, distance = _pooled(parts)
+        areas = [auc(part.odds[~part.same], part.odds[part.same]) for part in parts]
+        least = f" ({min(areas):.3f})" if by_block else ""
+        cells = [
+            f"{auc(odds[~same], odds[same]):.3f}{least}",
+            f"{auc(-distance[~same], -distance[same]):.3f}",
+        ]
+        cells += [f"{expected_calibration_error(_probabilities(odds, same), same, BINS):.3f}"]
         cells += [f"{np.mean([part.recognised[name] for part in parts]):.3f}" for name in names]
-        lines.append(f"| {label} | {' | '.join(cells)} | {chance_of(parts):.2f} |")
+        chance = np.mean([part.same.mean() for part in parts])  # share of pairs of one object
+        lines.append(f"| {label} | {' | '.join(cells)} | {chance:.2f} |")
     return [*lines, "", *NOTES]
-
-
-def chance_of(parts: list[HeldOut]) -> float:
-    """Share of pairs that are of one object, which is that of chance hits."""
-    return float(np.mean([part.same.mean() for part in parts]))
 
 
 NOTES = [
@@ -205,7 +177,7 @@ NOTES = [
 ]
 
 
-def draw(result: LikenessResult, png: Path) -> None:
+def _draw(result: _LikenessResult, png: Path) -> None:
     """Draws ROC, reliability and recognition."""
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
     kinds = {
@@ -214,11 +186,21 @@ def draw(result: LikenessResult, png: Path) -> None:
         "taxels": result.contacts,
     }
     for color, (label, parts) in zip(("C0", "C1", "C2"), kinds.items(), strict=True):
-        odds, same, distance = pooled(parts)
+        odds, same, distance = _pooled(parts)
         for score, style, of in ((odds, "-", "log-odds"), (-distance, ":", "absolute differences")):
-            axes[0].plot(*roc(score, same), style, color=color, label=f"{label}: {of}")
-        points = reliability(probabilities(odds, same), same)
-        axes[1].plot(points[:, 0], points[:, 1], "o-", color=color, label=label)
+            # Shares of the pairs of two objects and of one that are taken for one, as the limit falls.
+            truth = same[np.argsort(-score, kind="stable")]
+            shown = np.linspace(0, len(truth) - 1, min(len(truth), 2000)).astype(int)
+            wrong, right = (
+                (np.cumsum(~truth) / (~truth).sum())[shown],
+                (np.cumsum(truth) / truth.sum())[shown],
+            )
+            axes[0].plot(wrong, right, style, color=color, label=f"{label}: {of}")
+        # Mean probability of one object against the share of such pairs, in bins of equally many pairs.
+        chance = _probabilities(odds, same)
+        bins = np.array_split(np.argsort(chance, kind="stable"), BINS)
+        means = [[values[part].mean() for part in bins] for values in (chance, same)]
+        axes[1].plot(*means, "o-", color=color, label=label)
     axes[0].plot([0, 1], [0, 1], color="0.7", lw=1, label="chance")
     axes[1].plot([0, 1], [0, 1], color="0.7", lw=1)
     axes[0].set(xlabel="different objects taken for one", ylabel="pairs of one object found", title="ROC")
@@ -230,14 +212,7 @@ def draw(result: LikenessResult, png: Path) -> None:
     plt.close(figure)
 
 
-def roc(score: np.ndarray, same: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the pairs of two objects and of one that are taken for one, as the limit falls."""
-    truth = same[np.argsort(-score, kind="stable")]
-    points = np.linspace(0, len(truth) - 1, min(len(truth), 2000)).astype(int)
-    return (np.cumsum(~truth) / (~truth).sum())[points], (np.cumsum(truth) / truth.sum())[points]
-
-
-def _draw_recognition(axis: Any, kinds: dict[str, list[HeldOut]]) -> None:
+def _draw_recognition(axis: Any, kinds: dict[str, list[_HeldOut]]) -> None:
     """Bars of the shares of recognised objects."""
     names = ("log-odds", *DISTANCES)
     for k, name in enumerate(names):
@@ -250,4 +225,4 @@ def _draw_recognition(axis: Any, kinds: dict[str, list[HeldOut]]) -> None:
     axis.legend(fontsize=7, loc="upper left")
 
 
-FIGURE = RealFigure("Likeness of real touch images", measure, table, draw)
+FIGURE = Figure("Likeness of real touch images", _measure, _table, _draw)

@@ -1,8 +1,7 @@
 """Tangents and radius of objects along which a real whisker slid on a stage (Stanford bench).
 
-Tangents, curvature and radius of an outline felt in a plane.
-
-Input are points along an outline, in order, with their covariance, as `track_contact` gives them.
+`local_tangents` and `fit_circle` give tangents, curvature and radius of an outline felt in a plane, from the
+points along it, in order, with their covariance, as `track_contact` gives them.
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.distance import cdist
 
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
+from evaluation.papers.figure import Figure
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.sliding_contact import SlidingContact, find_contact, track_contact
 from robot.recordings.real_whiskers import cut_sweep, read_stage, read_stage_calibration
 from tactile.base.errors import InputError
@@ -199,7 +199,10 @@ def measure(folder: Path) -> TangentResult:
         InputError: a recording is missing or damaged.
     """
     (bench,) = require_recordings(folder, BENCH)
-    maps = {name: _read_map(bench, name) for name in (SENSOR_1, *CURVED)}
+    maps = {}
+    for name in (SENSOR_1, *CURVED):
+        calibration = read_stage_calibration(bench / "calibration" / name)
+        maps[name] = fit_signal_map(calibration.position, calibration.signal, calibration.base)
     by_day = {day: _sweeps(bench, maps[SENSOR_1], which)[0] for day, which in CYLINDER_DAYS.items()}
     cylinder = {}
     for day, sweeps in by_day.items():
@@ -245,11 +248,6 @@ def repeatability(sweeps: list[SweepResult]) -> np.ndarray:
         same = apart.min(axis=1) < NEAR
         angles.append(angle_between(one.tangents.direction, other.tangents.direction[nearest])[same])
     return np.concatenate(angles)
-
-
-def _read_map(bench: Path, name: str) -> SignalMap:
-    calibration = read_stage_calibration(bench / "calibration" / name)
-    return fit_signal_map(calibration.position, calibration.signal, calibration.base)
 
 
 def _sweeps(bench: Path, known: SignalMap, which: str) -> tuple[list[SweepResult], int]:
@@ -307,12 +305,15 @@ def table(result: TangentResult) -> list[str]:
     for day, found in result.cylinder.items():
         lines.append(_cylinder_row(f"{day} ({_use(day)})", [found]))
     lines.append(_cylinder_row("all", list(result.cylinder.values())))
+    # Largest distance of two days' centres, each fitted to that day's own sweeps, mm.
+    centres = [fit_centre([sweep.points for sweep in day.sweeps]) for day in result.cylinder.values()]
+    apart = float(1e3 * cdist(centres, centres).max())
     lines += [
         "",
         "True tangents are those of a circle of 15 mm about the centre fitted to the other days' sweeps, "
         "where the ray through the estimated contact meets it. All rows in contact count. The truth is no "
         "better than its centre (1 mm is 4°): fitted to each day's own sweeps it moves by "
-        f"{_own_centres(result):.1f} mm between days.",
+        f"{apart:.1f} mm between days.",
         "",
         "| other objects | sweeps (without contact) | tangent beside direction of motion, median (90 %) "
         "| tangents of two sweeps at the same place differ by | the same, contact at tip |",
@@ -337,12 +338,6 @@ def table(result: TangentResult) -> list[str]:
 
 def _use(day: str) -> str:
     return "settings not chosen on it" if day == CHECKED_ON else "settings chosen on it"
-
-
-def _own_centres(result: TangentResult) -> float:
-    """Largest distance of two days' centres, each fitted to that day's own sweeps, mm."""
-    centres = [fit_centre([sweep.points for sweep in day.sweeps]) for day in result.cylinder.values()]
-    return float(1e3 * cdist(centres, centres).max())
 
 
 def _cylinder_row(name: str, days: list[CylinderResult]) -> str:
@@ -422,4 +417,4 @@ def _draw_errors(axis: Axes, result: TangentResult) -> None:
     axis.legend()
 
 
-FIGURE = RealFigure("Tangents of objects along which a real whisker slid", measure, table, draw)
+FIGURE = Figure("Tangents of objects along which a real whisker slid", measure, table, draw)

@@ -9,6 +9,7 @@ simulated whiskers that compare one direction only, and odometry alone from the 
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,9 +18,10 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
+from evaluation.papers.figure import Figure
 from evaluation.papers.trial_sessions import collect_session, run_session
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
 from evaluation.papers.whiskers.likeness import OBJECTS
+from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.walk_source import (
     WalkConfig,
     most_needed,
@@ -30,9 +32,9 @@ from evaluation.papers.whiskers.walk_source import (
 from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
+from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import InMemorySource
-from robot.sources.odometry import OdometryConfig, simulate_odometry
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate, wrap
 
@@ -46,7 +48,7 @@ DRAWS = 200
 """Number of draws of the noise of odometry after the reversal."""
 
 
-class WalkEnd(NamedTuple):
+class _WalkEnd(NamedTuple):
     """What odometry alone makes of the fourth circuit.
 
     Attributes:
@@ -62,7 +64,7 @@ class WalkEnd(NamedTuple):
     heading: float
 
 
-class WalkResult(NamedTuple):
+class _WalkResult(NamedTuple):
     """One walk.
 
     Attributes:
@@ -76,54 +78,40 @@ class WalkResult(NamedTuple):
     shuffled: SessionResult
     simulated: SessionResult
     one_way: SessionResult
-    end: WalkEnd
+    end: _WalkEnd
 
 
-def measure(folder: Path) -> list[WalkResult]:
+def _measure(folder: Path) -> list[_WalkResult]:
     """Five walks.
 
     Raises:
         InputError: a recording is missing or damaged.
     """
     (objects,) = require_recordings(folder, OBJECTS)
-    return measure_walks(choose_mazes(FIRST_MAZE, WALKS), objects)
-
-
-def choose_mazes(first: int, count: int) -> list[int]:
-    """The first mazes in which no object is needed more often than half of its rows."""
-    chosen: list[int] = []
-    maze = first
-    while len(chosen) < count:
+    # The first mazes in which no object is needed more often than half of its rows.
+    mazes: list[int] = []
+    for maze in count(FIRST_MAZE):
+        if len(mazes) == WALKS:
+            break
         truth = HeadSimulation(walk_simulation(maze)).truth
         if most_needed(plan_visits(truth, THINGS, maze)) <= ROWS:
-            chosen.append(maze)
-        maze += 1
-    return chosen
-
-
-def measure_walks(mazes: list[int], objects: Path) -> list[WalkResult]:
-    """The walks in mazes, whose numbers are the seeds too; one kind of session after the other, because each
-    has a kernel of its own."""
+            mazes.append(maze)
+    # One kind of session after the other, because each has a kernel of its own.
     walks = [
         WalkConfig(folder=objects, simulation=walk_simulation(maze), seed=maze, shuffled=shuffled)
         for shuffled in (False, True)
         for maze in mazes
     ]
     logs = [open_walk(walk) for walk in walks]
-    recorded = [run_walk(log) for log in logs]
+    given = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
+    recorded = [run_session(complete(given, log), log) for log in logs]
     sessions = [collect_session(whisker_config(maze)) for maze in mazes]
     simulated = [run_session(*session) for session in sessions]
     one_way = [run_session(compare_one_way(config), log) for config, log in sessions]
     real, shuffled = recorded[: len(mazes)], recorded[len(mazes) :]
-    ends = [continue_walk(*row) for row in zip(mazes, real, logs[: len(mazes)], strict=True)]
+    ends = [_continue_walk(*row) for row in zip(mazes, real, logs[: len(mazes)], strict=True)]
     rows = zip(mazes, real, shuffled, simulated, one_way, ends, strict=True)
-    return [WalkResult(*row) for row in rows]
-
-
-def run_walk(log: InMemorySource) -> SessionResult:
-    """Maps a walk with the settings that follow from its source."""
-    config = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
-    return run_session(complete(config, log), log)
+    return [_WalkResult(*row) for row in rows]
 
 
 def whisker_config(maze: int) -> RunConfig:
@@ -137,7 +125,7 @@ def compare_one_way(config: RunConfig) -> RunConfig:
     return config.model_copy(update={"recall": config.recall.model_copy(update={"shifts": 0})})
 
 
-def continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> WalkEnd:
+def _continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> _WalkEnd:
     """The walk continued by odometry alone from the reversal on."""
     truth, last = real.truth, last_before_reversal(real.truth)
     reckoned = energy_all_pairs(continue_path(truth, log.motion[:, :3], last), truth).total
@@ -146,7 +134,7 @@ def continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> WalkEn
     before = slice(last + 1)
     turn = align(real.trajectory[before], truth[before])[2]
     heading = float(wrap(real.trajectory[last, 2] + turn - truth[last, 2]))
-    return WalkEnd(last + 1, reckoned, drawn, heading)
+    return _WalkEnd(last + 1, reckoned, drawn, heading)
 
 
 def energy(result: SessionResult, steps: int | None = None, *, odometry: bool = False) -> float:
@@ -155,7 +143,7 @@ def energy(result: SessionResult, steps: int | None = None, *, odometry: bool = 
     return float(energy_all_pairs(path[:steps], result.truth[:steps]).total)
 
 
-def table(walks: list[WalkResult]) -> list[str]:
+def table(walks: list[_WalkResult]) -> list[str]:
     """The lines of the table."""
     lines = [
         "| maze | whisks | EM | odometry | simulated whiskers | one direction only | shuffled (closures) "
@@ -180,7 +168,7 @@ def table(walks: list[WalkResult]) -> list[str]:
     ]
 
 
-def _line(walk: WalkResult) -> str:
+def _line(walk: _WalkResult) -> str:
     """The row of a walk."""
     real, three = walk.real, walk.end.turned
     false = closure_errors(real) > FALSE_CLOSURE_DISTANCE if len(real.closures) else np.zeros(0, bool)
@@ -204,7 +192,7 @@ NOTE = (
 )
 
 
-def draw(walks: list[WalkResult], png: Path) -> None:
+def draw(walks: list[_WalkResult], png: Path) -> None:
     """Draws the maps of all walks above those of odometry, aligned with the true path by three circuits."""
     figure, axes = plt.subplots(2, len(walks), figsize=(3.1 * len(walks), 5.6), layout="constrained")
     for column, walk in zip(axes.T, walks, strict=True):
@@ -227,7 +215,7 @@ def draw(walks: list[WalkResult], png: Path) -> None:
     plt.close(figure)
 
 
-FIGURE = RealFigure("A map from real whisker images on a simulated walk", measure, table, draw)
+FIGURE = Figure("A map from real whisker images on a simulated walk", _measure, table, draw)
 
 
 TURNS = 0.05

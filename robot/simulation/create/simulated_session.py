@@ -271,12 +271,18 @@ class CreateRobot:
         config = self.behaviour
         count = planned_rows(config, command)
         time = np.minimum(np.arange(1, count + 1) * config.period, max(command.duration, MIN_DURATION))
-        near = self._near(last.pose, command)
+        # Walls within reach of whiskers or body during the motion.
+        room = max(self.whiskers.reach, config.body) + abs(command.speed) * command.duration
+        near = self.walls[segment_distance(self.walls, last.pose[:2]) < room]
         poses = drive(command, last.pose, time)
         bent = bend_whiskers(self.whiskers, poses, near, last.side)
         strain = base_strains(self.sensors, self.whiskers, bent)
         known = monitor_strain(self.sensors, strain, self.whiskers.alive, config.period, self._random)
-        end = motion_end(config, state, known, self._bumps(last.pose, poses, near), last.contact)
+        bumped = np.zeros(len(poses), bool)  # the body touches a wall and approaches it
+        if len(near):
+            gap = segment_distance(near, np.vstack([last.pose, poses])[:, :2]).min(axis=1)
+            bumped = (gap[1:] < config.body) & (np.diff(gap) < 0)
+        end = motion_end(config, state, known, bumped, last.contact)
         duration = float(time[end.row])
         return CreateStep(
             state,
@@ -287,18 +293,6 @@ class CreateRobot:
             np.abs(known[end.row, :, 0]) > config.contact,
             self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
         )
-
-    def _near(self, pose: np.ndarray, command: WheelCommand) -> np.ndarray:
-        """Walls within reach of whiskers or body during a motion."""
-        room = max(self.whiskers.reach, self.behaviour.body) + abs(command.speed) * command.duration
-        return self.walls[segment_distance(self.walls, pose[:2]) < room]
-
-    def _bumps(self, start: np.ndarray, poses: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """[T] bool, whether the body touches a wall and approaches it."""
-        if not len(near):
-            return np.zeros(len(poses), bool)
-        room = segment_distance(near, np.vstack([start, poses])[:, :2]).min(axis=1)
-        return (room[1:] < self.behaviour.body) & (np.diff(room) < 0)
 
     def _sampled_strain(
         self, last: CreateStep, near: np.ndarray, command: WheelCommand, duration: float

@@ -58,8 +58,7 @@ class TurnConfig(Settings):
 
 
 class BehaviourConfig(Settings):
-    """Settings of the state machine; speeds, times and angles are from the paper, other values are
-    ours."""
+    """Settings of the state machine; speeds, times and angles are from the paper, which has no others."""
 
     fast: PositiveFloat = 0.05
     """Speed of FWD1 and BACK, m/s."""

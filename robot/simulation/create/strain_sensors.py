@@ -95,7 +95,12 @@ def bend_shafts(
     right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
     easier = no_side.copy()
     easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
-    sides = _bending_sides(blocked, easier, side)
+    # A whisker bends to the easier side at first contact, and to the same side as long as it is blocked.
+    was = np.vstack([side != 0, blocked[:-1]])
+    rows = np.arange(len(blocked))[:, None]
+    onset = np.maximum.accumulate(np.where(blocked & ~was, rows, -1), axis=0)
+    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
+    sides = np.where(blocked, since, 0)
     way = sides[row, whisker]
     chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
     turn, reach, lean = (free.copy() for _ in range(3))
@@ -158,15 +163,6 @@ def _free_ends(low: _Ends, high: _Ends) -> _Ends:
     return _Ends(angle, radius, near, away)
 
 
-def _bending_sides(blocked: np.ndarray, easier: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """The bending side [T, W] of each whisker: the easier one at first contact, constant afterwards."""
-    was = np.vstack([side != 0, blocked[:-1]])
-    row = np.arange(len(blocked))[:, None]
-    onset = np.maximum.accumulate(np.where(blocked & ~was, row, -1), axis=0)
-    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
-    return np.where(blocked, since, 0)
-
-
 def _solve_contacts(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, reach and lean [K] of whiskers in contact at that end."""
     turn, reach = end.angle.copy(), end.radius.copy()
@@ -218,8 +214,7 @@ class ShakeConfig(Settings):
 
 
 class WhiskersConfig(Settings):
-    """Four whiskers, tapered linearly. Lengths and diameters are from the paper, other defaults
-    are ours."""
+    """Four whiskers, tapered linearly; the paper gives their lengths and diameters only."""
 
     mounts: Annotated[tuple[MountConfig, ...], Field(min_length=1)] = (
         MountConfig(x=0.10, y=0.08, direction_deg=50.0),

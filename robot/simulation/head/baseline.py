@@ -34,6 +34,11 @@ class BaselineConfig(Settings):
     creep_time: PositiveFloat = 0.6
     """Time in which it bends and relaxes to 1/e, s."""
 
+    @property
+    def is_on(self) -> bool:
+        """Whether there is colour, drift or creep."""
+        return bool(self.colour or self.drift or self.creep)
+
 
 HALL_BASELINE = BaselineConfig(colour=1.0, colour_time=0.005, drift=1.5, creep=0.03, creep_time=0.6)
 """Fitted to magnetic (Hall) whiskers that an arm pushes through clutter (arXiv 2406.06038): colour and drift
@@ -94,13 +99,8 @@ def _recur(keep: float, value: np.ndarray, before: np.ndarray) -> tuple[np.ndarr
     return found.reshape(value.shape), after
 
 
-def has_baseline(config: BaselineConfig) -> bool:
-    """Whether colour, drift or creep is on."""
-    return bool(config.colour or config.drift or config.creep)
-
-
 def make_baseline(
     config: BaselineConfig, noise: float, rate: float, whiskers: int, seed: int
 ) -> Baseline | None:
     """The baseline of a head at the start of its record; None if it is off."""
-    return Baseline(config, noise, rate, whiskers, seed) if has_baseline(config) else None
+    return Baseline(config, noise, rate, whiskers, seed) if config.is_on else None

@@ -33,6 +33,10 @@ class BeamConfig(Settings):
     friction: NonNegativeFloat = 0.3
     """Coulomb friction coefficient of a whisker on a wall."""
 
+    def time_unit(self, length: float) -> float:
+        """Time unit of the unit beam for a whisker of a length (m), s."""
+        return float(length**2 * 2 / self.radius * np.sqrt(self.density / self.modulus))
+
 
 class ServoConfig(Settings):
     """A drive as a spring and damper on a rotor; its stiffness is `MechanicsConfig.servo`."""
@@ -105,11 +109,6 @@ def make_beam(config: ShaftConfig) -> Beam:
         moment=loads,
         unit=3 * (1 / config.reference - (1 - config.taper)),
     )
-
-
-def beam_time_unit(config: BeamConfig, length: float) -> float:
-    """Time unit of the unit beam, s."""
-    return float(length**2 * 2 / config.radius * np.sqrt(config.density / config.modulus))
 
 
 def _integrate(value: np.ndarray) -> np.ndarray:

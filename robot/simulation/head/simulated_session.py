@@ -3,10 +3,9 @@
 Every part draws from its own random stream (maze.loop, maze.walls, maze.heights, path, motion, sensor,
 colour, drift, odometry), so that changing one part leaves the others unchanged.
 
-The dynamic fidelity: drives with inertia, whiskers with two bending modes, elastic walls.
-
-Each whisker is a linear system of six states, its angle and the two loads of `Beam` with their rates, driven
-by the command (linear between samples) and the force of the wall (constant between samples), and is
+The dynamic fidelity, `simulate_dynamic`, has drives with inertia, whiskers with two bending modes and elastic
+walls. Each whisker is a linear system of six states, its angle and the two loads of `Beam` with their rates,
+driven by the command (linear between samples) and the force of the wall (constant between samples), and is
 integrated exactly by a matrix exponential. The wall is a stiff spring whose force is taken at the end of the
 sample (implicit, stable at any stiffness):
     force = spring x (depth without force) / (1 + spring x give).
@@ -23,9 +22,10 @@ import numpy as np
 from pydantic import Field, NonNegativeInt
 from scipy.linalg import expm
 
-from robot.simulation.head.baseline import has_baseline, make_baseline
-from robot.simulation.head.beam import Beam, StreamConfig, beam_time_unit, make_beam
+from robot.simulation.head.baseline import make_baseline
+from robot.simulation.head.beam import Beam, StreamConfig, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
+from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.whisk_stream import (
     WallSweep,
     simulate_cycles,
@@ -39,7 +39,6 @@ from robot.sources.in_memory import (
     digest_of_document,
     wrap_headings,
 )
-from robot.sources.odometry import OdometryConfig, simulate_odometry
 from robot.sources.source import SimulationInfo, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE, maze_text
 from robot.world.scene import (
@@ -52,12 +51,11 @@ from robot.world.scene import (
     other_surroundings,
     poses_at,
 )
-from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Whisk
-from tactile.calibration import Calibration, CalibrationConfig, calibrate
+from tactile.calibration import CalibrationConfig, calibrate
 from tactile.contact_threshold import stiffness
 from tactile.whisker_geometry import HeadConfig, ur10_head
 from tactile.whisking import (
@@ -127,7 +125,7 @@ def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
     lengths, which = np.unique(head.length, return_inverse=True)
     steps, pushes = [], []
     for length in lengths:
-        unit = beam_time_unit(config.beam, float(length))
+        unit = config.beam.time_unit(float(length))
         sample = 1 / (config.rate * unit)
         rotor = servo / (2 * np.pi * config.servo.frequency * unit) ** 2
         mass = np.zeros((3, 3))
@@ -209,7 +207,7 @@ def choose_tier(config: SimulationConfig) -> ChosenTier:
         InputError: raw samples, or a baseline that acts on them, are requested, but the configured fidelity
             has none.
     """
-    on = has_baseline(config.mechanics.baseline)
+    on = config.mechanics.baseline.is_on
     if config.fidelity == "kinematic" and (config.raw or on):
         found = "kinematic, which has no raw samples" + (" for mechanics.baseline to act on" if on else "")
         raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
@@ -258,13 +256,29 @@ class HeadSimulation(SimulatedSource):
         self.kidnapped[rows[rows < count]] = True
         random = stream(seed, "odometry")
         self.odometry = simulate_odometry(config.odometry, self.time, pose, random, self.kidnapped)
-        self._parts = self._surroundings()
+        self._parts = [(self.scene.surroundings, slice(None))]  # walls, and the cycles to which they apply
+        if config.later_maze is not None:
+            change = int(config.later_maze * count)
+            other = other_surroundings(self.scene, config.maze, head, seed)
+            self._parts = [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
         mechanics = config.mechanics
         self._baseline = make_baseline(
             mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
         )
-        self.calibration = None if self.tier.name == "kinematic" else self._calibrate()
-        self.features = self._kinematic() if self.calibration is None else None
+        self.calibration, self.features = None, None
+        if self.tier.name == "kinematic":
+            parts = []
+            for surroundings, cycles in self._parts:
+                random = stream(seed, "sensor")  # noise of the whole session, independent of the maze
+                columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
+                parts.append([column[cycles] for column in columns])
+            features = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            self.features = WhiskColumns(*features)
+        else:  # free whisking before the session
+            whisks = int(np.ceil(config.calibration.min_duration * whisking.rate))
+            random, model = stream(seed, "calibration"), RAW_TIERS[self.tier.name]
+            record = simulate_free_cycles(model, self._setup, whisks, random, self._baseline)
+            self.calibration = calibrate(config.calibration, record, where="simulation")
 
         plain = config.model_dump(mode="json", exclude={"maze": {"file"}})
         drawing = maze_text(self.scene.maze) if config.maze.file else ""
@@ -297,32 +311,6 @@ class HeadSimulation(SimulatedSource):
     @property
     def whiskers(self) -> int:
         return len(self.head.length)
-
-    def _surroundings(self) -> list[tuple[Surroundings, slice]]:
-        """Walls, and the cycles to which they apply."""
-        later = self.config.later_maze
-        if later is None:
-            return [(self.scene.surroundings, slice(None))]
-        change = int(later * self.length)
-        other = other_surroundings(self.scene, self.config.maze, self.head, self.config.seed)
-        return [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
-
-    def _kinematic(self) -> WhiskColumns:
-        parts = []
-        for surroundings, rows in self._parts:
-            random = stream(self.config.seed, "sensor")  # noise of the whole session, independent of the maze
-            columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
-            parts.append([column[rows] for column in columns])
-        return WhiskColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-    def _calibrate(self) -> Calibration:
-        """Calibration from free whisking before the session."""
-        config = self.config
-        count = int(np.ceil(config.calibration.min_duration * config.whisking.rate))
-        random = stream(config.seed, "calibration")
-        model = RAW_TIERS[self.tier.name]
-        record = simulate_free_cycles(model, self._setup, count, random, self._baseline)
-        return calibrate(config.calibration, record, where="simulation")
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is None:

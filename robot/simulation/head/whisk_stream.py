@@ -1,7 +1,7 @@
 """Walls in the sweep of whiskers at every sample, and cycles of raw samples from a mechanics model.
 
-The quasistatic fidelity: whiskers and drives in static equilibrium at every sample, with sensors and
-feedback.
+Here is the model of the quasistatic fidelity: whiskers and drives are in static equilibrium at every sample,
+with sensors and feedback.
 
 Of the commanded angle beyond the wall the whisker bends by the fraction servo / (servo + k), where k is its
 stiffness at the contact relative to that at the reference. The sensor reads the moment, k times the bend. A

@@ -74,11 +74,6 @@ class Timeline(NamedTuple):
     distal_turn: np.ndarray
 
 
-def boxes_of(box: BoxConfig, phases: tuple[PhaseConfig, ...]) -> list[BoxConfig]:
-    """The box of a session and those of its phases, in their order; a `Timeline` has their numbers."""
-    return [box, *(phase.box for phase in phases if phase.box is not None)]
-
-
 def lay_out_phases(
     phases: tuple[PhaseConfig, ...], box: BoxConfig, position: np.ndarray, rows: int, rate_hz: float
 ) -> Timeline:
@@ -102,7 +97,11 @@ def lay_out_phases(
     )
     changed, swaps = np.zeros(rows, bool), 0
     for number, phase in enumerate(phases):
-        part = _rows_of(phase, f"{KEY}.{number}", rows, rate_hz)
+        first = _first_row(phase.start, rate_hz)
+        if first >= rows:
+            found, expected = f"{phase.start:g} s", f"a time within the session of {rows / rate_hz:g} s"
+            raise InputError(f"{KEY}.{number}.start", found, expected)
+        part = slice(first, rows if phase.end is None else min(_first_row(phase.end, rate_hz), rows))
         timeline.dark[part] |= phase.dark
         turn = np.radians(phase.rotate_cues_deg)
         timeline.card_turn[part] += turn * (phase.cues != "distal")
@@ -121,14 +120,6 @@ def lay_out_phases(
             timeline.scale[part] = timeline.stretch[part] = phase.stretch
     _kidnap(phases, timeline, position, rate_hz)
     return timeline
-
-
-def _rows_of(phase: PhaseConfig, key: str, rows: int, rate_hz: float) -> slice:
-    first = _first_row(phase.start, rate_hz)
-    if first >= rows:
-        found, expected = f"{phase.start:g} s", f"a time within the session of {rows / rate_hz:g} s"
-        raise InputError(f"{key}.start", found, expected)
-    return slice(first, rows if phase.end is None else min(_first_row(phase.end, rate_hz), rows))
 
 
 def _first_row(time: float, rate_hz: float) -> int:

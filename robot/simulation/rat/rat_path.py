@@ -1,7 +1,4 @@
-"""The path of a rat, and its pose at even times.
-
-Odometry of a rat: its true motion with errors of speed and heading.
-"""
+"""The path of a rat, its poses at even times, and its odometry: the true motion with errors."""
 
 from __future__ import annotations
 
@@ -85,7 +82,7 @@ def sample_path(path: RatPath, config: MotionConfig, rate_hz: float, smoothing: 
 
     Positions are interpolated by monotone cubics (PCHIP; Fritsch & Carlson 1980) and smoothed by a Gaussian;
     they stay within the bounds of the given ones. Without given headings, the heading is the direction of
-    motion (`heading_of_motion`).
+    motion (`_heading_of_motion`).
 
     Args:
         smoothing: standard deviation of the Gaussian, s.
@@ -100,13 +97,13 @@ def sample_path(path: RatPath, config: MotionConfig, rate_hz: float, smoothing: 
     if smoothing:
         position = gaussian_filter1d(position, smoothing * rate_hz, axis=0, mode="nearest")
     if path.heading is None:
-        heading = heading_of_motion(position, config, rate_hz)
+        heading = _heading_of_motion(position, config, rate_hz)
     else:
         heading = np.interp(time, path.time, np.unwrap(path.heading))
     return np.column_stack([position, heading])
 
 
-def heading_of_motion(position: np.ndarray, config: MotionConfig, rate_hz: float) -> np.ndarray:
+def _heading_of_motion(position: np.ndarray, config: MotionConfig, rate_hz: float) -> np.ndarray:
     """[M] heading, rad, not wrapped, of positions [M, 2] at a rate: the direction of motion.
 
     While the rat is slower than `standing`, the direction holds, before its first motion that of the first

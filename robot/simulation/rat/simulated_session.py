@@ -1,13 +1,13 @@
 """A simulated session of a rat in a box with cues as a source, bit-identical for the same settings.
 
-A random walk of a rat in a box: Ornstein-Uhlenbeck speed and turning, drawn to the walls.
-
-After Raudies & Hasselmo 2012 and RatInABox (George et al. 2024), whose means and times the defaults are.
+Its random walk has Ornstein-Uhlenbeck speed and turning and is drawn to the walls, after Raudies & Hasselmo
+2012 and RatInABox (George et al. 2024), whose means and times the defaults are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from math import atan2, cos, exp, pi, sin
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 from robot.recordings.csv_file import read_csv
 from robot.recordings.sanity_checks import RowName
 from robot.simulation.rat.box import BoxConfig, ViewConfig, panoramic_views
-from robot.simulation.rat.phases import PhaseConfig, boxes_of, lay_out_phases
+from robot.simulation.rat.phases import PhaseConfig, lay_out_phases
 from robot.simulation.rat.rat_path import (
     MotionConfig,
     RatOdometryConfig,
@@ -88,7 +88,16 @@ def read_path(config: PathFileConfig) -> RatPath:
     """
     file = PACKAGED.get(str(config.file), config.file)
     require_file(file)
-    path, place = _read_csv_path(file) if file.suffix == ".csv" else _read_npz_path(file)
+    place: RowName
+    if file.suffix == ".csv":
+        table = read_csv(file)
+        raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
+        raise_errors(table.judge(["t", "x", "y"])[1])
+        position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
+        path, place = RatPath(table.column("t", "time"), position), table.place
+    else:
+        path = read_npz(file, ("t", "pos"), _parse_arrays, "a path: arrays t [N] and pos [N, 2]")
+        place = partial("{}:{}".format, file)
     path = path._replace(position=path.position * config.unit + np.asarray(config.shift))
     check_path(path, config, place)
     kept = path.time >= path.time[0] + config.skip
@@ -99,30 +108,15 @@ def read_path(config: PathFileConfig) -> RatPath:
     return RatPath(path.time[kept], path.position[kept])
 
 
-def _read_csv_path(file: Path) -> tuple[RatPath, RowName]:
-    table = read_csv(file)
-    raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
-    raise_errors(table.judge(["t", "x", "y"])[1])
-    position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
-    return RatPath(table.column("t", "time"), position), table.place
-
-
-def _read_npz_path(file: Path) -> tuple[RatPath, RowName]:
-    path = read_npz(file, ("t", "pos"), _parse_arrays, "a path: arrays t [N] and pos [N, 2]")
-    return path, lambda row: f"{file}:{row}"
-
-
 def _parse_arrays(time: np.ndarray, position: np.ndarray) -> RatPath:
+    """The path of arrays t [N] and pos [N, 2] in s and m; integers are thousandths."""
     if time.ndim != 1 or position.shape != (len(time), 2):
         raise ValueError(f"t {list(time.shape)} and pos {list(position.shape)}")
-    return RatPath(_in_units(time), _in_units(position))
-
-
-def _in_units(values: np.ndarray) -> np.ndarray:
-    """Values in s or m; integers are thousandths."""
-    if np.issubdtype(values.dtype, np.integer):
-        return values / 1000.0
-    return values.astype(np.float64)
+    time, position = (
+        values / 1000.0 if np.issubdtype(values.dtype, np.integer) else values.astype(np.float64)
+        for values in (time, position)
+    )
+    return RatPath(time, position)
 
 
 class RandomWalkConfig(Settings):
@@ -268,12 +262,17 @@ class RatSimulation(SimulatedSource):
         self.config = config
         self.view_shape = (1, config.views.columns, 1)
         pose = _poses_of(config, path)
-        rows = _count_rows(config, len(pose))
+        rows = len(pose)
+        if config.seconds is not None:
+            rows = max(round(config.seconds * config.rate_hz), 1)
+            if rows > len(pose):
+                there = f"at most the {len(pose) / config.rate_hz:g} s of the path"
+                raise InputError("rat_simulation.seconds", f"{config.seconds:g} s", there)
         self.timeline = lay_out_phases(config.phases, config.box, pose[:, :2], rows, config.rate_hz)
         self.time = np.arange(rows) / config.rate_hz
         source, scale = self.timeline.source, self.timeline.scale
-        here = scale_poses(pose[source], scale)
-        before = scale_poses(pose[np.maximum(source - 1, 0)], scale)
+        here = _scale_poses(pose[source], scale)
+        before = _scale_poses(pose[np.maximum(source - 1, 0)], scale)
         self.truth = wrap_headings(here)
         motion = np.column_stack(
             [between(before, here)[:, :2], here[:, 2] - before[:, 2], np.full(rows, 1.0)]
@@ -281,7 +280,8 @@ class RatSimulation(SimulatedSource):
         motion[:, 3] /= config.rate_hz
         motion[0] = 0.0
         self.odometry = measure_motion(config.odometry, motion, config.seed)
-        self._boxes = boxes_of(config.box, config.phases)
+        # The timeline has the numbers of these boxes.
+        self._boxes = [config.box, *(phase.box for phase in config.phases if phase.box is not None)]
         self.info = _describe(config, self._boxes)
         document = digest_of_document(self.info.provenance)
         self.digest = digest_of([document.encode(), np.ascontiguousarray(pose).tobytes()])
@@ -314,7 +314,7 @@ class RatSimulation(SimulatedSource):
             yield observation(NO_ODOMETRY, view, view_shape=self.view_shape)
 
 
-def scale_poses(pose: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _scale_poses(pose: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """[N, 3] poses [N, 3] in a box whose width and height have changed by factors [N, 2]; headings remain the
     direction of motion and are not wrapped."""
     heading = pose[:, 2]
@@ -351,16 +351,6 @@ def _enter_box(path: RatPath, size: tuple[float, float], where: str) -> RatPath:
         found = f"{len(far)} positions up to {beyond.max():.3g} m outside, the first ({x:.3g}, {y:.3g}) at "
         raise InputError(where, f"{found}{path.time[far[0]]:.6g} s", box, cure)
     return path._replace(position=inside)
-
-
-def _count_rows(config: RatSimulationConfig, there: int) -> int:
-    if config.seconds is None:
-        return there
-    rows = max(round(config.seconds * config.rate_hz), 1)
-    if rows > there:
-        found, expected = f"{config.seconds:g} s", f"at most the {there / config.rate_hz:g} s of the path"
-        raise InputError("rat_simulation.seconds", found, expected)
-    return rows
 
 
 def _describe(config: RatSimulationConfig, boxes: list[BoxConfig]) -> SourceInfo:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.papers.maps.reproduction import ROWS
+from evaluation.papers.figure import MAPS
 from ratslam.cli import GROUPS, build_parser, main
 from ratslam.cli.common import Commands
 
@@ -32,7 +32,7 @@ def test_the_help_of_saved_maps_lists_every_row(capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit):
         main(["reproduce", "maps", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert all(row in text for row in ROWS)
+    assert all(row in text for row in MAPS)
 
 
 def test_the_help_loads_no_numerics() -> None:

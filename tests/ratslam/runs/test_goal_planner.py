@@ -13,7 +13,7 @@ from evaluation.papers.maps.goals import VirtualArm
 from ratslam.runs.goal_planner import GoalPlanner, felt_points
 from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_config import GoalConfig, LiveConfig
-from robot.world.maze import Maze, between_cells, cell_centre, random_maze, wall_boxes
+from robot.world.maze import Maze, cell_centre, random_maze, wall_boxes
 from robot.world.scene import MotionConfig
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
@@ -37,7 +37,7 @@ def maze(loop_open: bool = True) -> Maze:
 
 
 def close(made: Maze, a, b) -> None:
-    wall, place = between_cells(made, a, b)
+    wall, place = made.between_cells(a, b)
     wall[place] = True
 
 

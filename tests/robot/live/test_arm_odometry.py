@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmOdometry
-from robot.sources.odometry import OdometryConfig
+from robot.simulation.head.odometry_errors import OdometryConfig
 from tactile.base.se2 import compose, integrate
 
 HZ = 125.0

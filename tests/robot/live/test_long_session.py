@@ -15,7 +15,7 @@ from robot.drivers.head.decoder import make_cut
 from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmOdometry
-from robot.sources.odometry import OdometryConfig
+from robot.simulation.head.odometry_errors import OdometryConfig
 from tests.robot.live.live_recordings import RATE, START, open_recorder, some_frames, some_states
 
 HZ = 125

@@ -17,10 +17,6 @@ from robot.world.arena import (
     Arena,
     ArenaConfig,
     arena_text,
-    has_clearance,
-    in_free_space,
-    is_enclosed,
-    is_occupied,
     make_arena,
     place_start,
     read_arena,
@@ -61,7 +57,7 @@ def test_passages_are_wide_enough(seed: int, config: ArenaConfig) -> None:
         assert room < 1e-9 or room >= config.passage
         for other in arena.objects[:number]:
             assert polygon_gap(one, other) >= config.passage
-    assert has_clearance(arena, arena.start[:2], 0.2)
+    assert arena.has_clearance(arena.start[:2], 0.2)
 
 
 @settings(max_examples=12)
@@ -70,7 +66,7 @@ def test_all_free_space_is_connected(seed: int, config: ArenaConfig) -> None:
     arena = make_arena(config, seed)
     axis = np.arange(0.005, config.side, 0.02)
     places = np.stack(np.meshgrid(axis, axis), axis=-1)
-    _, regions = label(has_clearance(arena, places, 0.18))
+    _, regions = label(arena.has_clearance(places, 0.18))
     assert regions == 1
 
 
@@ -100,7 +96,7 @@ def test_the_share_of_objects_at_walls_is_configurable() -> None:
 def test_starts_in_one_arena_differ_and_are_free(seed: int) -> None:
     place = make_arena(ArenaConfig(seed=1), 0)
     one, other = place_start(place, seed), place_start(place, seed + 1)
-    assert has_clearance(one, one.start[None, :2], OTHER_START_CLEARANCE).all()
+    assert one.has_clearance(one.start[None, :2], OTHER_START_CLEARANCE).all()
     assert not np.allclose(one.start, other.start)
     assert one.objects is place.objects
 
@@ -146,10 +142,10 @@ def test_a_line_from_inside_to_outside_crosses_an_odd_number_of_walls(seed: int,
     arena = make_arena(config, seed)
     points = np.random.default_rng(seed).uniform(-0.2, config.side + 0.2, (40, 2, 2))
     crossings = segments_cross(points.reshape(-1, 4), wall_segments(arena)).sum(axis=1)
-    free = in_free_space(arena, points)
+    free = arena.in_free_space(points)
     assert ((crossings % 2 == 1) == (free[:, 0] != free[:, 1])).all()
-    assert (is_occupied(arena, points) == ~free).all()
-    assert (free <= is_enclosed(arena, points)).all()
+    assert (arena.is_occupied(points) == ~free).all()
+    assert (free <= arena.is_enclosed(points)).all()
 
 
 def test_the_occupied_area_is_that_of_the_objects() -> None:
@@ -157,8 +153,8 @@ def test_the_occupied_area_is_that_of_the_objects() -> None:
     axis = (np.arange(250) + 0.5) / 250 * 1.25
     cells = np.stack(np.meshgrid(axis, axis), axis=-1)
     expected = sum(polygon_area(one) for one in arena.objects) / 1.25**2
-    assert is_occupied(arena, cells).mean() == pytest.approx(expected, rel=0.01)
-    assert is_occupied(arena, cells + 5).all()
+    assert arena.is_occupied(cells).mean() == pytest.approx(expected, rel=0.01)
+    assert arena.is_occupied(cells + 5).all()
 
 
 @given(SEEDS)
@@ -209,10 +205,10 @@ def test_an_arena_file_gives_walls_objects_and_start(tmp_path: Path) -> None:
     assert len(read.objects) == 2
     assert np.allclose(read.start, [1, 1, np.pi / 2])
     assert polygon_area(read.objects[0]) == pytest.approx(0.04)
-    assert not in_free_space(read, np.array([0.3, 1.7]))
-    assert not in_free_space(read, np.array([1.9, 1.2]))
+    assert not read.in_free_space(np.array([0.3, 1.7]))
+    assert not read.in_free_space(np.array([1.9, 1.2]))
     path.write_text(GOOD.replace("outer 0 0  2 0  2 2  0 2", "outer 0 2  2 2  2 0  0 0"))  # clockwise
-    assert (in_free_space(read_arena(path), np.array([[1.0, 1.0], [1.9, 1.2]])) == [True, False]).all()
+    assert (read_arena(path).in_free_space(np.array([[1.0, 1.0], [1.9, 1.2]])) == [True, False]).all()
 
 
 @pytest.mark.parametrize(

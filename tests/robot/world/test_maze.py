@@ -20,9 +20,7 @@ from robot.world.maze import (
     change_walls,
     closed_maze,
     describe_box,
-    is_open,
     maze_text,
-    neighbours,
     random_loop,
     random_maze,
     read_maze,
@@ -61,7 +59,7 @@ def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: i
     cells = [(column, row) for column in range(columns) for row in range(rows)]
     graph = networkx.Graph()
     graph.add_nodes_from(cells)
-    graph.add_edges_from((cell, other) for cell in cells for other in neighbours(maze, cell))
+    graph.add_edges_from((cell, other) for cell in cells for other in maze.neighbours(cell))
     assert networkx.is_tree(graph)
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
@@ -90,7 +88,7 @@ def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
     for k, cell in enumerate(loop):
-        assert set(neighbours(maze, cell)) == {loop[k - 1], loop[(k + 1) % 20]}
+        assert set(maze.neighbours(cell)) == {loop[k - 1], loop[(k + 1) % 20]}
     assert (~maze.across).sum() + (~maze.along).sum() == 20
     bare = random_maze(7, 5, loop, 0.0, stream(seed, "maze.walls"))
     assert bare.across.sum() + bare.along.sum() == 2 * 7 + 2 * 5
@@ -124,10 +122,10 @@ def test_a_maze_file_is_read_back_equal(
 def test_the_first_line_of_a_maze_file_is_the_north_wall(tmp_path: Path) -> None:
     (tmp_path / "maze.txt").write_text("o---o---o\n|     S |\no   o---o\n|   | G |\no---o---o\n")
     maze = read_maze(tmp_path / "maze.txt")
-    assert is_open(maze, (0, 1), (1, 1))
-    assert is_open(maze, (0, 0), (0, 1))
-    assert not is_open(maze, (1, 0), (1, 1))
-    assert not is_open(maze, (0, 0), (1, 0))
+    assert maze.is_open((0, 1), (1, 1))
+    assert maze.is_open((0, 0), (0, 1))
+    assert not maze.is_open((1, 0), (1, 1))
+    assert not maze.is_open((0, 0), (1, 0))
 
 
 @pytest.mark.parametrize(
@@ -177,7 +175,7 @@ def test_boxes_are_at_the_walls_of_the_maze(seed: int) -> None:
     for a, b in (((2, 2), (3, 2)), ((2, 2), (2, 3)), ((0, 0), (1, 0)), ((6, 3), (6, 4))):
         x, y = (cell_centre(a) + cell_centre(b)) / 2
         hit = (inside[:, 0] < x) & (x < inside[:, 2]) & (inside[:, 1] < y) & (y < inside[:, 3])
-        assert hit.any() != is_open(maze, a, b)
+        assert hit.any() != maze.is_open(a, b)
     # No two boxes overlap.
     west, south, east, north = (boxes.box + [1e-9, 1e-9, -1e-9, -1e-9]).T
     over = (
@@ -204,7 +202,7 @@ def test_boxes_have_names() -> None:
 
 def test_cells_that_are_not_neighbours_are_a_programming_error() -> None:
     with pytest.raises(ValueError, match="not neighbours"):
-        is_open(maze_of(0), (0, 0), (1, 1))
+        maze_of(0).is_open((0, 0), (1, 1))
 
 
 def test_changed_walls_are_those_named() -> None:

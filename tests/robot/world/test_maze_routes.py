@@ -15,9 +15,7 @@ from robot.world.maze import (
     circuit_route,
     closed_maze,
     exploration_route,
-    is_open,
     make_anticlockwise,
-    neighbours,
     random_loop,
     random_maze,
     winding_loop,
@@ -52,14 +50,14 @@ def test_routes_pass_no_wall(seed: int) -> None:
     assert len(way) == 300
     check_route(maze, way)
     for before, here, after in zip(way, way[1:], way[2:], strict=False):
-        assert after != before or neighbours(maze, here) == [before]
+        assert after != before or maze.neighbours(here) == [before]
 
 
 def test_exploration_visits_all_reachable_cells() -> None:
     maze, loop = world(1)
     there, edge = {loop[0]}, [loop[0]]
     while edge:
-        edge = [cell for here in edge for cell in neighbours(maze, here) if cell not in there]
+        edge = [cell for here in edge for cell in maze.neighbours(here) if cell not in there]
         there.update(edge)
     assert set(exploration_route(maze, loop[0], 20_000, stream(1, "path"))) == there
 
@@ -85,7 +83,7 @@ def test_invalid_words_are_refused(word: str, refused: Callable[..., InputError]
 def test_a_route_through_a_wall_is_refused_with_its_step(refused: Callable[..., InputError]) -> None:
     maze, loop = world(0)
     rows = [[(x, y) for x in range(7)] for y in range(5)]
-    blocked = next([a, b] for row in rows for a, b in pairwise(row) if not is_open(maze, a, b))
+    blocked = next([a, b] for row in rows for a, b in pairwise(row) if not maze.is_open(a, b))
     wall = f"the wall between cells {blocked[0]} and {blocked[1]}"
     refused(lambda: check_route(maze, blocked), "simulation.path.cells[0] to [1]", wall)
     refused(lambda: check_route(maze, [(0, 0), (7, 0)]), "cells[1]", "cell (7, 0)", "columns 0 to 6")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.packet_figures import (
     PATHS,
     RATE,
@@ -18,13 +17,14 @@ from evaluation.papers.cells.packet_figures import (
     measure_anchoring,
     table_anchoring,
 )
+from evaluation.papers.figure import Task
 
 SHORT = Schedule(test=20.0, back=28.0, end=34.0)
 
 
 @pytest.fixture(scope="module")
 def result() -> AnchoringResult:
-    return measure_anchoring(CellTask(41000, sessions=1), SHORT)
+    return measure_anchoring(Task(41000, sessions=1), SHORT)
 
 
 def test_sessions_are_equal_until_the_test(result: AnchoringResult) -> None:

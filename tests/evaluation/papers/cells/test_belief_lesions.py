@@ -22,7 +22,7 @@ from evaluation.papers.cells.belief_lesions import (
     silent_cells,
     table_lesions,
 )
-from evaluation.papers.cells.figure import CellTask
+from evaluation.papers.figure import Task
 from evaluation.papers.tables import touch_table as touch
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
@@ -38,7 +38,7 @@ def result() -> LesionResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("RATSLAM_DATA", raising=False)
         patch.setitem(touch.ROWS, "short", SHORT)
-        return measure_lesions(CellTask(31001, sessions=1), CHOSEN, ("short",))
+        return measure_lesions(Task(31001, sessions=1), CHOSEN, ("short",))
 
 
 def test_the_intact_network_closes_loops_and_a_renamed_one_the_same(result: LesionResult) -> None:
@@ -69,7 +69,7 @@ def test_table_and_picture(result: LesionResult, tmp_path: Path) -> None:
 def sizes() -> SizeResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(touch.ROWS, "short", SHORT)
-        return measure_sizes(CellTask(31001, sessions=1), "short", sides=(7, 21), sizes=())
+        return measure_sizes(Task(31001, sessions=1), "short", sides=(7, 21), sizes=())
 
 
 @pytest.mark.soak

@@ -37,10 +37,10 @@ from evaluation.papers.cells.belief_world import (
     room_closures,
     transition,
 )
-from evaluation.papers.cells.figure import CellTask
+from evaluation.papers.figure import Task
 from ratslam.network.config import PoseCellConfig
 
-SMALL = CellTask(41000, sessions=2)
+SMALL = Task(41000, sessions=2)
 
 
 @pytest.fixture(scope="module")

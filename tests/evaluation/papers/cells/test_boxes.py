@@ -20,8 +20,8 @@ from evaluation.papers.cells.boxes import (
     one_of_each,
     sum_columns,
 )
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.rat_sessions import rat_config
+from evaluation.papers.figure import Task
 
 BINS = 21
 CENTRES = np.random.default_rng(0).uniform(0, BINS, (40, 2))
@@ -107,7 +107,7 @@ def test_columns_are_places_with_headings_all_the_way_round():
 
 @pytest.mark.soak
 def test_a_short_session_gives_table_and_picture(tmp_path):
-    result = measure_boxes(CellTask(41009, 1), seconds=12.0, columns=8)
+    result = measure_boxes(Task(41009, 1), seconds=12.0, columns=8)
     assert result.side < result.torus
     text = "\n".join(FIGURE.table(result))
     assert "A with B, best common turn and shift" in text

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.packet_figures import (
     DRIFT,
     LEVELS,
@@ -19,13 +18,14 @@ from evaluation.papers.cells.packet_figures import (
     rms,
     table_drift,
 )
+from evaluation.papers.figure import Task
 
 CELL = np.array([0.05, np.radians(10)])
 
 
 @pytest.fixture(scope="module")
 def result() -> DriftResult:
-    return measure_drift(CellTask(41000, sessions=1), (10, 20))
+    return measure_drift(Task(41000, sessions=1), (10, 20))
 
 
 def test_without_noise_the_error_is_below_a_cell(result: DriftResult) -> None:

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.rotation import (
     CONDITIONS,
     RotationResult,
@@ -20,6 +19,7 @@ from evaluation.papers.cells.rotation import (
     rotation_of,
     table_rotation,
 )
+from evaluation.papers.figure import Task
 from tactile.base.se2 import wrap
 
 SHORT = Schedule(turn=16.0, late=19.0, end=22.0)
@@ -64,7 +64,7 @@ def test_a_packet_that_follows_odometry_has_not_turned(turn: float) -> None:
 
 @pytest.fixture(scope="module")
 def result() -> RotationResult:
-    return measure_rotation(CellTask(41000, sessions=1), SHORT)
+    return measure_rotation(Task(41000, sessions=1), SHORT)
 
 
 @pytest.mark.soak

@@ -6,15 +6,14 @@ import pytest
 
 from evaluation.papers.cells.agreement import GOAL, agreement_table, compare_scores
 from evaluation.papers.cells.analysis_cost import analysis_table, measure_analysis
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.networks import measure_networks, network_table
-from evaluation.papers.cells.reproduction import NAMES, find_figure
 from evaluation.papers.cells.shuffles import check_shuffles, shuffle_table
+from evaluation.papers.figure import CELLS, Task, find_figure
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CELLS)
 def test_every_figure_has_a_title_and_can_be_measured(name: str) -> None:
-    figure = find_figure(name)
+    figure = find_figure(CELLS[name])
     assert figure.title
     assert callable(figure.measure)
 
@@ -24,14 +23,14 @@ def test_every_figure_has_a_title_and_can_be_measured(name: str) -> None:
 def test_scores_agree_with_other_packages(cells: int, seconds: float) -> None:
     pytest.importorskip("opexebo", reason="compared with")
     pytest.importorskip("pynapple", reason="compared with")
-    found = compare_scores(CellTask(3, cells), seconds=seconds)
+    found = compare_scores(Task(3, cells), seconds=seconds)
     assert {one.score: one.difference() for one in found if not one.difference() <= GOAL} == {}
     assert len(list(agreement_table(found))) == 2 + len(found)
 
 
 @pytest.mark.soak
 def test_shuffles_of_every_score_are_compared() -> None:
-    found = check_shuffles(CellTask(3, 12), shuffles=19, seconds=60.0)
+    found = check_shuffles(Task(3, 12), shuffles=19, seconds=60.0)
     assert len({row.score for row in found.rows}) == 13
     assert all(0 < row.calibration.cells <= 12 for row in found.rows if row.score == "information")
     assert len(list(shuffle_table(found))) == 2 + len(found.rows)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.figure import CellTask
 from evaluation.papers.cells.torus import FIGURE, measure_cells, measure_torus
+from evaluation.papers.figure import Task
 
 RATE = 10.0
 
@@ -49,7 +49,7 @@ def test_a_box_smaller_than_the_torus_holds_no_lattice():
 
 @pytest.mark.soak
 def test_a_short_session_gives_table_and_picture(tmp_path):
-    result = measure_torus(CellTask(41009, 1), seconds=(60.0, 45.0), columns=6, shuffles=19)
+    result = measure_torus(Task(41009, 1), seconds=(60.0, 45.0), columns=6, shuffles=19)
     text = "\n".join(FIGURE.table(result))
     assert "3.33 x 2.38" in text
     assert "0.67 x 0.67" in text

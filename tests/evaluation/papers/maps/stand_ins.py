@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from evaluation.papers.maps.localisation_metrics import nearest_steps
-from evaluation.papers.maps.row import Localised, Methods
+from evaluation.papers.maps.operations import Localised, Methods
 from evaluation.papers.maps.scenarios import Recorded
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap
 from robot.world.maze import CELL_SIDE
@@ -89,3 +89,9 @@ WRONG = Methods(localise_wrongly, extend_wrongly, merge, changes)
 """Sure and wrong; joins everything."""
 APART = ORACLE._replace(merge=keep_apart)
 """Joins nothing."""
+
+
+def cells_by_figure(lines: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """What was measured and the control, by the figure of a line of a Markdown table."""
+    _, *rows = ([cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines)
+    return {figure: (measured, control) for figure, _, measured, control in rows}

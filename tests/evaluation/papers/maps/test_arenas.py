@@ -10,10 +10,10 @@ from evaluation.papers.maps.arenas import (
     ArenaDrive,
     ArenaFigures,
     arena_lines,
-    arena_record,
     shuffled_contacts,
 )
 from evaluation.papers.maps.localising import Judged
+from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 from tests.helpers.grid_world import report
 
 
@@ -36,7 +36,9 @@ def figures(found_at: int, error: float, other_at: int) -> ArenaFigures:
 
 
 def measured(*found: ArenaFigures) -> dict[str, str]:
-    return {line.figure: line.measured.split(" [")[0] for line in arena_lines(found)}
+    return {
+        figure: values[0].split(" [")[0] for figure, values in cells_by_figure(arena_lines(found)).items()
+    }
 
 
 def test_right_and_wrong_sessions_are_counted() -> None:
@@ -51,7 +53,7 @@ def test_right_and_wrong_sessions_are_counted() -> None:
 
 def test_a_session_is_recorded_with_what_it_fails_in() -> None:
     def failed(one: ArenaFigures) -> list[str]:
-        return [name for name, value in arena_record(one).items() if value is True]
+        return [name for name, value in one.record().items() if value is True]
 
     assert failed(figures(SOON - 1, 0.02, REPORTS)) == []
     assert failed(figures(SOON, 0.03, SOON)) == ["missed_soon", "found_elsewhere", "not_said"]

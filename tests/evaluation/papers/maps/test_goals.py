@@ -16,7 +16,6 @@ from evaluation.papers.maps.goals import (
     draw_goals,
     driven_map,
     goal_lines,
-    goal_record,
     shortest_driven,
     walls_of,
 )
@@ -25,6 +24,7 @@ from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
 from robot.live.goal_drive import DriveState
 from robot.world.maze import cell_centre
+from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
 MAZE = 31002
@@ -49,13 +49,13 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
         drive(DriveState.REACHED, 0.01),
     ]
     found = GoalFigures(MAZE, [drive(*end) for end in ends], walled, 120.0, np.zeros((2, 2)), 0.09)
-    lines = {line.figure: (line.measured, line.control) for line in goal_lines([found])}
+    lines = cells_by_figure(goal_lines([found]))
     assert lines["reached (truly within 0.09 m)"][0].startswith("1 of 3")
     assert lines["reached (truly within 0.09 m)"][1].startswith("0 of 3")
     assert lines["said to be reached at a wrong place"][0].startswith("1 of 6")
     assert lines["path over the shortest driven way, all reached"][0] == "1.11"
     assert lines["wall in the way: reached by a new way, or blocked"][0].startswith("2 of 3")
-    record = goal_record(found)
+    record = found.record()
     counts = [record[name] for name in ("not_reached", "wrongly_reached", "in_wall", "wall_not_solved")]
     assert counts == [2, 1, 0, 1]
     assert record["path_ratio"] == pytest.approx(0.2 / 0.18)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.papers.figure import MAPS, find_figure
 from evaluation.papers.maps import merged_maps
 from evaluation.papers.maps import merged_maps as merging
-from evaluation.papers.maps.reproduction import ROWS, reproduce_maps
-from evaluation.papers.maps.row import MapTask, Methods
+from evaluation.papers.maps.operations import MapTask, Methods, reproduce_maps
 from evaluation.papers.maps.scenarios import (
     Recipe,
     carried_sessions,
@@ -24,7 +24,7 @@ from evaluation.papers.maps.scenarios import (
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, map_path
 from evaluation.papers.tables.comparison import read_sessions
 from tactile.base.se2 import compose
-from tests.evaluation.papers.maps.stand_ins import APART, ORACLE, WRONG
+from tests.evaluation.papers.maps.stand_ins import APART, ORACLE, WRONG, cells_by_figure
 
 MAZE = 31000
 MOTION = np.array([1.0, -0.5, 0.7])
@@ -54,9 +54,9 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def measured(name: str, methods: Methods, maps: Path) -> dict[str, Sequence[str]]:
     """The measured value and that of the control, without intervals, of each figure."""
-    row = ROWS[name]
-    lines = row.lines([row.measure(MapTask(MAZE, maps, methods))])
-    return {line.figure: (line.measured.split(" [")[0], line.control.split(" [")[0]) for line in lines}
+    row = find_figure(MAPS[name])
+    cells = cells_by_figure(row.table([row.measure(MapTask(MAZE, maps, methods))]))
+    return {figure: [value.split(" [")[0] for value in values] for figure, values in cells.items()}
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_shuffled_images_find_nothing_with_a_method_that_looks(maps: Path) -> No
 
 def test_what_is_found_in_another_maze_is_counted(maps: Path) -> None:
     found = measured("other maze", ORACLE, maps)  # this stand-in believes to be in every maze
-    assert found["found in another maze, 300 whisks"] == ("1 of 1", "1 of 1")
+    assert found["found in another maze, 300 whisks"] == ["1 of 1", "1 of 1"]
     never = ORACLE._replace(localise=lambda made, recorded: _never(ORACLE, made, recorded))
     assert measured("other maze", never, maps)["found in another maze, 300 whisks"][0] == "0 of 1"
 
@@ -107,7 +107,7 @@ def test_a_merged_map_is_compared_with_one_session_over_both(maps: Path) -> None
 
 
 def test_joined_mazes_are_counted(maps: Path) -> None:
-    assert measured("merge mazes", ORACLE, maps)["joined"] == ("1 of 1", "1 of 1")
+    assert measured("merge mazes", ORACLE, maps)["joined"] == ["1 of 1", "1 of 1"]
     assert measured("merge mazes", APART, maps)["joined"][0] == "0 of 1"
 
 
@@ -134,23 +134,23 @@ def test_a_recording_is_split_into_two_halves(tmp_path: Path, monkeypatch: pytes
     assert first.log.length + second.log.length == whole.log.length
     np.testing.assert_array_equal(np.concatenate([first.truth, second.truth]), whole.truth)
     plant(tmp_path, *recipes)
-    figures = ROWS["buildings"].measure(MapTask(0, tmp_path, ORACLE))
+    figures = find_figure(MAPS["buildings"]).measure(MapTask(0, tmp_path, ORACLE))
     assert figures.found > 0.9
     assert figures.off == 0
     assert figures.shuffled[0] == 0
     assert figures.merged == pytest.approx(figures.whole, abs=1e-9)
-    named = ROWS["buildings"].record(figures)
+    named = figures.record()
     assert (named["not_joined"], named["found"], named["off"]) == (False, figures.found, 0)
 
 
 def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) -> None:
     (tmp_path / "maps").symlink_to(maps)
     names = ["start", "carried", "kidnaps", "merge", "door closed"]
-    text = "\n".join(reproduce_maps(names, ORACLE, tmp_path, MAZE, 1))
+    text = "\n".join(reproduce_maps(MAPS, names, ORACLE, tmp_path, MAZE, 1))
     page = (tmp_path / "maps.md").read_text(encoding="utf-8")
     for name in names:
         picture = f"{name.replace(' ', '_')}.png"
-        assert f"## {ROWS[name].title}" in text
+        assert f"## {find_figure(MAPS[name]).title}" in text
         assert picture in page
         assert (tmp_path / picture).stat().st_size > 10_000
     assert "31000" in page
@@ -161,8 +161,8 @@ def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) 
 
 def failures(name: str, methods: Methods, maps: Path) -> list[str]:
     """What a session of a row fails in."""
-    row = ROWS[name]
-    record = row.record(row.measure(MapTask(MAZE, maps, methods)))
+    row = find_figure(MAPS[name])
+    record = row.measure(MapTask(MAZE, maps, methods)).record()
     assert all(isinstance(value, bool | int | float) for value in record.values())
     return [figure for figure, value in record.items() if value is True]
 
@@ -198,9 +198,11 @@ def test_two_runs_of_saved_maps_are_compared_by_figure(maps: Path, tmp_path: Pat
     for folder in (tmp_path / "old", tmp_path / "new"):
         folder.mkdir()
         (folder / "maps").symlink_to(maps)
-    list(reproduce_maps(["start", "wall moved"], ORACLE, tmp_path / "old", MAZE, 1))
+    list(reproduce_maps(MAPS, ["start", "wall moved"], ORACLE, tmp_path / "old", MAZE, 1))
     lines = list(
-        reproduce_maps(["start", "wall moved"], WRONG, tmp_path / "new", MAZE, 1, against=tmp_path / "old")
+        reproduce_maps(
+            MAPS, ["start", "wall moved"], WRONG, tmp_path / "new", MAZE, 1, against=tmp_path / "old"
+        )
     )
     assert "| start | missed | 1 | 0 | 1 | - | 0, 1 (1) |" in lines
     assert "| start | whisks | 1 | 11.000 | inf | inf [-] | - |" in lines

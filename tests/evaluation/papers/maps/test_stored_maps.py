@@ -30,7 +30,7 @@ def test_a_grid_map_of_other_code_is_not_used_again(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(arenas, "open_observations", lambda _: pytest.fail("made again"))
     (tmp_path / "arena_7_1.25-this.npz").touch()
     np.savez(tmp_path / "arena_7_1.25-this.steps.npz", trajectory=np.zeros((5, 3)), truth=np.zeros((5, 3)))
-    assert len(arenas.store_arena_map(7, 1.25, tmp_path).steps.pose) == 5
+    assert len(arenas.store_arena_map(7, 1.25, tmp_path)[1].pose) == 5
     monkeypatch.setattr(arenas, "code_digest", lambda: "other")
     with pytest.raises(pytest.fail.Exception, match="made again"):
         arenas.store_arena_map(7, 1.25, tmp_path)

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from evaluation.papers.whiskers import reproduction
-from evaluation.papers.whiskers.figure import RealFigure, require_recordings
-from evaluation.papers.whiskers.reproduction import NAMES, UNPROVEN, find_figure, reproduce_real
+from evaluation.papers import figure as figures_of_papers
+from evaluation.papers.figure import REAL, Figure, find_figure, write_page
+from evaluation.papers.whiskers.recordings import UNPROVEN, require_recordings
 from tactile.base.errors import InputError
 
 
-@pytest.mark.parametrize("name", NAMES)
+def real_page(places: dict[str, str], data: Path, output: Path) -> Iterator[str]:
+    def measure(name: str, figure: Figure) -> tuple[tuple[()], object]:
+        return (), figure.measure(data)
+
+    return write_page(output / "real.md", places, places, measure, [UNPROVEN])
+
+
+@pytest.mark.parametrize("name", REAL)
 def test_each_name_is_a_figure(name: str) -> None:
-    figure = find_figure(name)
-    assert isinstance(figure, RealFigure)
+    figure = find_figure(REAL[name])
+    assert isinstance(figure, Figure)
     assert figure.title[0].isupper()
     assert not figure.title.endswith(".")
 
@@ -29,14 +37,14 @@ def test_the_page_holds_what_was_measured_before_an_error(tmp_path: Path, monkey
         picture.write_text(result)
 
     figures = {
-        "good": RealFigure("Whiskers", lambda data: "7 whiskers", lambda result: [f"| {result} |"], draw),
-        "bad": RealFigure("Fingers", measure, lambda result: [], draw),
+        "good": Figure("Whiskers", lambda data: "7 whiskers", lambda result: [f"| {result} |"], draw),
+        "bad": Figure("Fingers", measure, lambda result: [], draw),
     }
-    monkeypatch.setattr(reproduction, "find_figure", figures.__getitem__)
+    monkeypatch.setattr(figures_of_papers, "find_figure", figures.__getitem__)
     output = tmp_path / "new" / "page"
     lines = list[str]()
     with pytest.raises(InputError, match=r"touch\.csv"):
-        lines.extend(reproduce_real(["good", "bad"], tmp_path, output))
+        lines.extend(real_page(dict(zip(figures, figures, strict=True)), tmp_path, output))
     page = (output / "real.md").read_text(encoding="utf-8")
     assert lines == page.removesuffix(UNPROVEN).split("\n")[: len(lines)]
     assert "| 7 whiskers |" in lines
@@ -47,5 +55,5 @@ def test_the_page_holds_what_was_measured_before_an_error(tmp_path: Path, monkey
 
 def test_nothing_is_left_where_a_recording_is_missing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
-        list(reproduce_real(["drift"], tmp_path, tmp_path / "page"))
+        list(real_page({"drift": REAL["drift"]}, tmp_path, tmp_path / "page"))
     assert not (tmp_path / "page").exists()

@@ -29,8 +29,8 @@ from evaluation.papers.whiskers.walk_source import (
 from ratslam.recall.config import sector_shifts
 from ratslam.runs.settings.completion import complete
 from robot.recordings.real_whiskers import ObjectRecord
+from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.simulation.head.simulated_session import HeadSimulation
-from robot.sources.odometry import OdometryConfig
 from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, integrate, wrap

@@ -17,7 +17,7 @@ from robot.simulation.create.simulated_session import (
 )
 from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import Sample, Source
-from robot.world.arena import arena_text, in_free_space, wall_segments
+from robot.world.arena import arena_text, wall_segments
 from robot.world.walls import segment_distance
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -176,7 +176,7 @@ def test_the_steps_follow_the_state_machine(seed: int) -> None:
 @pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (1, 1.25), (2, 2.5), (3, 2.5)])
 def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
     simulation = session(seed, side)
-    assert in_free_space(simulation.arena, simulation.truth[:, :2]).all()
+    assert simulation.arena.in_free_space(simulation.truth[:, :2]).all()
     room = segment_distance(wall_segments(simulation.arena), simulation.truth[:, :2]).min()
     assert room > 0.17 - 0.05 * 0.01 - 1e-6  # motion between two checks
 

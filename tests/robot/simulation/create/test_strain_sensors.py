@@ -22,7 +22,7 @@ from robot.simulation.create.strain_sensors import (
     sample_strain,
     shaft_tilt,
 )
-from robot.world.arena import Arena, ArenaConfig, has_clearance, make_arena, wall_segments
+from robot.world.arena import Arena, ArenaConfig, make_arena, wall_segments
 from robot.world.walls import polygon_edges, segment_distance, segments_cross, square
 from tactile.base.random_streams import stream
 from tactile.contact_threshold import ShaftConfig, stiffness
@@ -39,7 +39,7 @@ def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
     room, random = make_arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (4000, 3))
     near = segment_distance(wall_segments(room), poses[:, :2]).min(axis=1) < 0.25
-    return room, poses[near & has_clearance(room, poses[:, :2], 0.17)][:50]
+    return room, poses[near & room.has_clearance(poses[:, :2], 0.17)][:50]
 
 
 def each(poses: np.ndarray, walls: np.ndarray) -> Bending:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.sources.odometry import OdometryConfig
+from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.sources.source import Source
 from robot.touch_source import open_touch_source
 from robot.world.maze import CELL_SIDE, maze_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.simulation.head.beam import BeamConfig, StreamConfig, beam_time_unit, make_beam
+from robot.simulation.head.beam import BeamConfig, StreamConfig, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
 from robot.simulation.head.simulated_session import simulate_dynamic
 from robot.simulation.head.whisk_stream import (
@@ -104,7 +104,7 @@ def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
     # Two shapes are an upper bound of the stiffness (Rayleigh and Ritz).
     assert 1.8751**2 <= first < 1.01 * 1.8751**2
     assert 4.6941**2 <= second < 1.1 * 4.6941**2
-    assert beam_time_unit(BeamConfig(), 0.2) == pytest.approx(4 * beam_time_unit(BeamConfig(), 0.1))
+    assert BeamConfig().time_unit(0.2) == pytest.approx(4 * BeamConfig().time_unit(0.1))
 
 
 @TIERS

@@ -1,19 +1,15 @@
-"""One figure or table of pose cells: what it measures, its lines and its picture.
+"""Panels of a picture in rows and columns, the error of the packet on the torus, and the time of calls.
 
-The error of the packet on the torus: decoded minus true pose, the shortest way round.
-
-Panels in rows and columns under a title, in the style of all plots.
-
-Processor and wall time of calls on one core, and the load of the machine meanwhile.
+The error is the decoded minus the true pose, the shortest way round. Times are taken on one core, beside the
+load of the machine meanwhile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,38 +21,6 @@ from evaluation.studies.machine import one_core, processor_name, watch_load
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-class CellTask(NamedTuple):
-    """What to measure.
-
-    Attributes:
-        first: seed of the first session; each session has the next one. sessions: their number, or that of
-            repeats; None: the usual number of the figure. workers: processes.
-    """
-
-    first: int
-    sessions: int | None = None
-    workers: int = 1
-
-    def seeds(self, usual: int) -> range:
-        """The seeds of the sessions; `usual` of them unless the task says otherwise."""
-        return range(self.first, self.first + (self.sessions or usual))
-
-
-class CellFigure(NamedTuple):
-    """A figure; each module of this room that is named in `reproduction.NAMES` offers one as `FIGURE`.
-
-    Attributes:
-        title: one line. measure: the result of a task. table: the lines of a Markdown table of the result,
-            each figure beside its goal and its control, and sentences about what it does not show. draw:
-            draws the result into a new PNG file; None: without a picture.
-    """
-
-    title: str
-    measure: Callable[[CellTask], Any]
-    table: Callable[[Any], Sequence[str]]
-    draw: Callable[[Any, Path], None] | None
 
 
 def torus_error(recording: CellRecording) -> np.ndarray:

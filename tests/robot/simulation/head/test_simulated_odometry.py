@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.sources.odometry import OdometryConfig, OdometryErrors, motions_between, simulate_odometry
+from robot.simulation.head.odometry_errors import (
+    OdometryConfig,
+    OdometryErrors,
+    motions_between,
+    simulate_odometry,
+)
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, integrate, wrap
 

@@ -1,0 +1,188 @@
+"""What is measured of saved maps: the operations of this program on them, in tasks, session by session.
+
+Operations are functions of a module, so that other processes can import them, and tests can measure others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evaluation.papers.figure import Figure, find_figure, write_page
+from evaluation.papers.maps.scenarios import Recipe, Recorded
+from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
+from evaluation.papers.tables.comparison import Files, SessionLog, compare_figures
+from evaluation.papers.trial_sessions import capacity_for
+from evaluation.studies.executor import run_tasks
+from ratslam.core.session import Session
+from ratslam.places.localiser import Localisation, Localiser
+from ratslam.runs.build_session import build_session
+from ratslam.runs.localise import localising
+from ratslam.runs.merge import merge_maps
+from ratslam.runs.run_directory import changes_of
+from ratslam.runs.saved_map import read_map
+from robot.touch_source import observation_of
+
+
+class Localised(NamedTuple):
+    """A session of T steps in a map that does not change.
+
+    Attributes:
+        found: [T] bool, whether the robot says that it knows where it is. foreign: [T] bool, whether it says
+            that it is not in this map. pose: [T, 3] in the map (m, m, rad).
+    """
+
+    found: np.ndarray
+    foreign: np.ndarray
+    pose: np.ndarray
+
+
+class Methods(NamedTuple):
+    """Operations on saved maps; functions of a module, so that other processes can import them.
+
+    Attributes:
+        localise: a session in a map. extend: the map of a session and then another one, whose robot may stand
+            anywhere: its arrays are over the steps of both, in this order. merge: one map of several, written
+            to a new path, and its arrays over the steps of all, in the order of the arguments. changes:
+            places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first.
+    """
+
+    localise: Callable[[StoredMap, Recorded], Localised]
+    extend: Callable[[StoredMap, Recorded], MapArrays]
+    merge: Callable[[Sequence[StoredMap], Path], StoredMap]
+    changes: Callable[[StoredMap, Recorded], np.ndarray]
+
+
+class MapTask(NamedTuple):
+    """One session of a row.
+
+    Attributes:
+        seed: of its maze; in rows of recordings, the number of the recording. folder: for maps. methods: what
+            is measured.
+    """
+
+    seed: int
+    folder: Path
+    methods: Methods
+
+    def map_of(self, recipe: Recipe) -> StoredMap:
+        """The map of a session, made once for all rows."""
+        return store_map(recipe, self.folder)
+
+
+def localise(made: StoredMap, recorded: Recorded) -> Localised:
+    """A session in a map, with `backend: localise`; poses are those given at each step.
+
+    Raises:
+        InputError: the session is not one of the map's sensor.
+    """
+    session = _session_in(made.path, capacity_for(recorded.log.length))
+    session.restart(recorded.config.session.seed)
+    steps = list(session.replay(observation_of(sample) for sample in recorded.log))
+    localiser = session.map
+    assert isinstance(localiser, Localiser)
+    states = localiser.states()
+    pose = np.array([step.pose for step in steps])
+    return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
+
+
+def extend(made: StoredMap, recorded: Recorded) -> MapArrays:
+    """The map of a session and then another one, which begins a new piece of it.
+
+    Raises:
+        InputError: the session is not one of the map's sensor.
+    """
+    session = read_map(made.path).open_session()
+    session.begin_piece()
+    for _ in session.replay(observation_of(sample) for sample in recorded.log):
+        pass
+    return MapArrays.of_session(session, np.concatenate([made.arrays.truth, recorded.truth]))
+
+
+def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
+    """One map of several, in a new folder; steps in the order of the arguments.
+
+    Raises:
+        InputError: the maps cannot be merged.
+    """
+    merged = merge_maps([made.path for made in maps], path)
+    begins = np.cumsum([0, *merged.steps[:-1]]).tolist()
+    begin = {at.parent: first for at, first in zip(merged.maps, begins, strict=True)}
+    order = np.concatenate([begin[made.path] + made.order for made in maps])
+    session = read_map(path).open_session()
+    truth = np.concatenate([made.arrays.truth for made in maps])
+    whole = MapArrays.of_session(session, truth)
+    arrays = whole._replace(trajectory=whole.trajectory[order], piece=whole.piece[order])
+    np.savez(path / STEPS, **arrays._asdict())
+    return StoredMap(path, arrays, order)
+
+
+def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
+    """Places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first."""
+    localise(made, recorded)
+    localiser = _session_in(made.path, capacity_for(recorded.log.length)).map
+    assert isinstance(localiser, Localiser)
+    found = changes_of(localiser, recorded.config.touch)
+    return np.array([change.position for change in found]).reshape(-1, 2)
+
+
+@lru_cache(maxsize=1)
+def _session_in(path: Path, reserve: int) -> Session:
+    """A session of any state in a map; the last one that was compiled is used again."""
+    saved = read_map(path)
+    config = localising(saved.config, saved)
+    rows = config.session.model_copy(update={"reserve": reserve})
+    return build_session(config.model_copy(update={"session": rows}), saved.source)
+
+
+PRODUCT = Methods(localise, extend, merge, changes)
+
+
+def reproduce_maps(
+    places: Mapping[str, str],
+    names: Sequence[str],
+    methods: Methods,
+    output: Path,
+    first: int,
+    sessions: int | None = None,
+    workers: int = 1,
+    against: Path | None = None,
+) -> Iterator[str]:
+    """The lines of the page, each table as soon as it is measured; writes `maps.md`, a PNG per figure, and
+    `maps.csv`, a session as soon as it is measured.
+
+    Args:
+        places: of the figures by name. names: those to measure. output: folder for the page, and for the maps
+            in `maps`, which later calls use again. first: seed of the first maze; each session has the next
+            one. sessions: of each figure; None: the figure's own number. workers: processes. against: folder
+            of an earlier run; the same sessions are compared below the last table.
+
+    Raises:
+        InputError: a session cannot be recorded, or a file of the sessions cannot be used.
+    """
+    labels: dict[str, dict[int, str]] = {}  # of the sessions of each figure by seed, or number of a recording
+    for name in names:
+        usual = find_figure(places[name]).sessions
+        if isinstance(usual, int):
+            labels[name] = {seed: str(seed) for seed in range(first, first + (sessions or usual))}
+        else:
+            labels[name] = dict(enumerate(usual[:sessions]))
+    planned = [(name, label) for name in names for label in labels[name].values()]
+    log = SessionLog("maps", Files(output, against), planned)
+
+    def measure(name: str, figure: Figure) -> tuple[list[str], list[Any]]:
+        used = list(labels[name].values())
+        tasks = [MapTask(seed, output / "maps", methods) for seed in labels[name]]
+        found = []
+        for label, figures in zip(used, run_tasks(figure.measure, tasks, workers=workers), strict=True):
+            log.add(name, label, figures.record())
+            found.append(figures)
+        named = ", ".join(used if len(used) < 3 else (used[0], "...", used[-1]))
+        return [f"{len(tasks)} sessions: {named}.", ""], found
+
+    yield from write_page(output / "maps.md", places, names, measure)
+    yield from compare_figures(log, names)
