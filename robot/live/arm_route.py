@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 
 from robot.drivers.outcome import Fault
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.drivers.ur10.safety import check_target as allowed
 from robot.live.live_config import LiveConfig
@@ -121,17 +120,17 @@ def _waypoint_path(config: LiveConfig) -> HeadPath:
 
 def main_route(config: LiveConfig, path: HeadPath) -> Route:
     """The route along a path, without its first pose, where the arm starts."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
+    return Route(config.arm.placing.tcp_from_pose(path.pose[1:]), route_speed(config))
 
 
 def approach_route(config: LiveConfig, path: HeadPath) -> Route:
     """The route from the present pose of the arm to above the first pose."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
+    return Route(config.arm.placing.tcp_from_pose(path.pose[:1], config.lift), route_speed(config))
 
 
 def descent_route(config: LiveConfig, path: HeadPath) -> Route:
     """The route from above the first pose down to it."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
+    return Route(config.arm.placing.tcp_from_pose(path.pose[:1]), route_speed(config))
 
 
 def check_targets(config: LiveConfig, path: HeadPath) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.create.driver_config import CommandRefused, wheel_speeds
-from robot.drivers.create.protocol import Bumps, describe_bumps
+from robot.drivers.create.driver_config import CommandRefused
+from robot.drivers.create.protocol import Bumps
 from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.live import selftest
@@ -64,7 +64,7 @@ def start_and_check(rig: CreateRig) -> Iterator[str]:
     rig.robot.refresh()
     reply = rig.robot.last_reply
     if reply is not None and reply.bumps & Bumps.BUMPED:
-        found = f"{describe_bumps(reply.bumps)} pressed"
+        found = f"{reply.bumps.describe()} pressed"
         raise InputError("live.create", found, "a free bumper", "move the robot away from what it touches")
     yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
     rig.monitor.begin()
@@ -77,8 +77,8 @@ def _check_speeds(rig: CreateRig) -> None:
     behaviour = rig.create.plan.behaviour
     try:
         for speed in (behaviour.fast, behaviour.slow):
-            wheel_speeds(rig.create, speed, 0.0)
-        wheel_speeds(rig.create, 0.0, behaviour.turn.rate)
+            rig.create.wheel_speeds(speed, 0.0)
+        rig.create.wheel_speeds(0.0, behaviour.turn.rate)
     except CommandRefused as error:
         cure = "a lower speed in the plan, or a higher limit"
         raise InputError("live.create.plan.behaviour", str(error), "", cure) from None

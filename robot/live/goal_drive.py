@@ -19,7 +19,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import MovableArm, route_speed
 from robot.live.live_config import GoalConfig, LiveConfig
@@ -514,7 +513,7 @@ class GoalRoute:
             return self.drive.finished
         if self._sent is None or _differ(self._sent, self._target):
             try:
-                arm.move(tcp_from_pose(self._placing, self._target), self._speed)
+                arm.move(self._placing.tcp_from_pose(self._target), self._speed)
                 self._sent = self._target
             except TargetRefused:
                 if arm.fault is not None:

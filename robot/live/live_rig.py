@@ -21,7 +21,7 @@ from robot.drivers.head.whisk_control import HeadDriver
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.driver_config import pose_from_tcp, tcp_heading
+from robot.drivers.ur10.driver_config import tcp_heading
 from robot.live.live_config import LiveConfig
 from robot.live.polling import TICK, HeadStream, OperatorStop, SessionFault, session_fault, wait_until
 from robot.live.recorder import LiveRecorder
@@ -64,7 +64,7 @@ class ArmOdometry:
         last = len(self._states) - 1
         k = min(max(bisect_left(self._states, time, key=_time_of), 1), last)
         pair = [self._states[max(k - 1, 0)], self._states[k]]
-        poses, _ = pose_from_tcp(self._config.arm.placing, np.stack([state[1] for state in pair]))
+        poses, _ = self._config.arm.placing.pose_from_tcp(np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
         share = float(np.clip((time - pair[0][0]) / span, 0, 1)) if span > 0 else 0.0
         step = poses[1] - poses[0]

@@ -88,7 +88,7 @@ class HeadStream:
     @property
     def streaming(self) -> bool:
         """Whether the head sends samples."""
-        return self._head.state.link is LinkState.STREAMING
+        return self._head.state is LinkState.STREAMING
 
     def take(self) -> Iterator[tuple[Frames, float]]:
         """The blocks since the last call, with their arrival times, s, host."""

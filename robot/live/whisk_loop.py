@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.decoder import Frames, assemble_cycle, make_cut
+from robot.drivers.head.decoder import Cut, Frames, assemble_cycle
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import ArmRoute
@@ -147,7 +147,7 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
         )
         frames = rig.head.ring.between(first, last)
         begin = sequence.start_of(number)
-        cut = make_cut(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
+        cut = Cut.of(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
         record.append(assemble_cycle(frames, cut))
     return record
 
@@ -166,7 +166,7 @@ def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper
         stamp, float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
     )
     whole, slow = _is_complete(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
-    cut = make_cut(number, stamp, start, frames, odometry, seen=whole and not slow)
+    cut = Cut.of(number, stamp, start, frames, odometry, seen=whole and not slow)
     if not cut.seen:
         rig.record_event(
             "dropped", f"whisk {number}: " + ("the mapper is behind" if whole else "samples are missing")

@@ -122,6 +122,30 @@ class Command(NamedTuple):
     offset: float = 0.0
     numbers: np.ndarray = np.zeros(0, np.int16)
 
+    def pack(self) -> bytes:
+        """The bytes of the command."""
+        numbers = np.asarray(self.numbers, "<i2")
+        kind, mode, *drive = self[:-1]
+        body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
+        return body + struct.pack("<I", zlib.crc32(body))
+
+    @classmethod
+    def unpack(cls, packet: bytes) -> Command | None:
+        """The command in a packet; None if it is invalid."""
+        if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
+            return None
+        magic, version, kind, mode, count, *drive = _COMMAND.unpack_from(packet)
+        known = (
+            magic == COMMAND_MAGIC
+            and version == VERSION
+            and kind in set(CommandKind)
+            and mode in set(FeedbackMode)
+        )
+        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
+            return None
+        numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
+        return cls(CommandKind(kind), FeedbackMode(mode), *drive, numbers)
+
 
 _COMMAND = struct.Struct("<4sBBBB5f")
 COMMAND_SIZE = _COMMAND.size + 4
@@ -180,31 +204,3 @@ def to_radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angles [N, W] and deflections [N, W, 2], rad, of counts [N, W, 3]."""
     value = values * ANGLE
     return value[..., 0], value[..., 1:]
-
-
-def pack_command(command: Command) -> bytes:
-    """The bytes of a command."""
-    numbers = np.asarray(command.numbers, "<i2")
-    kind, mode, *drive = command[:-1]
-    body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
-    return body + struct.pack("<I", zlib.crc32(body))
-
-
-def unpack_command(packet: bytes) -> Command | None:
-    """The command in a packet; None if it is invalid."""
-    if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
-        return None
-    magic, version, kind, mode, count, amplitude, frequency, gain, window, offset = _COMMAND.unpack_from(
-        packet
-    )
-    drive = amplitude, frequency, gain, window, offset
-    known = (
-        magic == COMMAND_MAGIC
-        and version == VERSION
-        and kind in set(CommandKind)
-        and mode in set(FeedbackMode)
-    )
-    if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
-        return None
-    numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-    return Command(CommandKind(kind), FeedbackMode(mode), *drive, numbers)

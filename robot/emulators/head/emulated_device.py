@@ -26,12 +26,12 @@ from robot.drivers.head.usb_protocol import (
     REQUEST_IN,
     VENDOR,
     VERSION,
+    Command,
     FrameFlag,
     Request,
     frame_values,
     pack_frames,
     to_counts,
-    unpack_command,
 )
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
@@ -121,7 +121,7 @@ class EmulatedHead:
 
     def bulk_out(self, packet: bytes, now: float) -> None:
         """Executes a command packet; an invalid one is ignored and counted."""
-        command = unpack_command(packet)
+        command = Command.unpack(packet)
         if command is None:
             self.received[""] += 1
             return

@@ -22,7 +22,7 @@ from robot.drivers.head.usb_protocol import (
     CommandKind,
     FeedbackMode,
 )
-from robot.drivers.ur10.driver_config import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.simulation.head.baseline import Baseline, make_baseline
@@ -400,7 +400,7 @@ class CarriedByArm:
         ahead = min(max(time - newest.time, -AHEAD), AHEAD)
         tool = np.array(newest.tcp, float)
         tool[:3] += ahead * newest.speed[:3]
-        pose, lift = pose_from_tcp(self.placing, tool)
+        pose, lift = self.placing.pose_from_tcp(tool)
         # The rotation axes of the arm and of the map's headings are both vertical.
         return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
 
