@@ -46,6 +46,9 @@ class ClockSync:
     def __init__(self) -> None:
         self.jumps = 0
         self._lock = Lock()
+        self._pieces: deque[_Segment]
+        self._line: Line
+        self._newest: float  # device time of the last observation
         self._restart()
 
     def observe(self, device: float, arrival: float) -> None:
@@ -98,8 +101,8 @@ class ClockSync:
         return float(np.quantile(late, RESIDUAL_QUANTILE))
 
     def _restart(self) -> None:
-        self._pieces: deque[_Segment] = deque()
-        self._line: Line = (0.0, 0.0, 1.0)
+        self._pieces = deque()
+        self._line = (0.0, 0.0, 1.0)
         self._newest = -np.inf
 
     def _edge(self) -> Line:

@@ -43,9 +43,8 @@ from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.slam import Slam
 from robot.drivers.outcome import Fault
 from robot.drivers.ur10.safety import plan_move
-from robot.emulators.ur10.emulated_arm import EmulatedArm
+from robot.emulators.ur10.emulated_arm import EmulatedArm, MoveL
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.motion import MoveL
 from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_config import GoalConfig, LiveConfig
 from robot.live.live_rig import ArmOdometry

@@ -134,17 +134,19 @@ class Command(NamedTuple):
         """The command in a packet; None if it is invalid."""
         if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
             return None
-        magic, version, kind, mode, count, *drive = _COMMAND.unpack_from(packet)
+        magic, version, kind, mode, count, *rest = _COMMAND.unpack_from(packet)
+        amplitude, frequency, gain, window, offset = rest
         known = (
             magic == COMMAND_MAGIC
             and version == VERSION
             and kind in set(CommandKind)
             and mode in set(FeedbackMode)
         )
-        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
+        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(rest).all():
             return None
         numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-        return cls(CommandKind(kind), FeedbackMode(mode), *drive, numbers)
+        kinds = CommandKind(kind), FeedbackMode(mode)
+        return cls(*kinds, amplitude, frequency, gain, window, offset, numbers)
 
 
 _COMMAND = struct.Struct("<4sBBBB5f")
