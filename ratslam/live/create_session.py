@@ -15,7 +15,7 @@ from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig, MotionReport, run_create_loop
-from robot.live.create_selftest import find_devices, start_and_check
+from robot.live.selftest import find_devices, start_and_check
 from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
 from robot.world.arena import Arena, make_arena, wall_segments
 from tactile.base.errors import InputError
