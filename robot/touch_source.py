@@ -1,4 +1,4 @@
-"""Turns the whisker readings of a source into observations."""
+"""Touch front ends, built in or registered, turn the whisker readings of a source into observations."""
 
 from __future__ import annotations
 

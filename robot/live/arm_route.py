@@ -42,7 +42,7 @@ class ArmRoute(Protocol):
         ...
 
 
-class Route:
+class _Route:
     """Targets [K, 6] in the arm's base frame, at a speed (m/s)."""
 
     def __init__(self, targets: np.ndarray, speed: float) -> None:
@@ -112,19 +112,19 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 
-def main_route(config: LiveConfig, path: HeadPath) -> Route:
+def main_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route along a path, without its first pose, where the arm starts."""
-    return Route(config.arm.placing.tcp_from_pose(path.pose[1:]), config.route_speed)
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[1:]), config.route_speed)
 
 
-def approach_route(config: LiveConfig, path: HeadPath) -> Route:
+def approach_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route from the present pose of the arm to above the first pose."""
-    return Route(config.arm.placing.tcp_from_pose(path.pose[:1], config.lift), config.route_speed)
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1], config.lift), config.route_speed)
 
 
-def descent_route(config: LiveConfig, path: HeadPath) -> Route:
+def descent_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route from above the first pose down to it."""
-    return Route(config.arm.placing.tcp_from_pose(path.pose[:1]), config.route_speed)
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1]), config.route_speed)
 
 
 def check_targets(config: LiveConfig, path: HeadPath) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -268,22 +268,9 @@ MAPPER_WAIT = 60.0
 """Longest wait of a robot at rest for its mapper, s."""
 
 
-class MotionReport(NamedTuple):
-    """Report on a motion that was passed on.
-
-    Attributes:
-        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end.
-        sampled: whether the whiskers sent samples to its end.
-    """
-
-    number: int
-    time: float
-    state: CreateState
-    moment: StepEnd
-    sampled: bool
-
-
-def run_create_loop(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
+def run_create_loop(
+    rig: CreateRig, mapper: AsyncMapper, tell: Callable[[float, CreateState, StepEnd], None]
+) -> None:
     """Explores as the state machine does and passes on a report of every motion, until the planned end; then,
     and at any fault, the robot is stopped.
 
@@ -313,7 +300,7 @@ def run_create_loop(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionR
             if rig.recorder is not None:
                 rig.recorder.add_sample(sample)
             mapper.offer(sample)
-            tell(MotionReport(number, stamp, doing.state, end.moment, sampled))
+            tell(stamp, doing.state, end.moment)
             if not sampled:
                 # The robot rests; the reader limits the time.
                 rig.record_event("held", "the whiskers send no samples")

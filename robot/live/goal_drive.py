@@ -89,7 +89,7 @@ class GoalDrive:
         self.off_way = config.off_way * cell
         self._missing = self._touched = 0
         self._returning, self._returns, self._unsure = False, 0, 0
-        self._legs: list[Leg] = []  # that are left
+        self._legs: list[_Leg] = []  # that are left
 
     @property
     def finished(self) -> bool:
@@ -162,7 +162,13 @@ class GoalDrive:
         made = self._planner.plan(pose, self.goal, self.obstacles)
         self.way = made.poses
         if made.poses is not None:
-            self._legs = legs_of(_join_way(made.poses, pose))
+            # The way is joined beside its beginning, without the detour over its first poses.
+            way, first = made.poses, 0
+            count = int(np.searchsorted(_lengths(way), JOINED, side="right"))
+            if count >= 2:
+                off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
+                first = int(np.argmin(off)) + 1
+            self._legs = legs_of(np.vstack([[*pose[:2], way[first, 2]], way[first:]]))
             return True
         if made.state is DriveState.LOST:
             self._wait(made.reason)
@@ -225,16 +231,6 @@ class GoalDrive:
         return bool(near.any())
 
 
-def _join_way(way: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """The way [K, 3] from a pose [3] beside its beginning on, without the detour over its first poses."""
-    count = int(np.searchsorted(_lengths(way), JOINED, side="right"))
-    if count < 2:
-        return np.vstack([[*pose[:2], way[0, 2]], way])
-    off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
-    first = int(np.argmin(off)) + 1
-    return np.vstack([[*pose[:2], way[first, 2]], way[first:]])
-
-
 def _lengths(way: np.ndarray) -> np.ndarray:
     """[K] length of a way [K, 2 or 3] up to each of its poses, m."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
@@ -253,7 +249,7 @@ ALONG = 0.35
 rad."""
 
 
-class Leg(NamedTuple):
+class _Leg(NamedTuple):
     """A straight move at one heading.
 
     Attributes:
@@ -270,13 +266,13 @@ class Leg(NamedTuple):
         return bool(np.hypot(*left) <= tolerance or step @ left < 0)
 
 
-def legs_of(way: np.ndarray) -> list[Leg]:
+def legs_of(way: np.ndarray) -> list[_Leg]:
     """The legs of a way [K, 3] (m, m, rad), K >= 1: its poses within `SCATTER` of the legs (Douglas &
     Peucker 1973). A way of one place is one leg without length."""
     if len(way) == 1:
-        return [Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
+        return [_Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
     marks = _vertices(way[:, :2])
-    return [Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1])) for a, b in pairwise(marks)]
+    return [_Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1])) for a, b in pairwise(marks)]
 
 
 def leg_heading(poses: np.ndarray) -> float:

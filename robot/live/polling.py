@@ -1,7 +1,7 @@
 """What both robots share in a live session: polling, the samples of a head, faults that end it, the mapper.
 
 `PolledRig` is the base of the rigs: it waits for conditions while the devices are polled, and records events.
-`HeadStream` collects the samples of a head, with its clock. `AsyncMapper` is the mapper as the loops see it.
+`_HeadStream` collects the samples of a head, with its clock. `AsyncMapper` is the mapper as the loops see it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MAX_CLOCK_STEP = 2e-3
 """Largest step of the head's clock against its sample count, s."""
 
 
-class HeadStream:
+class _HeadStream:
     """Collects the blocks of a reader, from its thread, for the thread that polls.
 
     Attributes:
@@ -117,7 +117,7 @@ class PolledRig:
     """
 
     def __init__(self, config: LiveConfig, head: HeadReader, stopped: Callable[[], bool]) -> None:
-        self.config, self.head, self.stream = config, head, HeadStream(head)
+        self.config, self.head, self.stream = config, head, _HeadStream(head)
         self.epoch = time.monotonic()
         self.recorder: LiveRecorder | None = None
         self._stopped = stopped

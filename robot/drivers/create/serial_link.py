@@ -37,7 +37,7 @@ class BadReply(Exception):
     """An invalid reply."""
 
 
-class SerialPort(Protocol):
+class _SerialPort(Protocol):
     """The methods of `serial.Serial` that the link uses."""
 
     timeout: float | None
@@ -69,7 +69,7 @@ class LinkCounts(NamedTuple):
         return self.lost - self.late
 
 
-def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
+def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
     """Opens the serial port at the Create's speed.
 
     Raises:
@@ -83,7 +83,9 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
     # Without `exclusive` pyserial takes no lock; False is refused on Windows.
     options = {"exclusive": True} if exclusive else {}
     try:
-        port: SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options)
+        port: _SerialPort = serial.Serial(
+            name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options
+        )
     except OSError as error:
         # The text of pyserial's error is the only place of most causes.
         cause = error.errno or getattr(error.__context__, "errno", None)
@@ -119,7 +121,7 @@ class SerialLink:
     the next; of a disturbed reply the end is parsed, since noise mostly precedes it.
     """
 
-    def __init__(self, port: SerialPort) -> None:
+    def __init__(self, port: _SerialPort) -> None:
         self._port = port
         self._late_motion = (0, 0)
         self.counts = LinkCounts()

@@ -271,19 +271,14 @@ class Decoder:
         self._good += len(frames)
         self._duplicates += len(new) - len(frames)
         self._overruns += int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
-        return Frames(
-            number, self._unwrap_times(frames["time"]), frames["flags"].copy(), frames["values"].copy()
-        )
-
-    def _unwrap_times(self, raw: np.ndarray) -> np.ndarray:
-        time = raw.astype(np.int64)
-        if len(time):
+        time = frames["time"].astype(np.int64)
+        if len(time):  # unwrapped: each within half of the range of the previous one
             before = int(time[0]) if self._time is None else self._time
             time[1:] -= time[:-1].copy()
             time[0] -= before
             time = before + ((time + HALF) % WRAP - HALF).cumsum()
             self._time = int(time[-1])
-        return time
+        return Frames(number, time, frames["flags"].copy(), frames["values"].copy())
 
 
 MAX_FRAMES = 1 << 16

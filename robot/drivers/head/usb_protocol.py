@@ -1,7 +1,7 @@
 """Wire format of a whisker head: frames from it, commands to it, and USB control requests.
 
 All numbers are little-endian; angles are int16 counts of `ANGLE`. The USB bridges of published heads
-(BIOTACT) are not documented, so this format is our own; another bridge needs its own
+(BIOTACT) are not documented, so this format is not theirs; another bridge needs its own
 `robot.drivers.head.decoder.FrameDecoder`.
 
 Each sample of the head is one frame of 20 + 2 n c bytes (128 for 18 whiskers of 3 channels):

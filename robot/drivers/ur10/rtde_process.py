@@ -33,9 +33,9 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import (
     MOVED_ON,
+    NO_STATE,
     RETREAT_SPEED,
     Finding,
-    StateMemory,
     TargetRefused,
     at_rest,
     check_command,
@@ -88,7 +88,7 @@ class CommandThread:
         self.script_unusable = False
         self.leaving = False
         self._retreating = False
-        self._watch = StateMemory()
+        self._watch = NO_STATE
         self._rest = np.zeros(6)
         self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
         self._own_stops = 0
@@ -102,7 +102,7 @@ class CommandThread:
     def set_rest_force(self, rest: np.ndarray) -> None:
         """Sets the force without contact [6] and starts the detection of contacts."""
         self._rest, self._force_limit = rest, self.config.force_limit
-        self._watch = self._watch._replace(loaded=0)
+        self._watch = 0, self._watch[1]
 
     def check_state(self, state: np.ndarray) -> None:
         """Stops if a state (ARM_STATE) requires it."""
@@ -193,7 +193,7 @@ class CommandThread:
         if order.do == "retreat":
             force = math.hypot(*(here["force"][:3] - self._rest[:3]))
             self._force_limit = max(force, self.config.force_limit) + self.config.force_limit
-            self._watch = self._watch._replace(loaded=0)
+            self._watch = 0, self._watch[1]
             self._retreating = True
         newest = self.shared.latest()
         assert newest is not None

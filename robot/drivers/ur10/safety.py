@@ -64,15 +64,10 @@ class Finding(NamedTuple):
     detail: str
 
 
-class StateMemory(NamedTuple):
-    """Memory between checks of consecutive states.
-
-    Attributes:
-        loaded: consecutive states above the force limit. robot: controller time of the last state, s.
-    """
-
-    loaded: int = 0
-    robot: float = -np.inf
+StateMemory = tuple[int, float]
+"""Memory between checks of consecutive states: number of consecutive states above the force limit, and the
+controller's time of the last state, s."""
+NO_STATE: StateMemory = (0, -np.inf)
 
 
 def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
@@ -179,15 +174,15 @@ def check_state(
     numbers = [state["robot"], *state["tcp"], *state["speed"], *state["force"], *state["joints"]]
     limit = config.force_limit if most is None else most
     force = math.hypot(*(state["force"][:3] - rest[:3]))
-    loaded = 0 if force <= limit else watch.loaded + 1  # NaN counts as above the limit
-    after = StateMemory(loaded, float(state["robot"]))
+    loaded = 0 if force <= limit else watch[0] + 1  # NaN counts as above the limit
+    after = loaded, float(state["robot"])
     if not np.isfinite(numbers).all():
         return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
     if np.abs(state["tcp"][:3]).max() > REACH or np.abs(state["joints"]).max() > JOINT_RANGE:
         return after, Finding(
             SessionOutcome.ARM_MALFORMED, f"an impossible state: tool at {_place(state['tcp'])}"
         )
-    if state["robot"] <= watch.robot:
+    if state["robot"] <= watch[1]:
         return after, Finding(SessionOutcome.CLOCK_JUMPED, "the controller's clock went back")
     for bits, outcome, text in SAFETY_BITS:
         if int(state["safety"]) & bits:

@@ -10,7 +10,7 @@ import math
 import re
 import sys
 from collections import deque
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import Any
 
 from robot.drivers.ur10.rtde_protocol import OUTPUT_TYPES, REGISTERS
@@ -105,32 +105,16 @@ class Runtime(IntEnum):
     PAUSED = 4
 
 
-class _SafetyBits(IntFlag):
-    """`safety_status_bits`."""
-
-    NORMAL = 1 << 0
-    PROTECTIVE_STOPPED = 1 << 2
-    SAFEGUARD_STOPPED = 1 << 4
-    ROBOT_EMERGENCY_STOPPED = 1 << 6
-    EMERGENCY_STOPPED = 1 << 7
-    STOPPED_DUE_TO_SAFETY = 1 << 10
-
-
-class _StatusBits(IntFlag):
-    """`robot_status_bits`."""
-
-    POWER_ON = 1 << 0
-    PROGRAM_RUNNING = 1 << 1
-
-
-BITS = {
-    SafetyMode.NORMAL: _SafetyBits.NORMAL,
-    SafetyMode.PROTECTIVE_STOP: _SafetyBits.PROTECTIVE_STOPPED | _SafetyBits.STOPPED_DUE_TO_SAFETY,
-    SafetyMode.SAFEGUARD_STOP: _SafetyBits.SAFEGUARD_STOPPED | _SafetyBits.STOPPED_DUE_TO_SAFETY,
-    SafetyMode.ROBOT_EMERGENCY_STOP: _SafetyBits.ROBOT_EMERGENCY_STOPPED
-    | _SafetyBits.EMERGENCY_STOPPED
-    | _SafetyBits.STOPPED_DUE_TO_SAFETY,
+SAFETY_BITS = {
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SafetyMode.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
+    SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
 }
+"""`safety_status_bits` of RTDE: 0 normal, 2 protective stop, 4 safeguard stop, 6 emergency stop of the robot,
+7 emergency stop, 10 stopped due to safety."""
+POWER_ON, PROGRAM_RUNNING = 1 << 0, 1 << 1
+"""`robot_status_bits` of RTDE."""
 
 
 class EmulatedController:
@@ -290,8 +274,8 @@ class EmulatedController:
         fields["runtime_state"] = (self.runtime,)
         fields["robot_mode"] = (self.robot_mode,)
         fields["safety_mode"] = (self.safety,)
-        fields["safety_status_bits"] = (BITS[self.safety],)
-        bits = _StatusBits.POWER_ON * powered | _StatusBits.PROGRAM_RUNNING * playing
+        fields["safety_status_bits"] = (SAFETY_BITS[self.safety],)
+        bits = POWER_ON * powered | PROGRAM_RUNNING * playing
         fields["robot_status_bits"] = (bits,)
         fields["target_speed_fraction"] = (self.arm.scale,)
 

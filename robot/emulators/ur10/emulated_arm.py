@@ -34,7 +34,7 @@ class Unreachable(ValueError):
     """No joint solution for a pose."""
 
 
-class MotionState(NamedTuple):
+class _MotionState(NamedTuple):
     """State of the arm.
 
     Attributes:
@@ -48,15 +48,15 @@ class MotionState(NamedTuple):
     joint_speed: Vector6
 
 
-class ArmModel(NamedTuple):
+class _ArmModel(NamedTuple):
     """The arm's lengths, and the tool's pose in the flange with its inverse."""
 
     geometry: Geometry
     tool: Vector6 = ZERO
     tool_back: Vector6 = ZERO
 
-    def with_tool(self, tool: Vector6) -> ArmModel:
-        return ArmModel(self.geometry, tool, invert_pose(tool))
+    def with_tool(self, tool: Vector6) -> _ArmModel:
+        return _ArmModel(self.geometry, tool, invert_pose(tool))
 
     def forward(self, joints: Sequence[float]) -> Vector6:
         return compose_poses(self.geometry.forward(joints), self.tool)
@@ -67,11 +67,11 @@ class ArmModel(NamedTuple):
             raise Unreachable(f"no joints for {[round(number, 4) for number in tcp]}")
         return joints
 
-    def move_tool(self, state: MotionState, tcp: Vector6, speed: Vector6, dt: float) -> MotionState:
+    def move_tool(self, state: _MotionState, tcp: Vector6, speed: Vector6, dt: float) -> _MotionState:
         """The arm's state `dt` s later, with the tool at `tcp`. Raises `Unreachable`."""
         joints = self.backward(tcp, state.joints)
         turned = [after - before for after, before in zip(joints, state.joints, strict=True)]
-        return MotionState(tcp, speed, joints, _scale(turned, 1 / dt))
+        return _MotionState(tcp, speed, joints, _scale(turned, 1 / dt))
 
 
 class Profile(NamedTuple):
@@ -115,8 +115,8 @@ class _LinearMotion(NamedTuple):
     time: float = 0.0
 
     def advance(
-        self, model: ArmModel, state: MotionState, dt: float
-    ) -> tuple[MotionState, _LinearMotion | None]:
+        self, model: _ArmModel, state: _MotionState, dt: float
+    ) -> tuple[_MotionState, _LinearMotion | None]:
         time = self.time + dt
         done, rate = self.profile.at(time)
         length = self.profile.length or 1.0
@@ -126,44 +126,6 @@ class _LinearMotion(NamedTuple):
         speed = _scale(self.way, rate / length)
         after = model.move_tool(state, tcp, speed, dt)
         return after, None if time >= self.profile.duration else self._replace(time=time)
-
-
-class _ToolSpeedMotion(NamedTuple):
-    """Accelerates to a tool speed and keeps it; ends at speed 0."""
-
-    goal: Vector6
-    acceleration: float
-    turn_ratio: float
-
-    def advance(
-        self, model: ArmModel, state: MotionState, dt: float
-    ) -> tuple[MotionState, _ToolSpeedMotion | None]:
-        step = self.acceleration * dt
-        linear = _step_towards(state.speed[:3], self.goal[:3], step)
-        angular = _step_towards(state.speed[3:], self.goal[3:], step * self.turn_ratio)
-        x, y, z = linear
-        rx, ry, rz = angular
-        tcp = (
-            state.tcp[0] + x * dt,
-            state.tcp[1] + y * dt,
-            state.tcp[2] + z * dt,
-            *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
-        )
-        speed = (x, y, z, rx, ry, rz)
-        after = model.move_tool(state, tcp, speed, dt)
-        return after, None if not any(speed) and not any(self.goal) else self
-
-
-Motion = _LinearMotion | _ToolSpeedMotion
-
-
-def _step_towards(now: Sequence[float], goal: Sequence[float], step: float) -> tuple[float, ...]:
-    """The vector `now` moved towards `goal` by at most `step`."""
-    way = [g - n for g, n in zip(goal, now, strict=True)]
-    length = math.hypot(*way)
-    if length <= step:
-        return tuple(goal)
-    return tuple(n + w * step / length for n, w in zip(now, way, strict=True))
 
 
 def _scale(vector: Sequence[float], scale: float) -> Vector6:
@@ -180,9 +142,28 @@ class MoveL(NamedTuple):
 
 
 class StopL(NamedTuple):
-    """A stop of the tool, with deceleration in m/s^2."""
+    """A stop of the tool, with deceleration in m/s^2; it is its own motion."""
 
     acceleration: float
+
+    def advance(
+        self, model: _ArmModel, state: _MotionState, dt: float, turn_ratio: float
+    ) -> tuple[_MotionState, StopL | None]:
+        """Slows translation and rotation down; `turn_ratio` (rad/m) relates their decelerations."""
+        slowed: list[float] = []
+        step = self.acceleration * dt
+        for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
+            length = math.hypot(*now)
+            slowed += [0.0 if length <= most else v - v * most / length for v in now]
+        x, y, z, rx, ry, rz = slowed
+        tcp = (
+            state.tcp[0] + x * dt,
+            state.tcp[1] + y * dt,
+            state.tcp[2] + z * dt,
+            *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
+        )
+        speed = (x, y, z, rx, ry, rz)
+        return model.move_tool(state, tcp, speed, dt), self if any(speed) else None
 
 
 MoveOrder = MoveL | StopL
@@ -214,17 +195,17 @@ class EmulatedArm:
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.model: ArmModel = ArmModel(UR10 if config.version[0] < 5 else UR10E)
+        self.model: _ArmModel = _ArmModel(UR10 if config.version[0] < 5 else UR10E)
         self.walls = list(config.walls)
         self.turn_ratio = config.turn_ratio
         self.scale = 1.0
         self.force: Vector6 = ZERO
         self.penetration_max = 0.0
-        self._motion: Motion | None = None
+        self._motion: _LinearMotion | StopL | None = None
         self._order: MoveOrder | None = None
         self._queue: deque[MoveOrder] = deque()
         tcp = config.start
-        self.state: MotionState = MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
+        self.state: _MotionState = _MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
         self._update_force()
 
     @property
@@ -243,7 +224,7 @@ class EmulatedArm:
 
     def place(self, tcp: Vector6) -> None:
         """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
-        self.state = MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
+        self.state = _MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
         self._update_force()
@@ -264,7 +245,7 @@ class EmulatedArm:
         """Drops all orders and stops with a deceleration, m/s^2."""
         self._queue.clear()
         self._order = None
-        self._motion = _ToolSpeedMotion(ZERO, acceleration, self.turn_ratio) if self.moving else None
+        self._motion = StopL(acceleration) if self.moving else None
 
     def step(self, dt: float) -> None:
         """Advances by a control step, s. Raises `Unreachable` and stops at once if the pose has no joints."""
@@ -281,7 +262,7 @@ class EmulatedArm:
             raise
         self._update_force()
 
-    def _start(self, order: MoveOrder) -> Motion | None:
+    def _start(self, order: MoveOrder) -> _LinearMotion | StopL | None:
         """The motion that executes an order; None if the tool is at the goal already.
 
         Raises:
@@ -289,7 +270,7 @@ class EmulatedArm:
         """
         state, ratio, acceleration = self.state, self.turn_ratio, max(order.acceleration, SMALL)
         if isinstance(order, StopL):
-            return _ToolSpeedMotion(ZERO, acceleration, ratio)
+            return StopL(acceleration)
         self.model.backward(order.goal, state.joints)
         speed = max(order.speed, SMALL)
         x, y, z = (g - s for g, s in zip(order.goal[:3], state.tcp[:3], strict=True))
@@ -301,12 +282,16 @@ class EmulatedArm:
         return _LinearMotion(state.tcp, way, slower) if slower.length > 0 else None
 
     def _advance(self, dt: float) -> None:
-        assert self._motion is not None
-        scale = self.scale if isinstance(self._motion, _LinearMotion) else 1.0
+        motion = self._motion
+        assert motion is not None
+        scale = 1.0 if isinstance(motion, StopL) else self.scale
         if scale <= 0:
             self._rest()
             return
-        state, self._motion = self._motion.advance(self.model, self.state, dt * scale)
+        if isinstance(motion, StopL):
+            state, self._motion = motion.advance(self.model, self.state, dt, self.turn_ratio)
+        else:
+            state, self._motion = motion.advance(self.model, self.state, dt * scale)
         if scale != 1.0:
             speed, rate = _scale(state.speed, scale), _scale(state.joint_speed, scale)
             state = state._replace(speed=speed, joint_speed=rate)

@@ -34,7 +34,7 @@ def rotation_vector(rotation: Quaternion) -> Vector3:
     return x * scale, y * scale, z * scale
 
 
-def product(first: Quaternion, second: Quaternion) -> Quaternion:
+def _product(first: Quaternion, second: Quaternion) -> Quaternion:
     """The rotation by `second`, then by `first`."""
     a, b, c, d = first
     e, f, g, h = second
@@ -52,7 +52,7 @@ def _conjugate(rotation: Quaternion) -> Quaternion:
     return w, -x, -y, -z
 
 
-def matrix(rotation: Quaternion) -> Matrix:
+def _matrix(rotation: Quaternion) -> Matrix:
     """Rotation matrix; its columns are the rotated axes."""
     w, x, y, z = rotation
     return (
@@ -65,7 +65,7 @@ def matrix(rotation: Quaternion) -> Matrix:
 def _rotate(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
     """The vector [3] after the rotation."""
     x, y, z = vector
-    first, second, third = matrix(rotation)
+    first, second, third = _matrix(rotation)
     return (
         first[0] * x + first[1] * y + first[2] * z,
         second[0] * x + second[1] * y + second[2] * z,
@@ -77,7 +77,7 @@ def compose_poses(frame: Sequence[float], pose: Sequence[float]) -> Vector6:
     """`pose`, which is given in `frame`, in the parent frame of `frame` (URScript's pose_trans)."""
     rotation = quaternion(frame[3:6])
     x, y, z = _rotate(rotation, pose[:3])
-    rotate_by = rotation_vector(product(rotation, quaternion(pose[3:6])))
+    rotate_by = rotation_vector(_product(rotation, quaternion(pose[3:6])))
     return (frame[0] + x, frame[1] + y, frame[2] + z, *rotate_by)
 
 
@@ -90,12 +90,12 @@ def invert_pose(pose: Sequence[float]) -> Vector6:
 
 def rotation_between(start: Sequence[float], goal: Sequence[float]) -> Vector3:
     """Rotation vector in the base frame, rad, of the shortest rotation from pose `start` to pose `goal`."""
-    return rotation_vector(product(quaternion(goal[3:6]), _conjugate(quaternion(start[3:6]))))
+    return rotation_vector(_product(quaternion(goal[3:6]), _conjugate(quaternion(start[3:6]))))
 
 
 def rotate_by(pose: Sequence[float], vector: Sequence[float]) -> Vector3:
     """Rotation vector of a pose after a rotation by a vector in the base frame, rad."""
-    return rotation_vector(product(quaternion(vector), quaternion(pose[3:6])))
+    return rotation_vector(_product(quaternion(vector), quaternion(pose[3:6])))
 
 
 def _quaternion_of(rows: Matrix) -> Quaternion:
@@ -164,7 +164,7 @@ class Geometry(NamedTuple):
         if not all(math.isfinite(number) for number in pose):
             return []
         px, py, pz = pose[:3]
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = matrix(quaternion(pose[3:6]))
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = _matrix(quaternion(pose[3:6]))
         wx, wy, wz = px - self.d6 * r02, py - self.d6 * r12, pz - self.d6 * r22
         radius = math.hypot(wx, wy)
         if radius < self.d4 * (1 - EDGE):

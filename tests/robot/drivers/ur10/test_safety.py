@@ -13,9 +13,9 @@ from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig
 from robot.drivers.ur10.safety import (
     MIN_SPEED,
     MOVED_ON,
+    NO_STATE,
     REACH,
     SAFETY_BITS,
-    StateMemory,
     TargetRefused,
     at_target,
     check_command,
@@ -175,7 +175,7 @@ def test_arrival_requires_position_and_rotation() -> None:
 
 
 def test_good_states_have_no_finding() -> None:
-    watch = StateMemory()
+    watch = NO_STATE
     for k in range(5):
         watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0), np.zeros(6))
         assert finding is None
@@ -186,14 +186,14 @@ def test_good_states_have_no_finding() -> None:
 def test_a_state_with_one_value_that_is_not_finite(field: str, where: int, bad: float) -> None:
     state = a_state()
     state[field][where] = bad
-    _, finding = check_state(CONFIG, StateMemory(), state, np.zeros(6))
+    _, finding = check_state(CONFIG, NO_STATE, state, np.zeros(6))
     assert finding is not None
     assert finding.outcome is SessionOutcome.ARM_MALFORMED
 
 
 @given(st.lists(st.floats(-1e300, 1e300), min_size=3, max_size=3))
 def test_states_outside_the_box(place: list[float]) -> None:
-    _, finding = check_state(CONFIG, StateMemory(), a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
+    _, finding = check_state(CONFIG, NO_STATE, a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
     if CONFIG.box.contains(np.array(place)):
         assert finding is None
     else:
@@ -204,7 +204,7 @@ def test_states_outside_the_box(place: list[float]) -> None:
 
 @given(st.integers(0, 2**11 - 1))
 def test_the_most_severe_safety_bit_is_reported(bits: int) -> None:
-    _, finding = check_state(CONFIG, StateMemory(), a_state(safety=bits), np.zeros(6))
+    _, finding = check_state(CONFIG, NO_STATE, a_state(safety=bits), np.zeros(6))
     named = [outcome for mask, outcome, _ in SAFETY_BITS if bits & mask]
     assert (finding.outcome if finding else None) is (named[0] if named else None)
     assert bool(finding) == bool(bits & ~0b11)
@@ -216,7 +216,7 @@ def test_the_most_severe_safety_bit_is_reported(bits: int) -> None:
 @given(st.lists(st.booleans(), min_size=1, max_size=12))
 def test_a_contact_requires_two_consecutive_states(loads: list[bool]) -> None:
     rest = np.array([20.0, -40.0, 10.0, 1.0, 1.0, 1.0])
-    watch, before = StateMemory(), False
+    watch, before = NO_STATE, False
     for k, loaded in enumerate(loads):
         force = rest + [0, (CONFIG.force_limit + 1) if loaded else CONFIG.force_limit - 1, 0, 0, 0, 0]
         watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0, force=force), rest)
@@ -225,7 +225,7 @@ def test_a_contact_requires_two_consecutive_states(loads: list[bool]) -> None:
 
 
 def test_a_controller_clock_that_stands_still() -> None:
-    watch, _ = check_state(CONFIG, StateMemory(), a_state(robot=2.0), np.zeros(6))
+    watch, _ = check_state(CONFIG, NO_STATE, a_state(robot=2.0), np.zeros(6))
     for robot in (2.0, 1.0):
         _, finding = check_state(CONFIG, watch, a_state(robot=robot), np.zeros(6))
         assert finding is not None
