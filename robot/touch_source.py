@@ -1,4 +1,4 @@
-"""Turns the whisker readings of a source into observations."""
+"""Touch front ends, built in or registered, turn the whisker readings of a source into observations."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
     if not info.raw_whiskers:
         return source
     if info.planar_whiskers is not None:
-        templates = strain_templates_of(source, config.reports)
+        templates = _strain_templates_of(source, config.reports)
         return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
     return TouchSource(source, lambda: Frontend(config, info.calibration), "touch.head")
 
@@ -167,7 +167,7 @@ def report_config_of(info: SourceInfo, config: ReportFrontendConfig) -> ReportFr
     return config.model_copy(update={k: v for k, v in found.items() if k not in config.model_fields_set})
 
 
-def strain_templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplates | None:
+def _strain_templates_of(source: Source, config: ReportFrontendConfig) -> StrainTemplates | None:
     """Strain templates, trained by simulating the Create of a source; None if the configuration needs none or
     names a file.
 

@@ -14,9 +14,10 @@ from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
-from robot.live.create_rig import CreateRig, MotionReport, run_create_loop
-from robot.live.create_selftest import find_devices, start_and_check
+from robot.live.create_rig import CreateRig, run_create_loop
+from robot.live.selftest import find_devices, start_and_check
 from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
+from robot.simulation.create.state_machine import CreateState
 from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
 from tactile.base.types import StepEnd
@@ -74,11 +75,11 @@ class CreateSession:
         begin_mapping(self.rig, mapper, None)
 
     def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
-        def count(motion: MotionReport) -> None:
+        def count(time: float, state: CreateState, moment: StepEnd) -> None:
             self._count += 1
-            self._ends[motion.moment] += 1
+            self._ends[moment] += 1
             ends = ", ".join(f"{self._ends[end]} {end.name}" for end in StepEnd if end is not StepEnd.FREE)
-            tell(f"{mapper_status(mapper)}{motion.time:.0f} s, {motion.state.name}, {ends}")
+            tell(f"{mapper_status(mapper)}{time:.0f} s, {state.name}, {ends}")
 
         run_create_loop(self.rig, mapper, count)
 

@@ -19,9 +19,8 @@ from evaluation.report.verdict import CAUTION, judge_map
 from ratslam.mapping.pose_graph import read_json
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.service.recording_check import Diagnosis
-from robot.live.create_selftest import check_create
 from robot.live.polling import SessionFault
-from robot.live.selftest import check_arm_session
+from robot.live.selftest import check_arm_session, check_create
 from tactile.base.errors import InputError
 from tactile.base.files import read_rows
 from tactile.base.se2 import between

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from threading import Lock
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,21 +29,8 @@ MIN_SPAN = 1.0
 """Jumps are detected once the pairs span this time, s."""
 
 Point = tuple[float, float]
-
-
-class ClockFit(NamedTuple):
-    """host = arrival + scale (device - `device`).
-
-    Attributes:
-        device, arrival: s, a point on the line. scale: host seconds per device second.
-    """
-
-    device: float
-    arrival: float
-    scale: float
-
-    def at(self, device: Array) -> Array:
-        return self.arrival + self.scale * (device - self.device)
+Line = tuple[float, float, float]
+"""A point on the fitted line, device and host time in s, and its slope, host seconds per device second."""
 
 
 class ClockSync:
@@ -52,21 +38,26 @@ class ClockSync:
 
     The result depends on the observations only. One thread may observe while others read.
 
-        Attributes:
-            jumps: number of jumps of the device's clock. A step back by less than the time between two
-                observations is not detected; the fit follows it as older pairs leave the window.
+    Attributes:
+        jumps: number of jumps of the device's clock. A step back by less than the time between two
+            observations is not detected; the fit follows it as older pairs leave the window.
     """
 
     def __init__(self) -> None:
         self.jumps = 0
         self._lock = Lock()
+        self._pieces: deque[_Segment]
+        self._line: Line
+        self._newest: float  # device time of the last observation
         self._restart()
 
     def observe(self, device: float, arrival: float) -> None:
         """Adds a pair of device time and arrival time, s; arrivals in order."""
         device, arrival = float(device), float(arrival)
         with self._lock:
-            if self._has_jumped(device, arrival):
+            # Only early arrivals count, since late ones occur on every busy host.
+            settled = bool(self._pieces) and device - self._pieces[0].begin >= MIN_SPAN
+            if device < self._newest or (settled and arrival - _on_line(self._line, device) < -JUMP):
                 self.jumps += 1
                 self._restart()
             self._newest = device
@@ -78,7 +69,7 @@ class ClockSync:
                 self._line = self._edge()
             else:
                 self._pieces[-1].add(device, arrival)
-                if arrival < self._line.at(device):
+                if arrival < _on_line(self._line, device):
                     self._line = self._edge()
 
     def to_host(self, device: Array) -> Array:
@@ -87,12 +78,14 @@ class ClockSync:
         Raises:
             ValueError: no observation yet.
         """
-        return self._known().at(device)
+        if not self._pieces:
+            raise ValueError("no observation of the device's clock yet")
+        return _on_line(self._line, device)
 
     @property
     def scale(self) -> float:
         """Host seconds per device second; 1 before the first observation."""
-        return self._line.scale
+        return self._line[2]
 
     @property
     def residual(self) -> float:
@@ -104,29 +97,15 @@ class ClockSync:
         if not points:
             return 0.0
         device, arrival = np.array(points).T
-        late = arrival - line.at(device)
+        late = arrival - _on_line(line, device)
         return float(np.quantile(late, RESIDUAL_QUANTILE))
 
-    def _known(self) -> ClockFit:
-        if not self._pieces:
-            raise ValueError("no observation of the device's clock yet")
-        return self._line
-
     def _restart(self) -> None:
-        self._pieces: deque[_Segment] = deque()
-        self._line = ClockFit(0.0, 0.0, 1.0)
+        self._pieces = deque()
+        self._line = (0.0, 0.0, 1.0)
         self._newest = -np.inf
 
-    def _has_jumped(self, device: float, arrival: float) -> bool:
-        if not self._pieces:
-            return False
-        if device < self._newest:
-            return True
-        # Only early arrivals count, since late ones occur on every busy host.
-        settled = device - self._pieces[0].begin >= MIN_SPAN
-        return settled and arrival - self._line.at(device) < -JUMP
-
-    def _edge(self) -> ClockFit:
+    def _edge(self) -> Line:
         """The lower edge: the hull edge below the middle of the points, or, where its slope is beyond the
         drift limit, the line of limited slope that touches the hull."""
         corners: list[Point] = []
@@ -136,14 +115,14 @@ class ClockSync:
         middle = (corners[0][0] + corners[-1][0]) / 2
         right = next((k for k, (device, _) in enumerate(corners) if device > middle), 0)
         if not right:
-            return ClockFit(*corners[0], 1.0)
+            return (*corners[0], 1.0)
         (x0, y0), (x1, y1) = corners[right - 1], corners[right]
         scale = (y1 - y0) / (x1 - x0)
         if abs(scale - 1) <= MAX_DRIFT:
-            return ClockFit(x0, y0, scale)
+            return x0, y0, scale
         scale = 1 + float(np.clip(scale - 1, -MAX_DRIFT, MAX_DRIFT))
         touched = min(corners, key=lambda corner: corner[1] - y0 - scale * (corner[0] - x0))
-        return ClockFit(*touched, scale)
+        return (*touched, scale)
 
 
 class _Segment:
@@ -157,6 +136,12 @@ class _Segment:
     def add(self, device: float, arrival: float) -> None:
         self.points.append((device, arrival))
         _extend_hull(self.hull, (device, arrival))
+
+
+def _on_line(line: Line, device: Array) -> Array:
+    """Host time, s, of device times [...] s."""
+    begin, arrival, scale = line
+    return arrival + scale * (device - begin)
 
 
 def _extend_hull(hull: list[Point], point: Point) -> None:

@@ -1,11 +1,10 @@
-"""Lateness of a loop: tells whether this machine was late, or a device.
+"""The processes of a session on this machine: their CPU priority, their lateness, and their signals.
 
-CPU priority of processes: robot control before mapping, mapping before drawing.
-
-Control gets a real-time policy where the system allows it: beside busy programs, a process of high ordinary
-priority (nice level -10) still waits 0.1 s and more for a processor, which is longer than an arm's watchdog.
-
-Ctrl-C and SIGTERM, withheld from the processes of a session, which it ends itself.
+Robot control comes before mapping, and mapping before drawing. Control gets a real-time policy where the
+system allows it: beside busy programs, a process of high ordinary priority (nice level -10) still waits 0.1 s
+and more for a processor, which is longer than an arm's watchdog. The lateness of a loop tells whether this
+machine was late, or a device. Ctrl-C and SIGTERM are withheld from the processes of a session, which ends
+them itself.
 """
 
 from __future__ import annotations
@@ -86,16 +85,12 @@ def step_back() -> None:
     with contextlib.suppress(OSError, AttributeError):
         niceness = min(LOWEST, os.getpriority(os.PRIO_PROCESS, os.getppid()) + BACKGROUND)
     for thread in _threads():
-        _lower(thread, niceness)
+        _set(thread, niceness, policy=0)
 
 
 def put_last(process: int) -> None:
     """Gives a process that was just started, by its id, the lowest priority."""
-    _lower(process, LOWEST)
-
-
-def _lower(thread: int, niceness: int) -> None:
-    _set(thread, niceness, policy=0)
+    _set(process, LOWEST, policy=0)
 
 
 def _set(thread: int, niceness: int, policy: int) -> None:

@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 
 from robot.drivers.outcome import Fault
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
 from robot.drivers.ur10.safety import check_target as allowed
 from robot.live.live_config import LiveConfig
@@ -43,7 +42,7 @@ class ArmRoute(Protocol):
         ...
 
 
-class Route:
+class _Route:
     """Targets [K, 6] in the arm's base frame, at a speed (m/s)."""
 
     def __init__(self, targets: np.ndarray, speed: float) -> None:
@@ -88,15 +87,20 @@ def plan_path(config: LiveConfig, head: Head) -> HeadPath:
 
 def whole_path(config: LiveConfig, head: Head) -> HeadPath:
     """The path of the waypoints or of the plan, whatever the goals."""
-    return _waypoint_path(config) if config.waypoints else _planned_path(config, head)
-
-
-def _planned_path(config: LiveConfig, head: Head) -> HeadPath:
-    made = plan_scene(config.plan, head)
-    if len(made.jumps):
-        raise InputError("live.plan.kidnaps", "kidnaps", "none on an arm", "remove them from the plan")
-    keep = made.path.time <= made.duration
-    return HeadPath(made.path.time[keep], made.path.pose[keep])
+    if not config.waypoints:
+        made = plan_scene(config.plan, head)
+        if len(made.jumps):
+            raise InputError("live.plan.kidnaps", "kidnaps", "none on an arm", "remove them from the plan")
+        keep = made.path.time <= made.duration
+        return HeadPath(made.path.time[keep], made.path.pose[keep])
+    pose = np.array(config.waypoints)
+    pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
+    if len(pose) < 2 and config.plan.goal is None:
+        raise InputError("live.waypoints", "one", "at least two")
+    step = np.abs(np.diff(pose, axis=0))
+    motion = config.plan.motion
+    took = np.maximum(np.hypot(step[:, 0], step[:, 1]) / motion.speed, step[:, 2] / motion.turn_rate)
+    return HeadPath(np.concatenate([[0.0], np.cumsum(took)]), pose)
 
 
 def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
@@ -108,30 +112,19 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 
-def _waypoint_path(config: LiveConfig) -> HeadPath:
-    pose = np.array(config.waypoints)
-    pose[:, 2] = np.unwrap(np.radians(pose[:, 2]))
-    if len(pose) < 2 and config.plan.goal is None:
-        raise InputError("live.waypoints", "one", "at least two")
-    step = np.abs(np.diff(pose, axis=0))
-    motion = config.plan.motion
-    took = np.maximum(np.hypot(step[:, 0], step[:, 1]) / motion.speed, step[:, 2] / motion.turn_rate)
-    return HeadPath(np.concatenate([[0.0], np.cumsum(took)]), pose)
-
-
-def main_route(config: LiveConfig, path: HeadPath) -> Route:
+def main_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route along a path, without its first pose, where the arm starts."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[1:]), route_speed(config))
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[1:]), config.route_speed)
 
 
-def approach_route(config: LiveConfig, path: HeadPath) -> Route:
+def approach_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route from the present pose of the arm to above the first pose."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[:1], config.lift), route_speed(config))
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1], config.lift), config.route_speed)
 
 
-def descent_route(config: LiveConfig, path: HeadPath) -> Route:
+def descent_route(config: LiveConfig, path: HeadPath) -> _Route:
     """The route from above the first pose down to it."""
-    return Route(tcp_from_pose(config.arm.placing, path.pose[:1]), route_speed(config))
+    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1]), config.route_speed)
 
 
 def check_targets(config: LiveConfig, path: HeadPath) -> None:
@@ -150,8 +143,3 @@ def check_targets(config: LiveConfig, path: HeadPath) -> None:
             where = "live.waypoints" if config.waypoints else "live.plan.path"
             raise InputError(where, str(error), cure="move them, or `live.arm.placing`") from None
         before = target
-
-
-def route_speed(config: LiveConfig) -> float:
-    """The lower of the plan's and the arm's speed, m/s."""
-    return min(config.plan.motion.speed, config.arm.speed)

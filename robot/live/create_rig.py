@@ -1,13 +1,13 @@
-"""A Create and its whiskers in a live session, polled a hundred times a second.
+"""A Create and its whiskers in a live session: the rig, the monitored strain, and the loop.
 
-The loop of a Create: the state machine of Fox et al. 2012 on the robot, each motion a report.
+The loop runs the state machine of Fox et al. 2012 on the robot, each motion a report.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -22,14 +22,12 @@ from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
 from robot.live.polling import (
     AsyncMapper,
-    HeadStream,
     OperatorStop,
+    PolledRig,
     SessionFault,
     check_mapper,
     session_fault,
-    wait_until,
 )
-from robot.live.recorder import LiveRecorder
 from robot.simulation.create.state_machine import (
     CreateState,
     MachineState,
@@ -61,39 +59,31 @@ MAX_READ_TIME = 1.0
 """Longest wait for a reading, s: the robot has another fault before."""
 
 
-class CreateRig:
+class CreateRig(PolledRig):
     """The robot and the whiskers of a session; a context manager that leaves the robot at rest.
 
     Args:
         config: with a part `create`. stopped: whether the operator has requested the end.
 
     Attributes:
-        create: settings of the robot. robot, head: the devices. stream: samples and clock of the whiskers.
-        monitor: their strain. alive: [W] bool, whiskers with a signal. epoch: time 0 of the session on the
-            host's clock, s. recorder: recorder of all data, or None.
+        create: settings of the robot. robot, head: the devices. monitor: strain of the whiskers. alive: [W]
+            bool, whiskers with a signal.
     """
 
     def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
         assert config.create is not None
-        self.config, self.create = config, config.create
+        self.create = config.create
         plan = self.create.plan
         fan = fixed_whiskers(plan.whiskers)
         self.alive = fan.alive.copy()
         self.robot = CreateDriver(self.create)
-        self.head = HeadReader(lambda: open_bridge(config.head.address), len(fan.base), config.head)
-        self.stream = HeadStream(self.head)
+        reader = HeadReader(lambda: open_bridge(config.head.address), len(fan.base), config.head)
+        super().__init__(config, reader, stopped)
         self.monitor = StrainMonitor(
             plan.whiskers.rate, plan.behaviour.period, self.create.strain_per_radian, len(fan.base)
         )
-        self.epoch = time.monotonic()
-        self.recorder: LiveRecorder | None = None
-        self._stopped = stopped
         self._connections = 0  # of the whiskers, seen so far
         self._free = self.epoch  # newest time at which the bumper was not pressed
-
-    def now(self) -> float:
-        """Session time, s."""
-        return time.monotonic() - self.epoch
 
     def poll(self) -> None:
         """Reads the samples of the whiskers and the state of the robot.
@@ -111,7 +101,12 @@ class CreateRig:
         fault = self.stream.fault or (self.recorder and self.recorder.fault)
         stop = self.robot.active_stop
         if stop is not None and stop.reason in OUTCOMES:
-            raise session_fault(OUTCOMES[stop.reason], stop.detail + self._outlook(stop.reason))
+            detail = stop.detail
+            if stop.reason is StopReason.UNPLUGGED:
+                detail += (
+                    f"; a watchdog process waits {self.create.replug:g} s for {self.create.port} to return"
+                )
+            raise session_fault(OUTCOMES[stop.reason], detail)
         if fault:
             raise SessionFault(fault)
         reply, now = self.robot.last_reply, time.monotonic()
@@ -122,10 +117,6 @@ class CreateRig:
             raise session_fault(SessionOutcome.BUMPER_STUCK, detail)
         if self._stopped():
             raise OperatorStop
-
-    def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
-        """Polls until a condition is true; see `robot.live.polling.wait_until`."""
-        wait_until(self.poll, done, longest, late, what)
 
     def begin(self) -> None:
         """Sets time 0 of the session to now."""
@@ -170,32 +161,12 @@ class CreateRig:
         motion = self.robot.odometry()
         return self.robot.counts.good > good and not any(motion[:3])
 
-    def record_event(self, name: str, text: str) -> None:
-        """Records an event."""
-        if self.recorder is not None:
-            self.recorder.add_event(self.now(), name, text)
-
-    def _outlook(self, reason: StopReason) -> str:
-        if reason is not StopReason.UNPLUGGED:
-            return ""
-        return f"; a watchdog process waits {self.create.replug:g} s for {self.create.port} to return"
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.robot.close()
         self.head.close()
-
-
-def unusual_strain(rows: np.ndarray, contact: float) -> int | None:
-    """The first whisker that shakes at rest so much that it would report contacts, or None.
-
-    Args:
-        rows: [T, W, 2] monitored strain at rest. contact: strain of a contact.
-    """
-    swing = np.abs(rows[..., 0] - rows[..., 0].mean(axis=0)).max(axis=0)
-    return int(swing.argmax()) if swing.max() > contact / 2 else None
 
 
 MAX_ROWS = 2**16
@@ -242,7 +213,9 @@ class StrainMonitor:
         mine = (place >= 0) & (place < MAX_ROWS)
         if not mine.any():
             return
-        self._reserve(int(place[mine].max()) + 1)
+        while len(self._count) <= place[mine].max():
+            self._sum = np.concatenate([self._sum, np.zeros_like(self._sum)])
+            self._count = np.concatenate([self._count, np.zeros_like(self._count)])
         np.add.at(self._sum, place[mine], self.strain(frames.values[mine]))
         np.add.at(self._count, place[mine], 1)
 
@@ -284,12 +257,6 @@ class StrainMonitor:
         filled = np.stack([np.interp(wanted, frames.sequence, channel) for channel in flat], axis=1)
         return filled.reshape(len(wanted), *strain.shape[1:])
 
-    def _reserve(self, rows: int) -> None:
-        """Makes room for this many rows."""
-        while len(self._count) < rows:
-            self._sum = np.concatenate([self._sum, np.zeros_like(self._sum)])
-            self._count = np.concatenate([self._count, np.zeros_like(self._count)])
-
 
 TICK = 0.005
 """Period of the poll during a motion, s."""
@@ -301,75 +268,64 @@ MAPPER_WAIT = 60.0
 """Longest wait of a robot at rest for its mapper, s."""
 
 
-class MotionReport(NamedTuple):
-    """Report on a motion that was passed on.
-
-    Attributes:
-        number: of the motion. time: of its end, s. state: of the machine. moment: kind of end.
-        sampled: whether the whiskers sent samples to its end.
-    """
-
-    number: int
-    time: float
-    state: CreateState
-    moment: StepEnd
-    sampled: bool
-
-
-class _Motion(NamedTuple):
-    """Attributes: end: of the motion; contact: [W] at its end; strain: [T, W, 2]; sampled: as above."""
-
-    end: MotionEnd
-    contact: np.ndarray
-    strain: np.ndarray
-    sampled: bool
-
-
-def run_create_loop(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
+def run_create_loop(
+    rig: CreateRig, mapper: AsyncMapper, tell: Callable[[float, CreateState, StepEnd], None]
+) -> None:
     """Explores as the state machine does and passes on a report of every motion, until the planned end; then,
     and at any fault, the robot is stopped.
 
     Raises:
         robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
-    try:
-        _explore(rig, mapper, tell)
-    finally:
-        rig.robot.stop()
-
-
-def _explore(rig: CreateRig, mapper: AsyncMapper, tell: Callable[[MotionReport], None]) -> None:
     plan = rig.create.plan
     random = stream(plan.seed, "behaviour")
     doing, touching = MachineState(CreateState.FWD1), np.zeros(len(rig.alive), bool)
     stamp, number = 0.0, 0
-    while number < plan.reports if plan.reports else stamp < 60 * plan.minutes:
-        _wait_for_mapper(rig, mapper)
-        motion = _execute(rig, mapper, doing, touching)
-        odometry = rig.motion()
-        stamp += odometry.dt
-        report = Report(
-            odometry=odometry,
-            motion=int(doing.state.motion),
-            moment=int(motion.end.moment),
-            alive=rig.alive & motion.sampled,
-            contact=motion.contact,
-            time=np.arange(len(motion.strain)) / plan.whiskers.rate,
-            strain=motion.strain,
-        )
-        sample = Sample(stamp, report, None)
-        if rig.recorder is not None:
-            rig.recorder.add_sample(sample)
-        mapper.offer(sample)
-        tell(MotionReport(number, stamp, doing.state, motion.end.moment, motion.sampled))
-        if not motion.sampled:
-            _wait_for_whiskers(rig)
-        doing = next_state(plan.behaviour, doing, motion.end.moment, odometry.dtheta, random, LEAST_TURN)
-        touching, number = motion.contact, number + 1
+    try:
+        while number < plan.reports if plan.reports else stamp < 60 * plan.minutes:
+            _wait_for_mapper(rig, mapper)
+            end, contact, strain, sampled = _execute(rig, mapper, doing, touching)
+            odometry = rig.motion()
+            stamp += odometry.dt
+            report = Report(
+                odometry=odometry,
+                motion=int(doing.state.motion),
+                moment=int(end.moment),
+                alive=rig.alive & sampled,
+                contact=contact,
+                time=np.arange(len(strain)) / plan.whiskers.rate,
+                strain=strain,
+            )
+            sample = Sample(stamp, report, None)
+            if rig.recorder is not None:
+                rig.recorder.add_sample(sample)
+            mapper.offer(sample)
+            tell(stamp, doing.state, end.moment)
+            if not sampled:
+                # The robot rests; the reader limits the time.
+                rig.record_event("held", "the whiskers send no samples")
+                rig.wait_until(
+                    lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the whiskers"
+                )
+                rig.record_event("resumed", "the whiskers send samples")
+            doing = next_state(plan.behaviour, doing, end.moment, odometry.dtheta, random, LEAST_TURN)
+            touching, number = contact, number + 1
+    finally:
+        rig.robot.stop()
 
 
-def _execute(rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: np.ndarray) -> _Motion:
-    """Drives until the planned end, an early one, or the last sample of whiskers that fall silent."""
+def _execute(
+    rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: np.ndarray
+) -> tuple[MotionEnd, np.ndarray, np.ndarray, bool]:
+    """Drives until the planned end, an early one, or the last sample of whiskers that fall silent.
+
+    Args:
+        before: [W] contacts at the end of the previous motion.
+
+    Returns:
+        the end of the motion; [W] contacts at its end; [T, W, 2] strain; whether the whiskers sent samples to
+        its end.
+    """
     behaviour, monitor = rig.create.plan.behaviour, rig.monitor
     command = wheel_command(behaviour, doing)
     last = planned_rows(behaviour, command) - 1
@@ -391,7 +347,9 @@ def _execute(rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: n
             raise session_fault(SessionOutcome.HOST_LATE, detail)
         if not rig.stream.streaming or rig.stream.restarts != life:
             rig.robot.stop()
-            return _unfelt_motion(rig)
+            whiskers = len(rig.alive)
+            nothing = np.zeros(whiskers, bool), np.zeros((0, whiskers, 2))
+            return MotionEnd(0, StepEnd.FREE), *nothing, False
         rows = monitor.rows(last + 1)
         bumped += [rig.bumped] * (len(rows) - len(bumped))
         if len(rows):
@@ -405,7 +363,7 @@ def _execute(rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: n
     else:
         rig.robot.stop()
     contact = np.abs(_known(rig, rows)[end.row, :, 0]) > behaviour.contact
-    return _Motion(end, contact, _strain_series(rig, doing.state, end.row + 1), sampled=True)
+    return end, contact, _strain_series(rig, doing.state, end.row + 1), True
 
 
 def _drive(rig: CreateRig, command: WheelCommand) -> float:
@@ -435,20 +393,6 @@ def _strain_series(rig: CreateRig, state: CreateState, rows: int) -> np.ndarray:
         rig.record_event("dropped", "the strain of a slow drive: samples are missing")
         return nothing
     return _known(rig, strain)
-
-
-def _unfelt_motion(rig: CreateRig) -> _Motion:
-    whiskers = len(rig.alive)
-    return _Motion(
-        MotionEnd(0, StepEnd.FREE), np.zeros(whiskers, bool), np.zeros((0, whiskers, 2)), sampled=False
-    )
-
-
-def _wait_for_whiskers(rig: CreateRig) -> None:
-    """Waits, with the robot at rest, for whiskers that send no samples; the reader limits the time."""
-    rig.record_event("held", "the whiskers send no samples")
-    rig.wait_until(lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the whiskers")
-    rig.record_event("resumed", "the whiskers send samples")
 
 
 def _wait_for_mapper(rig: CreateRig, mapper: AsyncMapper) -> None:

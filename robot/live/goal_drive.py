@@ -1,27 +1,21 @@
 """Driving to goals on a map, whisk by whisk: decides from estimates and contacts where to move next.
 
-Pure: no clock, no devices. The estimate may come from any method; without one the robot rests.
-
-Straight legs of a way: what a robot drives that turns on the spot and then moves without turning.
-
-Odometry errs most in turns, and views are those remembered only at the headings at which the way was driven.
-So a way over experiences, whose poses scatter, is driven in long straight legs, each at one heading.
-
-The route of an arm that drives to goals: each estimate aims the arm anew.
+`GoalDrive` decides: pure, without a clock or devices. The estimate may come from any method; without one the
+robot rests. A way over experiences, whose poses scatter, is driven in long straight legs, each at one
+heading: odometry errs most in turns, and views are those remembered only at the headings at which the way was
+driven. `GoalRoute` aims the arm anew by each estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import Enum
 from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.arm_route import MovableArm, route_speed
+from robot.live.arm_route import MovableArm
 from robot.live.live_config import GoalConfig, LiveConfig
 from tactile.base.se2 import between, compose, line_distances, wrap
 
@@ -51,19 +45,6 @@ class DriveState(Enum):
     @property
     def ended(self) -> bool:
         return self not in (DriveState.DRIVING, DriveState.WAITING)
-
-
-class Sighting(NamedTuple):
-    """What is known after a whisk.
-
-    Attributes:
-        pose: [3] in the map (m, m, rad); None without an estimate. points: [n, 2] contacts in the map, m.
-            sure: whether the method knows the pose and the contacts agree with the map.
-    """
-
-    pose: np.ndarray | None
-    points: np.ndarray
-    sure: bool = True
 
 
 class PlannedWay(NamedTuple):
@@ -108,7 +89,7 @@ class GoalDrive:
         self.off_way = config.off_way * cell
         self._missing = self._touched = 0
         self._returning, self._returns, self._unsure = False, 0, 0
-        self._legs: list[Leg] = []  # that are left
+        self._legs: list[_Leg] = []  # that are left
 
     @property
     def finished(self) -> bool:
@@ -124,30 +105,36 @@ class GoalDrive:
         self._returning, self._returns, self._unsure = False, 0, 0
         self.state, self.target = DriveState.WAITING, None
 
-    def observe(self, sighting: Sighting) -> DriveState:
-        """Decides after a whisk; `target` is where to move."""
+    def observe(self, pose: np.ndarray | None, points: np.ndarray, sure: bool = True) -> DriveState:
+        """Decides after a whisk; `target` is where to move.
+
+        Args:
+            pose: [3] in the map (m, m, rad); None without an estimate. points: [n, 2] contacts in the map, m.
+            sure: whether the method knows the pose and the contacts agree with the map.
+        """
         if self.state.ended:
             return self.state
         self.target = None
-        if sighting.pose is None:
+        if pose is None:
             return self._wait("no estimate")
-        if self.way is None and not self._plan(sighting.pose):
+        if self.way is None and not self._plan(pose):
             return self.state
         if not self._legs:
-            return self._end(sighting)
-        if self._distance_to_way(sighting.pose) > self.off_way:
+            return self._end(pose, sure)
+        line = np.array([self._legs[0].start, *(leg.end for leg in self._legs)])
+        if line_distances(pose[None, :2], line)[0] > self.off_way:
             self.reason = "the estimate is off the way"
-            if not self._replan(sighting.pose):
+            if not self._replan(pose):
                 return self.state
-        if self._is_blocked(sighting):
+        if self._is_blocked(pose, points):
             if self._touched < self._config.confirm:
                 self.state, self.reason = DriveState.WAITING, "a contact on the way"
                 return self.state
             self._touched = 0
-            if not self._replan(sighting.pose):
+            if not self._replan(pose):
                 return self.state
         self._missing = 0
-        return self._advance(sighting)
+        return self._advance(pose, sure)
 
     def refuse(self, pose: np.ndarray) -> DriveState:
         """Takes note that the robot cannot move to the target, seen from its estimate [3]: plans anew."""
@@ -175,7 +162,13 @@ class GoalDrive:
         made = self._planner.plan(pose, self.goal, self.obstacles)
         self.way = made.poses
         if made.poses is not None:
-            self._legs = legs_of(join_way(made.poses, pose))
+            # The way is joined beside its beginning, without the detour over its first poses.
+            way, first = made.poses, 0
+            count = int(np.searchsorted(_lengths(way), JOINED, side="right"))
+            if count >= 2:
+                off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
+                first = int(np.argmin(off)) + 1
+            self._legs = legs_of(np.vstack([[*pose[:2], way[first, 2]], way[first:]]))
             return True
         if made.state is DriveState.LOST:
             self._wait(made.reason)
@@ -183,17 +176,16 @@ class GoalDrive:
             self.state, self.reason = made.state, made.reason
         return False
 
-    def _end(self, sighting: Sighting) -> DriveState:
+    def _end(self, pose: np.ndarray, sure: bool) -> DriveState:
         """At the end of a way: the goal is reached if the pose is sure; otherwise some of the way is driven
         back, to be driven again."""
         assert self.way is not None
-        assert sighting.pose is not None
         self.target = None
-        away = float(np.hypot(*(sighting.pose - self.way[-1])[:2]))
+        away = float(np.hypot(*(pose - self.way[-1])[:2]))
         if self._returning or away > self.off_way:
             self._returning, self.way = False, None
             self.state, self.reason = DriveState.WAITING, "on the way again"
-        elif sighting.sure:
+        elif sure:
             self.state, self.reason = DriveState.REACHED, ""
         elif self._returns == self._config.returns:
             self.state, self.reason = DriveState.LOST, "the goal's surroundings do not fit the map"
@@ -202,18 +194,17 @@ class GoalDrive:
             self.state, self.reason = DriveState.WAITING, "the pose is not sure"
         else:
             self._returning, self._unsure, self._returns = True, 0, self._returns + 1
-            self._legs = legs_of(beginning(self.way[::-1], RETURNED))
+            back = self.way[::-1]
+            self._legs = legs_of(back[: max(2, int(np.searchsorted(_lengths(back), RETURNED, side="right")))])
         return self.state
 
-    def _advance(self, sighting: Sighting) -> DriveState:
-        assert sighting.pose is not None
-        pose = sighting.pose
-        while self._legs and is_passed(
-            self._legs[0], pose, CORNER if len(self._legs) > 1 else self._config.tolerance
+    def _advance(self, pose: np.ndarray, sure: bool) -> DriveState:
+        while self._legs and self._legs[0].is_passed(
+            pose, CORNER if len(self._legs) > 1 else self._config.tolerance
         ):
             self._legs.pop(0)
         if not self._legs:
-            return self._end(sighting)
+            return self._end(pose, sure)
         self.state, self.reason = DriveState.DRIVING, ""
         leg = self._legs[0]
         if abs(wrap(leg.heading - pose[2])) > STEADY:
@@ -222,63 +213,33 @@ class GoalDrive:
             self.target = np.array([*leg.end, pose[2]])
         return self.state
 
-    def _is_blocked(self, sighting: Sighting) -> bool:
+    def _is_blocked(self, pose: np.ndarray, points: np.ndarray) -> bool:
         """Whether a contact lies on the way ahead; counts such whisks, and remembers the contacts once
         they are confirmed."""
-        assert self.way is not None
-        assert sighting.pose is not None
-        points = sighting.points
-        near = line_distances(points, line_ahead(self._legs, sighting.pose)) < self._config.standoff
+        # [K, 2] the line from the pose over the ends of the legs that are left, for `NEAR_WAY`.
+        line = np.vstack([pose[None, :2], *(leg.end[None] for leg in self._legs)])
+        done = _lengths(line)
+        count = int(np.searchsorted(done, NEAR_WAY))
+        if count < len(line):
+            share = (NEAR_WAY - done[count - 1]) / np.hypot(*(line[count] - line[count - 1]))
+            line[count] = line[count - 1] + share * (line[count] - line[count - 1])
+        near = line_distances(points, line[: count + 1]) < self._config.standoff
         self._touched = self._touched + 1 if near.any() else 0
         if self._touched >= self._config.confirm:
             self.reason = "a contact on the way"
             self.obstacles = np.vstack([self.obstacles, points[near]])
         return bool(near.any())
 
-    def _distance_to_way(self, pose: np.ndarray) -> float:
-        line = [self._legs[0].start, *(leg.end for leg in self._legs)]
-        return float(line_distances(pose[None, :2], np.array(line))[0])
+
+def _lengths(way: np.ndarray) -> np.ndarray:
+    """[K] length of a way [K, 2 or 3] up to each of its poses, m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
 
 
-def is_passed(leg: Leg, pose: np.ndarray, tolerance: float) -> bool:
-    """Whether a pose is at the end of a leg, within the tolerance (m), or beyond it."""
-    step, left = leg.end - leg.start, leg.end - pose[:2]
-    return bool(np.hypot(*left) <= tolerance or step @ left < 0)
-
-
-def join_way(way: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """The way [K, 3] from a pose [3] beside its beginning on, without the detour over its first poses."""
-    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
-    count = int(np.searchsorted(far, JOINED, side="right"))
-    if count < 2:
-        return np.vstack([[*pose[:2], way[0, 2]], way])
-    off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
-    first = int(np.argmin(off)) + 1
-    return np.vstack([[*pose[:2], way[first, 2]], way[first:]])
-
-
-def beginning(way: np.ndarray, length: float) -> np.ndarray:
-    """The first poses of a way [K, 3], up to a length (m); at least two, if there are."""
-    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
-    return way[: max(2, int(np.searchsorted(far, length, side="right")))]
-
-
-def points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n, 2] points in base_link, seen from a pose [3] in the map."""
     points = np.asarray(points, float).reshape(-1, 2)
     return compose(pose, np.column_stack([points, np.zeros(len(points))]))[:, :2]
-
-
-def line_ahead(legs: Sequence[Leg], pose: np.ndarray) -> np.ndarray:
-    """[K, 2] the line from a pose over the ends of these legs, for `NEAR_WAY`."""
-    line = np.vstack([pose[None, :2], *(leg.end[None] for leg in legs)])
-    length = np.hypot(*np.diff(line, axis=0).T)
-    done = np.concatenate([[0.0], np.cumsum(length)])
-    count = int(np.searchsorted(done, NEAR_WAY))
-    if count < len(line):
-        share = (NEAR_WAY - done[count - 1]) / length[count - 1]
-        line[count] = line[count - 1] + share * (line[count] - line[count - 1])
-    return line[: count + 1]
 
 
 SCATTER = 0.02
@@ -288,7 +249,7 @@ ALONG = 0.35
 rad."""
 
 
-class Leg(NamedTuple):
+class _Leg(NamedTuple):
     """A straight move at one heading.
 
     Attributes:
@@ -299,14 +260,19 @@ class Leg(NamedTuple):
     end: np.ndarray
     heading: float
 
+    def is_passed(self, pose: np.ndarray, tolerance: float) -> bool:
+        """Whether a pose [3] is at the end of the leg, within the tolerance (m), or beyond it."""
+        step, left = self.end - self.start, self.end - pose[:2]
+        return bool(np.hypot(*left) <= tolerance or step @ left < 0)
 
-def legs_of(way: np.ndarray) -> list[Leg]:
+
+def legs_of(way: np.ndarray) -> list[_Leg]:
     """The legs of a way [K, 3] (m, m, rad), K >= 1: its poses within `SCATTER` of the legs (Douglas &
     Peucker 1973). A way of one place is one leg without length."""
     if len(way) == 1:
-        return [Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
+        return [_Leg(way[0, :2], way[0, :2], float(way[0, 2]))]
     marks = _vertices(way[:, :2])
-    return [Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1])) for a, b in pairwise(marks)]
+    return [_Leg(way[a, :2], way[b, :2], leg_heading(way[a : b + 1])) for a, b in pairwise(marks)]
 
 
 def leg_heading(poses: np.ndarray) -> float:
@@ -409,7 +375,7 @@ class GoalRoute:
     ) -> None:
         self.drive = drive
         self.pose: np.ndarray | None = None
-        self._placing, self._speed, self._jump = config.arm.placing, route_speed(config), jump
+        self._placing, self._speed, self._jump = config.arm.placing, config.route_speed, jump
         self._contacts = contacts or NoContacts()
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []  # arm's pose and contacts of the last whisks
         self._coast, self._unseen = coast, 0.0  # way without an estimate, m
@@ -443,7 +409,7 @@ class GoalRoute:
             self.pose = None
             return self.rest()
         now = compose(self.pose, between(arm_pose, arm_now))
-        state = self.drive.observe(Sighting(now, points_in_map(self.pose, points), sure))
+        state = self.drive.observe(now, _points_in_map(self.pose, points), sure)
         if self.drive.target is not None:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
@@ -451,30 +417,25 @@ class GoalRoute:
     def rest(self) -> DriveState:
         """A whisk stays without any result: the arm rests."""
         self._target = None
-        return self.drive.observe(Sighting(None, np.zeros((0, 2))))
+        return self.drive.observe(None, np.zeros((0, 2)))
 
     def _align(self, estimate: np.ndarray | None, arm_pose: np.ndarray) -> bool:
         """Aligns the last contacts with those of the map; returns whether the pose is sure then."""
         assert self.pose is not None
         points = self._recent_points(arm_pose)
         self.pose = self._contacts.align(self.pose, points)
-        agrees = self._contacts.agrees(self.pose, self._without_obstacles(points))
+        # The map does not have the obstacles that were found on the way.
+        found = self.drive.obstacles
+        away = np.linalg.norm(_points_in_map(self.pose, points)[:, None] - found, axis=-1)
+        agrees = self._contacts.agrees(self.pose, points[(away > NEW).all(axis=1)])
         if estimate is None:
             self._unseen = self._unseen if agrees else np.inf
             return False
         return agrees and bool(np.hypot(*(self.pose - estimate)[:2]) <= self._jump)
 
-    def _without_obstacles(self, points: np.ndarray) -> np.ndarray:
-        """The points [n, 2] in base_link that are not at obstacles found on the way, which the map does not
-        have."""
-        assert self.pose is not None
-        found = self.drive.obstacles
-        away = np.linalg.norm(points_in_map(self.pose, points)[:, None] - found, axis=-1)
-        return points[(away > NEW).all(axis=1)]
-
     def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
-        seen = [points_in_map(between(arm_pose, before), points) for before, points in self._recent]
+        seen = [_points_in_map(between(arm_pose, before), points) for before, points in self._recent]
         return np.concatenate(seen)
 
     def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
@@ -482,8 +443,10 @@ class GoalRoute:
         [n, 2] in base_link, m; returns whether it did."""
         apart = np.zeros(3) if self.pose is None else between(self.pose, estimate)
         self._elsewhere = self._elsewhere + 1 if np.hypot(apart[0], apart[1]) > self._jump else 0
-        if self.pose is not None and self._elsewhere and self._denies(estimate, points):
-            return False
+        if self.pose is not None and self._elsewhere:
+            here, there = (self._contacts.align(pose, points) for pose in (self.pose, estimate))
+            if self._contacts.agrees(here, points) and not self._contacts.agrees(there, points):
+                return False
         self._unseen, self._count = 0.0, self._count + 1
         if self.pose is None or self._elsewhere >= MOVED:
             self.pose, self._count, self._elsewhere = estimate, 1, 0
@@ -492,12 +455,6 @@ class GoalRoute:
         most = OUTLIER if self._count > SETTLED else np.full(3, np.inf)
         self.pose = compose(self.pose, share * np.clip(apart, -most, most))
         return True
-
-    def _denies(self, estimate: np.ndarray, points: np.ndarray) -> bool:
-        """Whether contacts agree with the map at the pose and not at the estimate."""
-        assert self.pose is not None
-        here, there = (self._contacts.align(pose, points) for pose in (self.pose, estimate))
-        return self._contacts.agrees(here, points) and not self._contacts.agrees(there, points)
 
     def advance(self, arm: MovableArm) -> bool:
         """Sends the newest target, or halts the arm without one; returns whether the drive has ended.
@@ -512,9 +469,14 @@ class GoalRoute:
                 arm.halt()
                 self._sent = None
             return self.drive.finished
-        if self._sent is None or _differ(self._sent, self._target):
+        sent, target = self._sent, self._target
+        if (
+            sent is None
+            or np.hypot(*(sent[:2] - target[:2])) > SAME
+            or abs(wrap(sent[2] - target[2])) > SAME_TURN
+        ):
             try:
-                arm.move(tcp_from_pose(self._placing, self._target), self._speed)
+                arm.move(self._placing.tcp_from_pose(self._target), self._speed)
                 self._sent = self._target
             except TargetRefused:
                 if arm.fault is not None:
@@ -527,7 +489,3 @@ class GoalRoute:
     def resend_last(self) -> None:
         """Sends the target again with the next `advance`, after a stop."""
         self._sent = None
-
-
-def _differ(a: np.ndarray, b: np.ndarray) -> bool:
-    return bool(np.hypot(*(a[:2] - b[:2])) > SAME or abs(wrap(a[2] - b[2])) > SAME_TURN)

@@ -1,7 +1,4 @@
-"""Settings of a live session: robot, head, route, and checks before the start.
-
-Settings of a session that drives to goals on a saved map.
-"""
+"""Settings of a live session: robot, head, route, checks before the start, and goals on a saved map."""
 
 from __future__ import annotations
 
@@ -136,6 +133,11 @@ class LiveConfig(Settings):
     """Free disk space required to start, bytes."""
     seed: int = 0
     """Random seed of the errors added to the odometry."""
+
+    @property
+    def route_speed(self) -> float:
+        """Speed of the arm on a route: the lower of the plan's and the arm's, m/s."""
+        return min(self.plan.motion.speed, self.arm.speed)
 
     @model_validator(mode="after")
     def _one_robot(self) -> LiveConfig:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.head.driver_config import Address
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
@@ -23,7 +22,7 @@ def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None =
     """A controller at the session's address, or another one; the arm starts above the first pose of the
     route."""
     start = plan_path(config, ur10_head(head)).pose[0]
-    start = tcp_from_pose(config.arm.placing, start, config.lift / 2)
+    start = config.arm.placing.tcp_from_pose(start, config.lift / 2)
     return UrEmulatorConfig(
         host=host or config.arm.host, hz=config.arm.hz, start=tuple(np.asarray(start).tolist())
     )

@@ -1,6 +1,6 @@
 """Arm and head of a live session, polled a hundred times a second, with one clock for both.
 
-Odometry of the arm: poses at any time, and the motion between whisks.
+Odometry of the arm gives its pose at any time, and the motion between whisks.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from robot.drivers.head.whisk_control import HeadDriver
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.driver_config import pose_from_tcp, tcp_heading
+from robot.drivers.ur10.driver_config import tcp_heading
 from robot.live.live_config import LiveConfig
-from robot.live.polling import TICK, HeadStream, OperatorStop, SessionFault, session_fault, wait_until
-from robot.live.recorder import LiveRecorder
+from robot.live.polling import TICK, OperatorStop, PolledRig, SessionFault, session_fault
 from robot.simulation.head.odometry_errors import OdometryErrors, motions_between
 from robot.sources.odometry import MIDPOINT, from_velocities
 from tactile.base.random_streams import stream
@@ -65,7 +64,7 @@ class ArmOdometry:
         last = len(self._states) - 1
         k = min(max(bisect_left(self._states, time, key=_time_of), 1), last)
         pair = [self._states[max(k - 1, 0)], self._states[k]]
-        poses, _ = pose_from_tcp(self._config.arm.placing, np.stack([state[1] for state in pair]))
+        poses, _ = self._config.arm.placing.pose_from_tcp(np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
         share = float(np.clip((time - pair[0][0]) / span, 0, 1)) if span > 0 else 0.0
         step = poses[1] - poses[0]
@@ -119,41 +118,35 @@ MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
 
 
-class Rig:
+class Rig(PolledRig):
     """The two devices of a session; a context manager that leaves both at rest.
 
     Args:
         stopped: whether the operator has requested the end.
 
     Attributes:
-        arm, head, driver: the devices. stream: samples and clock of the head. odometer: of the arm. epoch:
-            time 0 of the session on the host's clock, s. state_ages: age of the newest state at each poll, s.
-            recorder: recorder of all data, or None.
+        arm, head, driver: the devices. odometer: of the arm. state_ages: age of the newest state at each
+            poll, s.
     """
 
     def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
-        self.config, self.shape = config, ur10_head(head)
-        whiskers = len(self.shape.length)
+        self.shape = ur10_head(head)
         self.arm = Arm(config.arm)
-        self.head = HeadReader(
+        reader = HeadReader(
             lambda: open_bridge(config.head.address),
-            whiskers,
+            len(self.shape.length),
             config.head,
             alive=self.shape.alive,
-            on_overload=self._overload,
+            on_overload=lambda whisker: self.arm.fail(
+                SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit"
+            ),
         )
-        self.driver = HeadDriver(self.head, self.shape)
-        self.stream, self.odometer = HeadStream(self.head), ArmOdometry(config)
-        self.epoch = time.monotonic()
+        self.driver = HeadDriver(reader, self.shape)
+        super().__init__(config, reader, stopped)
+        self.odometer = ArmOdometry(config)
         self.state_ages: list[float] = []
-        self.recorder: LiveRecorder | None = None
-        self._stopped = stopped
         self._arm_clock = ClockSync()
         self._seen = 0
-
-    def now(self) -> float:
-        """Session time, s."""
-        return time.monotonic() - self.epoch
 
     def poll(self) -> None:
         """Reads the data of both devices.
@@ -173,10 +166,6 @@ class Rig:
         if self._stopped():
             raise OperatorStop
 
-    def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
-        """Polls until a condition is true; see `robot.live.polling.wait_until`."""
-        wait_until(self.poll, done, longest, late, what)
-
     def begin(self) -> None:
         """Sets time 0 of the session to now."""
         self.epoch = time.monotonic()
@@ -195,11 +184,6 @@ class Rig:
                 stood = now
         return self.arm.still()
 
-    def record_event(self, name: str, text: str) -> None:
-        """Records an event."""
-        if self.recorder is not None:
-            self.recorder.add_event(self.now(), name, text)
-
     def _take_states(self) -> None:
         states = self.arm.states(self._seen)
         if self.arm.latest() is not None:
@@ -214,9 +198,6 @@ class Rig:
         if self.recorder is not None:
             states["host"] -= self.epoch
             self.recorder.add_states(states)
-
-    def _overload(self, whisker: int) -> None:
-        self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit")
 
     def __enter__(self) -> Self:
         return self

@@ -1,8 +1,7 @@
-"""The end of a session, and waiting for a condition while devices are polled.
+"""What both robots share in a live session: polling, the samples of a head, faults that end it, the mapper.
 
-The samples of a head as they arrive, with its clock: what every rig does with a head.
-
-The mapper of a session, as its loops see it.
+`PolledRig` is the base of the rigs: it waits for conditions while the devices are polled, and records events.
+`_HeadStream` collects the samples of a head, with its clock. `AsyncMapper` is the mapper as the loops see it.
 """
 
 from __future__ import annotations
@@ -19,6 +18,8 @@ from robot.drivers.head.decoder import Frames
 from robot.drivers.head.reader import HeadReader, LinkState
 from robot.drivers.head.usb_protocol import FrameFlag
 from robot.drivers.outcome import Fault, SessionOutcome
+from robot.live.live_config import LiveConfig
+from robot.live.recorder import LiveRecorder
 from robot.sources.source import Sample
 
 TICK = 0.01
@@ -42,31 +43,11 @@ def session_fault(outcome: SessionOutcome, detail: str) -> SessionFault:
     return SessionFault(Fault(outcome, detail, time.monotonic()))
 
 
-def wait_until(
-    poll: Callable[[], None], done: Callable[[], bool], longest: float, late: SessionOutcome, what: str
-) -> None:
-    """Polls until a condition is true.
-
-    Args:
-        poll: reads the devices; raises at a fault. longest: time limit, s. late: outcome after that time.
-        what: the awaited event, for the fault.
-
-    Raises:
-        SessionFault, OperatorStop.
-    """
-    due = time.monotonic() + longest
-    while not done():
-        if time.monotonic() > due:
-            raise session_fault(late, f"{what} took more than {longest:g} s")
-        poll()
-        time.sleep(TICK)
-
-
 MAX_CLOCK_STEP = 2e-3
 """Largest step of the head's clock against its sample count, s."""
 
 
-class HeadStream:
+class _HeadStream:
     """Collects the blocks of a reader, from its thread, for the thread that polls.
 
     Attributes:
@@ -88,7 +69,7 @@ class HeadStream:
     @property
     def streaming(self) -> bool:
         """Whether the head sends samples."""
-        return self._head.state.link is LinkState.STREAMING
+        return self._head.state is LinkState.STREAMING
 
     def take(self) -> Iterator[tuple[Frames, float]]:
         """The blocks since the last call, with their arrival times, s, host."""
@@ -101,7 +82,12 @@ class HeadStream:
                 continue
             frames, arrival = block
             self.clock.observe(float(frames.time.max()) * 1e-6, arrival)
-            self._count(frames)
+            # The head's clock and its sample count are both independent of the host's load.
+            assert self._head.identity is not None
+            ahead = frames.time * 1e-6 - frames.sequence / self._head.identity.rate
+            before = ahead[0] if self._ahead is None else self._ahead
+            self._uneven = max(self._uneven, float(np.abs(ahead - before).max()))
+            self._ahead = float(ahead[-1])
             begins = (frames.flags & np.uint8(FrameFlag.CYCLE)) > 0
             self.whisk_starts += frames.sequence[begins].tolist()
             yield frames, arrival
@@ -118,13 +104,56 @@ class HeadStream:
             return Fault(SessionOutcome.CLOCK_JUMPED, detail, time.monotonic())
         return None
 
-    def _count(self, frames: Frames) -> None:
-        """Checks the head's clock against its sample count; both are independent of the host's load."""
-        assert self._head.identity is not None
-        ahead = frames.time * 1e-6 - frames.sequence / self._head.identity.rate
-        before = ahead[0] if self._ahead is None else self._ahead
-        self._uneven = max(self._uneven, float(np.abs(ahead - before).max()))
-        self._ahead = float(ahead[-1])
+
+class PolledRig:
+    """The devices of a session, polled a hundred times a second.
+
+    Args:
+        head: of the whiskers. stopped: whether the operator has requested the end.
+
+    Attributes:
+        stream: samples and clock of the head. epoch: time 0 of the session on the host's clock, s. recorder:
+            recorder of all data, or None.
+    """
+
+    def __init__(self, config: LiveConfig, head: HeadReader, stopped: Callable[[], bool]) -> None:
+        self.config, self.head, self.stream = config, head, _HeadStream(head)
+        self.epoch = time.monotonic()
+        self.recorder: LiveRecorder | None = None
+        self._stopped = stopped
+
+    def now(self) -> float:
+        """Session time, s."""
+        return time.monotonic() - self.epoch
+
+    def poll(self) -> None:
+        """Reads the data of all devices.
+
+        Raises:
+            SessionFault, OperatorStop: the session must end.
+        """
+        raise NotImplementedError
+
+    def wait_until(self, done: Callable[[], bool], longest: float, late: SessionOutcome, what: str) -> None:
+        """Polls until a condition is true.
+
+        Args:
+            longest: time limit, s. late: outcome after that time. what: the awaited event, for the fault.
+
+        Raises:
+            SessionFault, OperatorStop.
+        """
+        due = time.monotonic() + longest
+        while not done():
+            if time.monotonic() > due:
+                raise session_fault(late, f"{what} took more than {longest:g} s")
+            self.poll()
+            time.sleep(TICK)
+
+    def record_event(self, name: str, text: str) -> None:
+        """Records an event."""
+        if self.recorder is not None:
+            self.recorder.add_event(self.now(), name, text)
 
 
 class AsyncMapper(Protocol):

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, select_frames
+from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.recordings.cdr import (
     ARM,
@@ -102,7 +102,7 @@ class LiveRecorder:
         Raises:
             ValueError: the frames are not those of the cut.
         """
-        mine = select_frames(frames, cut.first, cut.last)
+        mine = frames.select(cut.first, cut.last)
         if cut.seen and not 0 < len(mine.sequence) == cut.frames <= MAX_FRAMES:
             raise ValueError(f"{len(mine.sequence)} frames for a whisk of {cut.frames}")
         with self._writing(cut.time) as able:

@@ -1,116 +1,37 @@
-"""Self-test of both devices and of this machine before the arm moves."""
+"""Self-tests of a session's devices and of this machine, for an arm with a head and for a Create.
+
+Nothing moves in a self-test. A session runs its two steps itself: it finds the devices, and later, when the
+mapper is ready, starts and checks them.
+"""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from robot.drivers.head.reader import HeadReader
+from robot.drivers.create.driver_config import CommandRefused
+from robot.drivers.create.protocol import Bumps
+from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
+from robot.live.create_rig import CreateRig
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import Rig
-from robot.live.polling import TICK, HeadStream, SessionFault
+from robot.live.polling import PolledRig
 from tactile.base.errors import InputError, os_errors_of
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
 LISTEN_TIME = 1.5
-"""Time for which both streams are observed, s."""
+"""Time for which the streams are observed, s."""
 MIN_RATE_SHARE = 0.9
 """Required share of a stream's nominal rate."""
-
-
-def check_disk(config: LiveConfig, directory: Path) -> str:
-    """Checks that a directory can be made, and the free disk space there; returns a line of text.
-
-    Raises:
-        InputError: it cannot be made, or there is not enough free space.
-    """
-    there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
-    with os_errors_of(directory, "cannot be made", "a writable folder", "choose another with -o"):
-        tempfile.TemporaryFile(dir=there).close()
-    free = shutil.disk_usage(there).free
-    if free < config.room:
-        found = f"{free / 1e9:.2g} GB free"
-        cure = "make room, or choose another disk with -o"
-        raise InputError(str(directory), found, f"{config.room / 1e9:.2g} GB", cure)
-    return f"disk: {free / 1e9:.0f} GB free"
-
-
-def find_devices(rig: Rig) -> Iterator[str]:
-    """Starts the head and asks the arm's controller for its status, which starts no program on it; yields a
-    line of text for each device.
-
-    Raises:
-        InputError: a device is missing or not ready; the error gives its cure.
-    """
-    yield start_head(rig.head)
-    version = ".".join(map(str, check_controller(rig.config.arm).version))
-    yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
-
-
-def start_and_check(rig: Rig) -> Iterator[str]:
-    """Starts the arm and checks the streams of both devices; yields a line of text for each passed check.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
-    """
-    rig.arm.start()
-    yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
-    check_stream(rig.head, rig.stream, rig.config.residual, lambda: _listen(rig))
-    age = float(np.median(rig.state_ages[-100:]))
-    yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms, newest state {age * 1e3:.0f} ms old"
-
-
-def check_stream(head: HeadReader, stream: HeadStream, residual: float, listen: Callable[[], None]) -> None:
-    """Checks rate, damage and clock of a head's samples.
-
-    Args:
-        residual: largest one of the clock synchronisation, s. listen: polls for `LISTEN_TIME`.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-    """
-    identity = head.identity
-    assert identity is not None
-    before = head.decoder.counts
-    listen()
-    after = head.decoder.counts
-    rate = (after.good - before.good) / LISTEN_TIME
-    if rate < MIN_RATE_SHARE * identity.rate:
-        raise InputError(
-            "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
-        )
-    if after.bad > before.bad:
-        found = f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s"
-        raise InputError("head", found, "none", "change the cable")
-    if stream.clock.residual > residual:
-        found = f"clock residual of {stream.clock.residual * 1e3:.1f} ms"
-        raise InputError("head", found, f"{residual * 1e3:g} ms", "check the load of this machine")
-
-
-def start_head(head: HeadReader) -> str:
-    """Starts a head; returns a line of text about it.
-
-    Raises:
-        InputError: it is missing or has another shape; the error gives the cure.
-    """
-    head.start()
-    identity = head.identity
-    assert identity is not None
-    return f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
-
-
-def _listen(rig: Rig) -> None:
-    end = rig.now() + LISTEN_TIME
-    rig.wait_until(lambda: rig.now() >= end, LISTEN_TIME + 5.0, SessionOutcome.HEAD_SILENT, "the self-test")
+FEWEST_ALIVE = 1
+"""Least number of whiskers of a Create with a signal."""
 
 
 def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
@@ -130,15 +51,156 @@ def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> 
     yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
     with Rig(config, head, lambda: False) as rig:
         yield from find_devices(rig)
-        check_stream(rig.head, rig.stream, config.residual, lambda: _listen_to_head(rig.stream))
+        _check_stream(rig)
         yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
 
 
-def _listen_to_head(stream: HeadStream) -> None:
-    end = time.monotonic() + LISTEN_TIME
-    while time.monotonic() < end:
-        for _ in stream.take():
-            pass
-        if stream.fault:
-            raise SessionFault(stream.fault)
-        time.sleep(TICK)
+def check_create(config: LiveConfig, directory: Path) -> Iterator[str]:
+    """Checks everything that a session needs, without a motion; yields a line for each passed check.
+
+    Args:
+        config: with a part `create`. directory: in which the session would make its run directory.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+        robot.live.polling.SessionFault: a device failed meanwhile.
+    """
+    yield check_disk(config, directory)
+    with CreateRig(config, lambda: False) as rig:
+        yield from find_devices(rig)
+        yield from start_and_check(rig)
+
+
+def check_disk(config: LiveConfig, directory: Path) -> str:
+    """Checks that a directory can be made, and the free disk space there; returns a line of text.
+
+    Raises:
+        InputError: it cannot be made, or there is not enough free space.
+    """
+    there = next(folder for folder in (directory, *directory.resolve().parents) if folder.exists())
+    with os_errors_of(directory, "cannot be made", "a writable folder", "choose another with -o"):
+        tempfile.TemporaryFile(dir=there).close()
+    free = shutil.disk_usage(there).free
+    if free < config.room:
+        found = f"{free / 1e9:.2g} GB free"
+        cure = "make room, or choose another disk with -o"
+        raise InputError(str(directory), found, f"{config.room / 1e9:.2g} GB", cure)
+    return f"disk: {free / 1e9:.0f} GB free"
+
+
+def find_devices(rig: Rig | CreateRig) -> Iterator[str]:
+    """Starts the stream of the whiskers and finds the robot; yields a line of text for each device.
+
+    It asks the arm's controller for its status, which starts no program on it, or opens the Create's port
+    once.
+
+    Raises:
+        InputError: a device is missing or not ready; the error gives its cure.
+    """
+    if isinstance(rig, CreateRig):
+        behaviour = rig.create.plan.behaviour
+        try:
+            for speed in (behaviour.fast, behaviour.slow):
+                rig.create.wheel_speeds(speed, 0.0)
+            rig.create.wheel_speeds(0.0, behaviour.turn.rate)
+        except CommandRefused as error:
+            cure = "a lower speed in the plan, or a higher limit"
+            raise InputError("live.create.plan.behaviour", str(error), "", cure) from None
+        open_port(rig.create.port).close()
+        yield f"Create: port {rig.create.port} can be opened"
+    rig.head.start()
+    identity = rig.head.identity
+    assert identity is not None
+    yield f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
+    if isinstance(rig, CreateRig):
+        wanted = rig.create.plan.whiskers.rate
+        if abs(identity.rate - wanted) > 1e-6 * wanted:
+            found, key = f"{identity.rate:g} samples per second", "live.create.plan.whiskers.rate"
+            raise InputError("head", found, f"{wanted:g}, as in `{key}`", f"--set {key}={identity.rate:g}")
+    else:
+        version = ".".join(map(str, check_controller(rig.config.arm).version))
+        yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
+
+
+def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
+    """Starts the robot, a Create in safe mode and at rest, and checks the streams of the devices; yields a
+    line of text for each passed check.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
+    """
+    if isinstance(rig, CreateRig):
+        rig.robot.start()
+        rig.robot.refresh()
+        reply = rig.robot.last_reply
+        if reply is not None and reply.bumps & Bumps.BUMPED:
+            found = f"{reply.bumps.describe()} pressed"
+            raise InputError(
+                "live.create", found, "a free bumper", "move the robot away from what it touches"
+            )
+        yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
+        rig.monitor.begin()
+    else:
+        rig.arm.start()
+        yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
+    _check_stream(rig)
+    clocks = f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
+    if isinstance(rig, CreateRig):
+        yield _check_whiskers(rig)
+        yield clocks
+    else:
+        age = float(np.median(rig.state_ages[-100:]))
+        yield f"{clocks}, newest state {age * 1e3:.0f} ms old"
+
+
+def _check_stream(rig: PolledRig) -> None:
+    """Listens to the head for a while and checks rate, damage and clock of its samples.
+
+    Raises:
+        InputError: a check failed; the error gives its cure.
+    """
+    head, residual = rig.head, rig.config.residual
+    identity = head.identity
+    assert identity is not None
+    before = head.decoder.counts
+    end = rig.now() + LISTEN_TIME
+    rig.wait_until(lambda: rig.now() >= end, LISTEN_TIME + 5.0, SessionOutcome.HEAD_SILENT, "the self-test")
+    after = head.decoder.counts
+    rate = (after.good - before.good) / LISTEN_TIME
+    if rate < MIN_RATE_SHARE * identity.rate:
+        raise InputError(
+            "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
+        )
+    if after.bad > before.bad:
+        found = f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s"
+        raise InputError("head", found, "none", "change the cable")
+    measured = rig.stream.clock.residual
+    if measured > residual:
+        found = f"clock residual of {measured * 1e3:.1f} ms"
+        raise InputError("head", found, f"{residual * 1e3:g} ms", "check the load of this machine")
+
+
+def _check_whiskers(rig: CreateRig) -> str:
+    """Measures the strain at rest and finds whiskers without a signal."""
+    newest = rig.head.ring.newest
+    assert newest is not None
+    values = rig.head.ring.between(newest[0] - round(rig.monitor.rate), newest[0]).values
+    rig.alive &= (values[..., 1:] != values[:1, :, 1:]).any(axis=(0, 2))
+    if rig.alive.sum() < FEWEST_ALIVE:
+        raise InputError("head", "no whisker has a signal", "", "check the cables of the whiskers")
+    rows = rig.monitor.rows(len(values))
+    # A whisker that shakes at rest by half the strain of a contact would report contacts.
+    horizontal = (rows * rig.alive[:, None])[..., 0]
+    swing = np.abs(horizontal - horizontal.mean(axis=0)).max(axis=0)
+    if swing.max() > rig.create.plan.behaviour.contact / 2:
+        cure = "let the robot stand with its whiskers free, or raise `live.create.plan.behaviour.contact`"
+        where = f"whisker {int(swing.argmax())}"
+        raise InputError(where, "its strain changes while the robot rests", "", cure)
+    rig.monitor.rest = rig.monitor.strain(values).mean(axis=0)
+    level = 1e6 * float(np.abs(rows - rows.mean(axis=0)).std())
+    dead = [str(k) for k in np.flatnonzero(~rig.alive)]
+    without = f", without a signal: {', '.join(dead)}" if dead else ""
+    return (
+        f"whiskers: {int(rig.alive.sum())} of {len(rig.alive)} alive, noise {level:.1f} microstrain{without}"
+    )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.head.decoder import Frames, assemble_cycle, make_cut
+from robot.drivers.head.decoder import Cut, assemble_cycle
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import ArmRoute
@@ -37,7 +37,7 @@ class WhiskReport(NamedTuple):
     pose: np.ndarray
 
 
-class WhiskSequence(NamedTuple):
+class _WhiskSequence(NamedTuple):
     """A sequence of consecutive whisks, timed by the head's own clock.
 
     Attributes:
@@ -75,7 +75,7 @@ def run_whisk_loop(
     number, most = 0, rig.config.whisks
     arrived = False
     while not arrived and number != most:
-        sequence, life = next_sequence(rig, number), rig.stream.restarts
+        sequence, life = _next_sequence(rig, number), rig.stream.restarts
         while rig.stream.streaming and rig.stream.restarts == life:
             rig.poll()
             check_mapper(mapper)
@@ -89,7 +89,12 @@ def run_whisk_loop(
             if arrived or number == most:
                 break
         else:
-            wait_for_head(rig, route)
+            rig.arm.halt()
+            rig.record_event("held", "the head sends no samples")
+            # The reader limits the waiting time and turns it into a fault.
+            rig.wait_until(lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
+            rig.record_event("resumed", "the head sends samples")
+            route.resend_last()
 
 
 def follow_route(rig: Rig, route: ArmRoute) -> None:
@@ -97,17 +102,7 @@ def follow_route(rig: Rig, route: ArmRoute) -> None:
     rig.wait_until(lambda: _advance(rig, route), float("inf"), SessionOutcome.NOT_ARRIVED, "the route")
 
 
-def wait_for_head(rig: Rig, route: ArmRoute) -> None:
-    """Stops the arm until the head sends samples."""
-    rig.arm.halt()
-    rig.record_event("held", "the head sends no samples")
-    # The reader limits the waiting time and turns it into a fault.
-    rig.wait_until(lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
-    rig.record_event("resumed", "the head sends samples")
-    route.resend_last()
-
-
-def next_sequence(rig: Rig, number: int) -> WhiskSequence:
+def _next_sequence(rig: Rig, number: int) -> _WhiskSequence:
     """The sequence that starts with the next whisk.
 
     Raises:
@@ -133,12 +128,12 @@ def next_sequence(rig: Rig, number: int) -> WhiskSequence:
     assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
     start = float(rig.stream.clock.to_host(device)) - rig.epoch
-    return WhiskSequence(number, first, device, start, round(count), 1 / rate)
+    return _WhiskSequence(number, first, device, start, round(count), 1 / rate)
 
 
 def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
     """Records whisks in free air, as raw cycles, for the calibration."""
-    sequence = next_sequence(rig, 0)
+    sequence = _next_sequence(rig, 0)
     record = []
     for number in range(count):
         first, last = sequence.frame_range(number)
@@ -147,12 +142,12 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
         )
         frames = rig.head.ring.between(first, last)
         begin = sequence.start_of(number)
-        cut = make_cut(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
+        cut = Cut.of(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
         record.append(assemble_cycle(frames, cut))
     return record
 
 
-def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
+def _hand_on(rig: Rig, sequence: _WhiskSequence, number: int, mapper: AsyncMapper) -> WhiskReport | None:
     """Passes on a whisk that is complete or `grace` late; returns None before."""
     first, last = sequence.frame_range(number)
     due = float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + 1)))
@@ -165,8 +160,12 @@ def _hand_on(rig: Rig, sequence: WhiskSequence, number: int, mapper: AsyncMapper
     odometry, truth = rig.odometer.step(
         stamp, float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
     )
-    whole, slow = _is_complete(frames, first, last, rig.config.gap), mapper.behind() > rig.config.budget
-    cut = make_cut(number, stamp, start, frames, odometry, seen=whole and not slow)
+    # An image needs fewer than `gap` consecutive missing samples, and times without a larger gap either.
+    gap, step = rig.config.gap, np.diff(frames.time)
+    even = len(step) > 0 and step.min() > 0 and step.max() <= gap * np.median(step)
+    numbers = np.concatenate([[first - 1], frames.sequence, [last + 1]])
+    whole, slow = bool(np.diff(numbers).max() <= gap and even), mapper.behind() > rig.config.budget
+    cut = Cut.of(number, stamp, start, frames, odometry, seen=whole and not slow)
     if not cut.seen:
         rig.record_event(
             "dropped", f"whisk {number}: " + ("the mapper is behind" if whole else "samples are missing")
@@ -192,11 +191,3 @@ def _has_arrived(rig: Rig, last: int) -> bool:
     """Whether sample `last` or a later one has arrived."""
     newest = rig.head.ring.newest
     return newest is not None and newest[0] >= last
-
-
-def _is_complete(frames: Frames, first: int, last: int, gap: int) -> bool:
-    """Whether fewer than `gap` consecutive samples are missing, and the times have no larger gap either."""
-    known = np.concatenate([[first - 1], frames.sequence, [last + 1]])
-    step = np.diff(frames.time)
-    even = len(step) > 0 and step.min() > 0 and step.max() <= gap * np.median(step)
-    return bool(np.diff(known).max() <= gap and even)

@@ -39,11 +39,9 @@ from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.slam import Slam
 from robot.drivers.outcome import Fault
-from robot.drivers.ur10.driver_config import pose_from_tcp, tcp_from_pose
 from robot.drivers.ur10.safety import plan_move
-from robot.emulators.ur10.emulated_arm import EmulatedArm
+from robot.emulators.ur10.emulated_arm import EmulatedArm, MoveL
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.motion import MoveL
 from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_config import GoalConfig, LiveConfig
 from robot.live.live_rig import ArmOdometry
@@ -75,7 +73,7 @@ class VirtualArm:
     def __init__(self, config: LiveConfig, surroundings: Surroundings, start: np.ndarray) -> None:
         self.surroundings, self.time = surroundings, 0.0
         self._config, self._dt = config, 1.0 / config.arm.hz
-        tcp = tuple(map(float, tcp_from_pose(config.arm.placing, start)))
+        tcp = tuple(map(float, config.arm.placing.tcp_from_pose(start)))
         self._arm = EmulatedArm(UrEmulatorConfig(hz=config.arm.hz, start=tcp))  # type: ignore[arg-type]
         plan = config.plan
         self._setup = HeadSetup(surroundings.head, plan.stream, plan.mechanics, plan.whisking)
@@ -126,7 +124,7 @@ class VirtualArm:
             yield self.whisk()
 
     def _pose(self) -> np.ndarray:
-        return pose_from_tcp(self._config.arm.placing, np.array(self._arm.state.tcp))[0]
+        return self._config.arm.placing.pose_from_tcp(np.array(self._arm.state.tcp))[0]
 
     def _remember(self) -> None:
         state = self._arm.state

@@ -1,11 +1,8 @@
 """Driver of a Create: a control thread, and a watchdog process for the end of that thread.
 
-Control loop of the Create: read sensors, check, command the wheels.
-
-Odometry from the whole millimetres and degrees that the Create reports.
-
-The robot keeps the remainder below 1 mm and 1 degree for the next reply. Unless a reply is lost, sums
-stay within these bounds of the wheels' motion, at any reading rate.
+The thread reads the sensors, checks them and commands the wheels, in this order. Odometry sums the whole
+millimetres and degrees that the Create reports. The robot keeps the remainder below 1 mm and 1 degree for the
+next reply: unless a reply is lost, sums stay within these bounds of the wheels' motion, at any reading rate.
 """
 
 from __future__ import annotations
@@ -15,17 +12,11 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import Self
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver_config import (
-    CommandRefused,
-    CreateConfig,
-    StopEvent,
-    StopReason,
-    stop_reason,
-    wheel_speeds,
-)
+from robot.drivers.create.driver_config import CommandRefused, CreateConfig, StopEvent, StopReason
+from robot.drivers.create.protocol import Bumps
 from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged, open_port
 from robot.drivers.create.watchdog import Watchdog
 from tactile.base.errors import InputError
@@ -33,14 +24,6 @@ from tactile.base.types import Odometry
 
 PAUSE = 0.03
 """Pause between commands that change the mode, s; within 20 ms of one the robot may miss the next."""
-
-
-class WheelCommand(NamedTuple):
-    """Requested wheel speeds, mm/s, and the time of the request, s."""
-
-    right: int
-    left: int
-    time: float
 
 
 class ControlLoop:
@@ -56,7 +39,7 @@ class ControlLoop:
     def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._lock = threading.Lock()
-        self._command = WheelCommand(0, 0, -math.inf)
+        self._command = (0, 0, -math.inf)  # requested speeds, right and left, mm/s; time of the request, s
         self._reply_time = clock()
         self._odometer = CreateOdometry(self._reply_time)
         self._outstanding = 0  # at the last call of `gap`
@@ -75,11 +58,11 @@ class ControlLoop:
         Raises:
             CommandRefused: above the speed limit, not finite, or stopped and not released.
         """
-        right, left = wheel_speeds(self._config, forward, turn)
+        right, left = self._config.wheel_speeds(forward, turn)
         with self._lock:
             if self.active_stop and (right or left):
                 raise CommandRefused(f"the robot is stopped: {self.active_stop}")
-            self._command = WheelCommand(right, left, self._clock())
+            self._command = (right, left, self._clock())
 
     def release(self) -> None:
         """Allows driving again after a stop; the robot stands until the next command.
@@ -107,7 +90,7 @@ class ControlLoop:
     def halt(self, reason: StopReason, detail: str) -> None:
         """Stops the robot with the next poll, until release; the first reason is kept."""
         with self._lock:
-            self._command = WheelCommand(0, 0, -math.inf)
+            self._command = (0, 0, -math.inf)
             self.active_stop = self.active_stop or StopEvent(reason, detail, self._clock())
 
     def poll(self) -> None:
@@ -120,13 +103,18 @@ class ControlLoop:
                 self._link.send(protocol.SAFE)
                 return
             found = self._read()
-            command = self._command  # read once: another thread may replace it
-            stop = stop_reason(found, command.right, command.left) if found else None
-            if stop:
-                self.halt(*stop)
-            fresh = self._clock() - command.time <= self._config.patience
+            right, left, requested = self._command  # read once: another thread may replace it
+            if found is None:
+                pass
+            elif found.bumps & Bumps.DROPPED:
+                self.halt(StopReason.WHEEL_DROP, (found.bumps & Bumps.DROPPED).describe())
+            elif found.mode != protocol.Mode.SAFE:
+                self.halt(StopReason.LEFT_SAFE_MODE, f"the robot is in {found.mode.name.lower()} mode")
+            elif found.bumps & Bumps.BUMPED and right + left > 0:  # driving back is allowed
+                self.halt(StopReason.BUMPED, (found.bumps & Bumps.BUMPED).describe())
+            fresh = self._clock() - requested <= self._config.patience
             drives = fresh and self.active_stop is None
-            self._link.send(protocol.drive(command.right, command.left) if drives else protocol.STOP)
+            self._link.send(protocol.drive(right, left) if drives else protocol.STOP)
         except Unplugged as error:
             self.halt(StopReason.UNPLUGGED, str(error))
 
@@ -334,10 +322,10 @@ class CreateDriver:
                 f"replies of a Create at {protocol.BAUD} baud",
                 "switch it on, check cable and port; a Create 2 is not supported",
             )
-        if found.bumps & protocol.Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
+        if found.bumps & Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
             raise NotSafe(
                 port,
-                f"the Create stays in {found.mode.name.lower()} mode, {protocol.describe_bumps(found.bumps)}",
+                f"the Create stays in {found.mode.name.lower()} mode, {found.bumps.describe()}",
                 "safe mode",
                 "set it on all its wheels, away from edges, and unplug its charger",
             )

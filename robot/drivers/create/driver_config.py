@@ -1,7 +1,4 @@
-"""Settings of a Create: port, speed and time limits.
-
-Reasons that stop a Create, each with its cure; the speed limit.
-"""
+"""Settings of a Create (port, speed and time limits), its speed limit, and the reasons that stop it."""
 
 from __future__ import annotations
 
@@ -11,8 +8,12 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from robot.drivers.create.protocol import TOP_SPEED, WHEEL_BASE, Bumps, Mode, SensorReply, describe_bumps
+from robot.drivers.create.protocol import TOP_SPEED, WHEEL_BASE
 from tactile.base.settings import Settings
+
+
+class CommandRefused(ValueError):
+    """A rejected command."""
 
 
 class CreateConfig(Settings):
@@ -40,6 +41,27 @@ class CreateConfig(Settings):
             raise ValueError(f"silence of {self.silence:g} s is less than two readings at {self.rate:g} Hz")
         return self
 
+    def wheel_speeds(self, forward: float, turn: float) -> tuple[int, int]:
+        """Speeds of right and left wheel, mm/s.
+
+        Args:
+            forward: m/s. turn: rad/s, counter-clockwise.
+
+        Raises:
+            CommandRefused: not finite, or a wheel faster than `speed`.
+        """
+        if not (math.isfinite(forward) and math.isfinite(turn)):
+            raise CommandRefused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
+        apart = turn * self.wheel_base / 2
+        right, left = (1000 * speed for speed in (forward + apart, forward - apart))
+        if max(abs(right), abs(left)) > 1000 * self.speed + 1e-6:
+            raise CommandRefused(
+                f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
+                f" {max(abs(right), abs(left)) / 1000:g} m/s; the limit is {self.speed:g} (`speed`)"
+            )
+        cap = math.floor(1000 * self.speed + 1e-6)  # rounding must not exceed the limit
+        return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
+
 
 class StopReason(Enum):
     """Reason of a stop of the wheels; the value is its cure."""
@@ -66,40 +88,3 @@ class StopEvent(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.reason.name.lower()}: {self.detail}; {self.reason.value}"
-
-
-class CommandRefused(ValueError):
-    """A rejected command."""
-
-
-def wheel_speeds(config: CreateConfig, forward: float, turn: float) -> tuple[int, int]:
-    """Speeds of right and left wheel, mm/s.
-
-    Args:
-        forward: m/s. turn: rad/s, counter-clockwise.
-
-    Raises:
-        CommandRefused: not finite, or a wheel faster than `config.speed`.
-    """
-    if not (math.isfinite(forward) and math.isfinite(turn)):
-        raise CommandRefused(f"forward {forward} m/s, turn {turn} rad/s: not finite")
-    apart = turn * config.wheel_base / 2
-    right, left = (1000 * speed for speed in (forward + apart, forward - apart))
-    if max(abs(right), abs(left)) > 1000 * config.speed + 1e-6:
-        raise CommandRefused(
-            f"forward {forward:g} m/s, turn {turn:g} rad/s needs a wheel at"
-            f" {max(abs(right), abs(left)) / 1000:g} m/s; the limit is {config.speed:g} (`speed`)"
-        )
-    cap = math.floor(1000 * config.speed + 1e-6)  # rounding must not exceed the limit
-    return max(-cap, min(cap, round(right))), max(-cap, min(cap, round(left)))
-
-
-def stop_reason(reply: SensorReply, right: int, left: int) -> tuple[StopReason, str] | None:
-    """Reason and detail for a stop after a reading, or None. After a bump, driving back is allowed."""
-    if reply.bumps & Bumps.DROPPED:
-        return StopReason.WHEEL_DROP, describe_bumps(reply.bumps & Bumps.DROPPED)
-    if reply.mode != Mode.SAFE:
-        return StopReason.LEFT_SAFE_MODE, f"the robot is in {reply.mode.name.lower()} mode"
-    if reply.bumps & Bumps.BUMPED and right + left > 0:
-        return StopReason.BUMPED, describe_bumps(reply.bumps & Bumps.BUMPED)
-    return None

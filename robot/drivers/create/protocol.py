@@ -56,6 +56,10 @@ class Bumps(IntFlag):
     BUMPED = RIGHT | LEFT
     DROPPED = DROPPED_RIGHT | DROPPED_LEFT | DROPPED_CASTER
 
+    def describe(self) -> str:
+        """Bumps and wheel drops in words."""
+        return " and ".join(str(bump.name).lower().replace("_", " ") for bump in self) or "nothing touched"
+
 
 class SensorReply(NamedTuple):
     """One reply; distance and angle are those since the previous reply.
@@ -69,6 +73,25 @@ class SensorReply(NamedTuple):
     bumps: Bumps
     mode: Mode
 
+    @classmethod
+    def parse(cls, data: bytes, elapsed: float) -> SensorReply | None:
+        """The reply in these bytes; None if it cannot be one of a Create.
+
+        Args:
+            elapsed: s since the last accepted reply; inf without one.
+        """
+        if len(data) != REPLY.size:
+            return None
+        millimetres, degrees, bumps, mode = REPLY.unpack(data)
+        time = elapsed + MAX_DELAY
+        believable = (
+            mode in (Mode.PASSIVE, Mode.SAFE, Mode.FULL)
+            and bumps <= Bumps.BUMPED | Bumps.DROPPED
+            and abs(millimetres) <= TOP_SPEED * time + NUDGE
+            and abs(degrees) <= TURN_PER_SECOND * time + NUDGE
+        )
+        return cls(millimetres, degrees, Bumps(bumps), Mode(mode)) if believable else None
+
 
 def drive(right: int, left: int) -> bytes:
     """The command that sets both wheel speeds, mm/s. It holds until the next: the robot has no watchdog."""
@@ -80,27 +103,3 @@ def drive(right: int, left: int) -> bytes:
 STOP = drive(0, 0)
 STOP_ANYHOW = bytes(4) + STOP
 """Stops even after an incomplete command: the zeros complete it, and have no effect otherwise."""
-
-
-def parse_reply(data: bytes, elapsed: float) -> SensorReply | None:
-    """The reply; None if it cannot be one of a Create.
-
-    Args:
-        elapsed: s since the last accepted reply; inf without one.
-    """
-    if len(data) != REPLY.size:
-        return None
-    millimetres, degrees, bumps, mode = REPLY.unpack(data)
-    time = elapsed + MAX_DELAY
-    believable = (
-        mode in (Mode.PASSIVE, Mode.SAFE, Mode.FULL)
-        and bumps <= Bumps.BUMPED | Bumps.DROPPED
-        and abs(millimetres) <= TOP_SPEED * time + NUDGE
-        and abs(degrees) <= TURN_PER_SECOND * time + NUDGE
-    )
-    return SensorReply(millimetres, degrees, Bumps(bumps), Mode(mode)) if believable else None
-
-
-def describe_bumps(bumps: Bumps) -> str:
-    """Bumps and wheel drops in words."""
-    return " and ".join(str(bump.name).lower().replace("_", " ") for bump in bumps) or "nothing touched"

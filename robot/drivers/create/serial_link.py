@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
 from robot.drivers.create import protocol
+from robot.drivers.create.protocol import SensorReply
 from tactile.base.errors import InputError
 
 ANSWER = 0.1
@@ -36,7 +37,7 @@ class BadReply(Exception):
     """An invalid reply."""
 
 
-class SerialPort(Protocol):
+class _SerialPort(Protocol):
     """The methods of `serial.Serial` that the link uses."""
 
     timeout: float | None
@@ -68,7 +69,7 @@ class LinkCounts(NamedTuple):
         return self.lost - self.late
 
 
-def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
+def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
     """Opens the serial port at the Create's speed.
 
     Raises:
@@ -82,35 +83,34 @@ def open_port(name: str, *, exclusive: bool = True) -> SerialPort:
     # Without `exclusive` pyserial takes no lock; False is refused on Windows.
     options = {"exclusive": True} if exclusive else {}
     try:
-        port: SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options)
+        port: _SerialPort = serial.Serial(
+            name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options
+        )
     except OSError as error:
-        raise _explain(name, error) from None
+        # The text of pyserial's error is the only place of most causes.
+        cause = error.errno or getattr(error.__context__, "errno", None)
+        if cause == errno.ENOENT:
+            from serial.tools.list_ports import comports
+
+            ports = ", ".join(sorted(port.device for port in comports())) or "none; plug the cable in"
+            raise NoPort(name, "no such port", f"one of the ports {ports}") from None
+        if cause == errno.EACCES:
+            cure = "join its group: sudo usermod -aG dialout $USER"
+            raise NoPort(name, "no permission to open it", "", cure) from None
+        if cause in (errno.EAGAIN, errno.EBUSY):
+            raise PortBusy(name, "is held by another program", "", "end that program") from None
+        raise NoPort(name, f"cannot be opened ({error})", "a serial port") from None
     return port
 
 
-def _explain(name: str, error: OSError) -> NoPort:
-    """Translates an error of pyserial by its text, the only place of most causes."""
-    cause = error.errno or getattr(error.__context__, "errno", None)
-    if cause == errno.ENOENT:
-        from serial.tools.list_ports import comports
-
-        ports = ", ".join(sorted(port.device for port in comports())) or "none; plug the cable in"
-        return NoPort(name, "no such port", f"one of the ports {ports}")
-    if cause == errno.EACCES:
-        return NoPort(name, "no permission to open it", "", "join its group: sudo usermod -aG dialout $USER")
-    if cause in (errno.EAGAIN, errno.EBUSY):
-        return PortBusy(name, "is held by another program", "", "end that program")
-    return NoPort(name, f"cannot be opened ({error})", "a serial port")
-
-
-def _replies(data: bytes, elapsed: float, most: int) -> list[protocol.SensorReply]:
+def _replies(data: bytes, elapsed: float, most: int) -> list[SensorReply]:
     """The bytes as replies, oldest first, at most the last `most`; if invalid, their end as one, or none."""
     size = protocol.REPLY.size
-    pieces = [protocol.parse_reply(data[i : i + size], elapsed) for i in range(0, len(data), size)]
+    pieces = [SensorReply.parse(data[i : i + size], elapsed) for i in range(0, len(data), size)]
     believed = [piece for piece in pieces if piece is not None]
     if len(believed) == len(pieces):
         return believed[-most:]
-    last = protocol.parse_reply(data[-size:], elapsed)
+    last = SensorReply.parse(data[-size:], elapsed)
     return [] if last is None else [last]
 
 
@@ -121,7 +121,7 @@ class SerialLink:
     the next; of a disturbed reply the end is parsed, since noise mostly precedes it.
     """
 
-    def __init__(self, port: SerialPort) -> None:
+    def __init__(self, port: _SerialPort) -> None:
         self._port = port
         self._late_motion = (0, 0)
         self.counts = LinkCounts()
@@ -131,7 +131,7 @@ class SerialLink:
         with self._attached():
             self._port.write(command)
 
-    def ask(self, elapsed: float) -> protocol.SensorReply:
+    def ask(self, elapsed: float) -> SensorReply:
         """Sends a query and returns the reply.
 
         Args:
@@ -141,12 +141,17 @@ class SerialLink:
             NoReply, BadReply, Unplugged: no valid reply.
         """
         with self._attached():
-            self._catch_up(elapsed)
+            # Late replies are accepted. Any other bytes make the reply before them doubtful.
+            late = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
+            outstanding = self.counts.outstanding
+            found = _replies(late, elapsed, outstanding) if outstanding else []
+            self._accept(found, late=len(found), stray=len(late) - protocol.REPLY.size * len(found))
+            self._count(lost=int(bool(late) and not found))
             self._port.timeout = ANSWER
             self._port.write(protocol.QUERY)
             data = self._port.read(protocol.REPLY.size)
             # Noise and the start of a reply can look like a reply: then more bytes follow.
-            if data and (self._port.in_waiting or protocol.parse_reply(data, elapsed) is None):
+            if data and (self._port.in_waiting or SensorReply.parse(data, elapsed) is None):
                 data += self._rest()
         found = _replies(data, elapsed, 1 + self.counts.outstanding)
         if not found:
@@ -160,15 +165,7 @@ class SerialLink:
         """Closes the port."""
         self._port.close()
 
-    def _catch_up(self, elapsed: float) -> None:
-        """Accepts late replies. Any other bytes make the reply before them doubtful."""
-        data = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
-        outstanding = self.counts.outstanding
-        found = _replies(data, elapsed, outstanding) if outstanding else []
-        self._accept(found, late=len(found), stray=len(data) - protocol.REPLY.size * len(found))
-        self._count(lost=int(bool(data) and not found))
-
-    def _accept(self, found: list[protocol.SensorReply], *, late: int, stray: int) -> None:
+    def _accept(self, found: list[SensorReply], *, late: int, stray: int) -> None:
         self._late_motion = (
             self._late_motion[0] + sum(reply.millimetres for reply in found),
             self._late_motion[1] + sum(reply.degrees for reply in found),

@@ -17,7 +17,7 @@ import threading
 import time
 
 from robot.drivers.create import protocol
-from robot.drivers.create.serial_link import NoPort, PortBusy, SerialPort, open_port
+from robot.drivers.create.serial_link import NoPort, PortBusy, open_port
 from robot.drivers.processes import become_urgent, withheld_signals
 from tactile.base.errors import InputError
 
@@ -81,7 +81,6 @@ class Watchdog:
             self._process.wait(1)
         if self._process.poll() is None:
             self._process.kill()
-            self._process.wait()
         self._close_pipes()
 
     def leave(self) -> None:
@@ -89,13 +88,11 @@ class Watchdog:
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
-        threading.Thread(target=self._outlive, daemon=True, name="watchdog end").start()
-
-    def _outlive(self) -> None:
-        self._process.wait()
-        self._close_pipes()
+        threading.Thread(target=self._close_pipes, daemon=True, name="watchdog end").start()
 
     def _close_pipes(self) -> None:
+        """Waits for the end of the process, then releases its pipes."""
+        self._process.wait()
         self._reader.join(1)
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe:
@@ -109,7 +106,7 @@ class Watchdog:
             self._ready.set()
 
 
-def watch(port: str, patience: float, replug: float) -> None:
+def _watch(port: str, patience: float, replug: float) -> None:
     """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s).
 
     Args:
@@ -156,22 +153,19 @@ def _stop_on_return(port: str, replug: float) -> None:
     while time.monotonic() < end:
         try:
             if os.name == "nt" or os.path.exists(port):
-                _stop_for_good(open_port(port))
+                line = open_port(port)
+                for _ in range(2):  # the first bytes after the connection may be lost
+                    line.write(protocol.STOP_ANYHOW)
+                    time.sleep(RETRY)
+                line.write(protocol.START)
+                time.sleep(RETRY)  # until the byte is on the line
+                line.close()
                 return
         except PortBusy:
             return
         except (NoPort, OSError):
             pass  # not yet
         time.sleep(RETRY)
-
-
-def _stop_for_good(line: SerialPort) -> None:
-    for _ in range(2):  # the first bytes after the connection may be lost
-        line.write(protocol.STOP_ANYHOW)
-        time.sleep(RETRY)
-    line.write(protocol.START)
-    time.sleep(RETRY)  # until the byte is on the line
-    line.close()
 
 
 def _say(word: bytes) -> None:
@@ -181,4 +175,4 @@ def _say(word: bytes) -> None:
 
 if __name__ == "__main__":
     become_urgent()
-    watch(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]))
+    _watch(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]))

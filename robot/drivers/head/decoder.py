@@ -1,4 +1,4 @@
-"""Decodes a head's byte stream into frames, also after damage, loss or insertion of bytes.
+"""Decodes a head's byte stream into frames, unwraps their numbers, and assembles those of one whisk.
 
 The decoder searches for the magic, waits for the bytes of a frame and checks them. A valid frame is consumed;
 after an invalid one the search continues at the next byte. A damaged frame therefore costs no other frame,
@@ -6,9 +6,8 @@ the result does not depend on the pieces in which the stream arrives, and
 
     bytes fed = frame size x (good + duplicates) + skipped_bytes + `pending` (bytes not decided yet)
 
-Unwraps 32-bit sequence numbers; finds new, missing and repeated frames and restarts of the stream.
-
-Assembles the frames of one whisk into a cycle: the same function live and in replay.
+The 32-bit sequence numbers show new, missing and repeated frames, and restarts of the stream. A whisk becomes
+a cycle by the same function live and in replay.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from tactile.base.types import Cycle, Odometry
 LATE = 4096
 """Largest distance of a late frame behind the newest; a head buffers no more frames."""
 HALF = WRAP // 2
-SEQUENCE_NUMBERS_BATCH = 1024
+UNWRAPPED_AT_ONCE = 1024
 """Numbers processed at once."""
 
 
@@ -66,10 +65,16 @@ class SequenceUnwrapper:
         number, new = np.empty_like(raw), np.ones(len(raw), bool)
         place = 0
         while place < len(raw):
-            some = slice(place, place + self._rising(raw[place : place + SEQUENCE_NUMBERS_BATCH]))
+            some = slice(place, place + self._rising(raw[place : place + UNWRAPPED_AT_ONCE]))
             if some.stop > place:
                 number[some] = self._highest + (raw[some] - self._highest) % WRAP
-                self._ahead(number[some])
+                # Increasing numbers, all above the highest, are accepted.
+                last = int(number[some.stop - 1])
+                self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
+                recent = number[some]
+                self._seen[recent[recent > last - LATE] % LATE] = True
+                self._highest = last
+                self._held += len(recent)
                 place = some.stop
             else:
                 number[place], new[place] = self._other(int(raw[place]))
@@ -91,27 +96,16 @@ class SequenceUnwrapper:
         number = self._highest - (self._highest - raw) % WRAP
         if not self._begun or number <= self._highest - LATE:
             self.restart()
-            return self._begin(raw), True
+            number = raw + (WRAP * (self._highest // WRAP + 1) if self.streams else 0)
+            self._seen[number % LATE] = True
+            self._first = self._highest = number
+            self._held, self._begun = 1, True
+            self.streams += 1
+            return number, True
         new = number > self._first and not self._seen[number % LATE]
         self._seen[number % LATE] |= new
         self._held += new
         return number, bool(new)
-
-    def _begin(self, raw: int) -> int:
-        number = raw + (WRAP * (self._highest // WRAP + 1) if self.streams else 0)
-        self._seen[number % LATE] = True
-        self._first = self._highest = number
-        self._held, self._begun = 1, True
-        self.streams += 1
-        return number
-
-    def _ahead(self, number: np.ndarray) -> None:
-        """Accepts increasing numbers, all above the highest."""
-        last = int(number[-1])
-        self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
-        self._seen[number[number > last - LATE] % LATE] = True
-        self._highest = last
-        self._held += len(number)
 
     def _lacking(self) -> int:
         return self._highest - self._first + 1 - self._held if self._begun else 0
@@ -134,6 +128,12 @@ class Frames(NamedTuple):
     time: np.ndarray
     flags: np.ndarray
     values: np.ndarray
+
+    def select(self, first: int, last: int) -> Frames:
+        """The frames from first to last, both included, ordered by sequence number."""
+        rows = np.flatnonzero((self.sequence >= first) & (self.sequence <= last))
+        rows = rows[np.argsort(self.sequence[rows], kind="stable")]
+        return Frames(*(np.ascontiguousarray(column[rows]) for column in self))
 
 
 class DecoderCounts(NamedTuple):
@@ -236,7 +236,10 @@ class Decoder:
                 self._bad += 1
                 self._skipped += 1
                 place += 1
-        end = start if start >= 0 else len(buffer) - _partial_magic(buffer[max(place, len(buffer) - 3) :])
+        end = start
+        if end < 0:  # the last bytes may be the start of the magic
+            tail = buffer[max(place, len(buffer) - 3) :]
+            end = len(buffer) - next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)
         self._skipped += end - place
         self._rest = buffer[end:]
         return self._accept(np.frombuffer(b"".join(runs), self._type))
@@ -268,24 +271,14 @@ class Decoder:
         self._good += len(frames)
         self._duplicates += len(new) - len(frames)
         self._overruns += int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
-        return Frames(
-            number, self._unwrap_times(frames["time"]), frames["flags"].copy(), frames["values"].copy()
-        )
-
-    def _unwrap_times(self, raw: np.ndarray) -> np.ndarray:
-        time = raw.astype(np.int64)
-        if len(time):
+        time = frames["time"].astype(np.int64)
+        if len(time):  # unwrapped: each within half of the range of the previous one
             before = int(time[0]) if self._time is None else self._time
             time[1:] -= time[:-1].copy()
             time[0] -= before
             time = before + ((time + HALF) % WRAP - HALF).cumsum()
             self._time = int(time[-1])
-        return time
-
-
-def _partial_magic(tail: bytes) -> int:
-    """Number of bytes at the end that may be the start of the magic."""
-    return next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)
+        return Frames(number, time, frames["flags"].copy(), frames["values"].copy())
 
 
 MAX_FRAMES = 1 << 16
@@ -312,21 +305,14 @@ class Cut(NamedTuple):
     odometry: Odometry
     seen: bool
 
-
-def make_cut(
-    number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
-) -> Cut:
-    """The cut of exactly these frames; not `seen` without frames."""
-    count = len(frames.sequence)
-    first, last = (int(frames.sequence.min()), int(frames.sequence.max())) if count else (0, -1)
-    return Cut(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
-
-
-def select_frames(frames: Frames, first: int, last: int) -> Frames:
-    """The frames from first to last, both included, ordered by sequence number."""
-    rows = np.flatnonzero((frames.sequence >= first) & (frames.sequence <= last))
-    rows = rows[np.argsort(frames.sequence[rows], kind="stable")]
-    return Frames(*(np.ascontiguousarray(column[rows]) for column in frames))
+    @classmethod
+    def of(
+        cls, number: int, time: float, start: float, frames: Frames, odometry: Odometry, seen: bool = True
+    ) -> Cut:
+        """The cut of exactly these frames; not `seen` without frames."""
+        count = len(frames.sequence)
+        first, last = (int(frames.sequence.min()), int(frames.sequence.max())) if count else (0, -1)
+        return cls(number, float(time), float(start), first, last, count, odometry, bool(seen and count))
 
 
 def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
@@ -339,9 +325,9 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
         ValueError: frames of the cut are missing.
     """
     if not cut.seen:
-        frames = select_frames(frames, 0, -1)
+        frames = frames.select(0, -1)
         return Cycle(np.zeros(0), *to_radians(frames.values), cut.odometry)
-    mine = select_frames(frames, cut.first, cut.last)
+    mine = frames.select(cut.first, cut.last)
     if len(mine.sequence) != cut.frames:
         raise ValueError(f"a whisk of {cut.frames} frames, of which {len(mine.sequence)} are present")
     # The memory layout matters: it decides the order of summation.
@@ -387,4 +373,4 @@ class FrameWindow:
             block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
         ]
         parts = zip(*(blocks or [self._empty]), strict=True)
-        return select_frames(Frames(*(np.concatenate(part) for part in parts)), first, last)
+        return Frames(*(np.concatenate(part) for part in parts)).select(first, last)

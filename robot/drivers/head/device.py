@@ -38,8 +38,10 @@ class Stalled(OSError):
 
 
 class HeadIdentity(NamedTuple):
-    """Attributes:
-    name, version: of the bridge. whiskers, channels: of a frame. rate: samples per second.
+    """What a head says of itself.
+
+    Attributes:
+        name, version: of the bridge. whiskers, channels: of a frame. rate: samples per second.
     """
 
     name: str
@@ -47,6 +49,24 @@ class HeadIdentity(NamedTuple):
     whiskers: int
     channels: int
     rate: float
+
+    @classmethod
+    def read(cls, bridge: Bridge) -> HeadIdentity:
+        """Asks the device behind a bridge for its identity.
+
+        Raises:
+            Disconnected, Stalled. InputError: the device is not a head.
+        """
+        answer = bridge.request(Request.IDENTITY)
+        try:
+            fields = json.loads(answer)
+            size = int(fields["whiskers"]), int(fields["channels"])
+            return cls(str(fields["name"]), str(fields["version"]), *size, float(fields["rate"]))
+        except (ValueError, KeyError, TypeError):
+            cure = "check the address, or the bridge's firmware"
+            raise InputError(
+                "head", f"identity {answer[:80]!r}", "name, version, shape, rate", cure
+            ) from None
 
 
 class Bridge(Protocol):
@@ -81,22 +101,6 @@ class Bridge(Protocol):
         ...
 
 
-def read_identity(bridge: Bridge) -> HeadIdentity:
-    """Asks the device for its identity.
-
-    Raises:
-        Disconnected, Stalled. InputError: the device is not a head.
-    """
-    answer = bridge.request(Request.IDENTITY)
-    try:
-        fields = json.loads(answer)
-        size = int(fields["whiskers"]), int(fields["channels"])
-        return HeadIdentity(str(fields["name"]), str(fields["version"]), *size, float(fields["rate"]))
-    except (ValueError, KeyError, TypeError):
-        cure = "check the address, or the bridge's firmware"
-        raise InputError("head", f"identity {answer[:80]!r}", "name, version, shape, rate", cure) from None
-
-
 def open_bridge(address: str) -> Bridge:
     """Opens the bridge at an address (`HeadLinkConfig.address`).
 
@@ -121,7 +125,13 @@ class UsbBridge:
 
     def __init__(self, device: Any, where: str) -> None:
         self._device, self._where = device, where
-        self._configure()
+        # Setting a configuration resets a running device, so it is set only if none is active.
+        try:
+            configured = device.get_active_configuration() is not None
+        except _pyusb().USBError:
+            configured = False
+        if not configured:
+            device.set_configuration()
         from usb import util
 
         util.claim_interface(device, INTERFACE)
@@ -149,15 +159,6 @@ class UsbBridge:
         from usb import util
 
         util.dispose_resources(self._device)
-
-    def _configure(self) -> None:
-        # Setting a configuration resets a running device, so it is set only if none is active.
-        try:
-            configured = self._device.get_active_configuration() is not None
-        except _pyusb().USBError:
-            configured = False
-        if not configured:
-            self._device.set_configuration()
 
     def _try(self, action: Callable[[], T], endpoint: int | None = None) -> T | None:
         """Result of a transfer; None after its time-out."""

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from pydantic import AfterValidator, PositiveFloat
+from pydantic import PositiveFloat, field_validator
 
 from robot.drivers.head.usb_protocol import PRODUCT, VENDOR
 from tactile.base.settings import Settings
 
 
-def _readable(address: str) -> str:
-    Address.parse(address)
-    return address
-
-
 class HeadLinkConfig(Settings):
     """Address and time limits of a whisker head."""
 
-    address: Annotated[str, AfterValidator(_readable)] = "usb"
+    address: str = "usb"
     """`usb` for the only connected head, `usb:1209:0001` or `usb:1209:0001:SERIAL` for a specific one, HOST
     or HOST:PORT for an emulated one."""
     patience: PositiveFloat = 20.0
@@ -33,6 +28,12 @@ class HeadLinkConfig(Settings):
     """Where contact feedback (RCP) is computed, in the modes that have it. The host reacts a block of samples
     later, so whiskers bend more; only the host supports `spread`."""
 
+    @field_validator("address")
+    @classmethod
+    def _readable(cls, address: str) -> str:
+        Address.parse(address)
+        return address
+
 
 EMULATOR_PORT = 30100
 _USB = re.compile(r"usb(?::([0-9a-f]{4}):([0-9a-f]{4})(?::(\S+))?)?", re.IGNORECASE)
@@ -40,9 +41,11 @@ _HOST = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
 
 
 class Address(NamedTuple):
-    """Attributes:
-    vendor, product: USB ids. serial: serial number of the device, or None for any.
-    host, port: of an emulated head; host is None for a real head.
+    """Where a head is.
+
+    Attributes:
+        vendor, product: USB ids. serial: serial number of the device, or None for any.
+        host, port: of an emulated head; host is None for a real head.
     """
 
     vendor: int = VENDOR

@@ -1,6 +1,4 @@
-"""A pyusb backend for an emulated device behind a socket: no kernel, no libusb.
-
-USB over TCP: protocol of a connection to an emulated device, and its client.
+"""USB over TCP to an emulated device: its protocol, its client, and a pyusb backend without kernel or libusb.
 
 A client waits for each answer before the next request, so concurrent transfers need separate connections.
 Little-endian:
@@ -63,7 +61,7 @@ class UsbConnection:
         try:
             self._socket = socket.create_connection((host, port), PATIENCE)
         except OSError:
-            raise no_device() from None
+            raise _no_device() from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def call(
@@ -94,7 +92,7 @@ class UsbConnection:
                 got = self._exactly(length)
             except OSError:
                 self._socket.close()  # a late answer would be read as that of the next request
-                raise no_device() from None
+                raise _no_device() from None
         if status:
             raise OSError(-status, os.strerror(-status))
         return got
@@ -110,13 +108,13 @@ class UsbConnection:
         while size:
             part = self._socket.recv(size)
             if not part:
-                raise no_device()
+                raise _no_device()
             parts.append(part)
             size -= len(part)
         return b"".join(parts)
 
 
-def no_device() -> OSError:
+def _no_device() -> OSError:
     """The error of a transfer to a disconnected device."""
     return OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
@@ -124,7 +122,7 @@ def no_device() -> OSError:
 T = TypeVar("T")
 
 
-class Handle:
+class _Handle:
     """An open device: one connection for transfers that wait for data, another for all others."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -198,39 +196,39 @@ class SocketBackend:
             extra_descriptors=[],
         )
 
-    def open_device(self, dev: bytes) -> Handle:
-        return _as_usb_error(lambda: Handle(self.host, self.port))
+    def open_device(self, dev: bytes) -> _Handle:
+        return _as_usb_error(lambda: _Handle(self.host, self.port))
 
-    def close_device(self, dev_handle: Handle) -> None:
+    def close_device(self, dev_handle: _Handle) -> None:
         dev_handle.close()
 
-    def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
+    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
         self._request(dev_handle, Op.CONTROL, 0x00, request=9, value=config_value)
 
-    def get_configuration(self, dev_handle: Handle) -> int:
+    def get_configuration(self, dev_handle: _Handle) -> int:
         return self._request(dev_handle, Op.CONTROL, 0x80, request=8, size=1)[0]
 
-    def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
+    def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
         self._request(dev_handle, Op.CONTROL, 0x01, request=11, value=altsetting, index=intf)
 
-    def claim_interface(self, dev_handle: Handle, intf: int) -> None:
+    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
         self._request(dev_handle, Op.CLAIM)
 
-    def release_interface(self, dev_handle: Handle, intf: int) -> None:
+    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
         self._request(dev_handle, Op.RELEASE)
 
-    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array, timeout: int) -> int:
+    def bulk_write(self, dev_handle: _Handle, ep: int, intf: int, data: array, timeout: int) -> int:
         packet = data.tobytes()
         self._request(dev_handle, Op.BULK, ep, data=packet, timeout=timeout)
         return len(packet)
 
-    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: array, timeout: int) -> int:
+    def bulk_read(self, dev_handle: _Handle, ep: int, intf: int, buff: array, timeout: int) -> int:
         got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
         return _fill(buff, got)
 
     def ctrl_transfer(
         self,
-        dev_handle: Handle,
+        dev_handle: _Handle,
         bmRequestType: int,
         bRequest: int,
         wValue: int,
@@ -245,19 +243,19 @@ class SocketBackend:
         self._request(dev_handle, Op.CONTROL, bmRequestType, data=data.tobytes(), **setup)
         return _size(data)
 
-    def clear_halt(self, dev_handle: Handle, ep: int) -> None:
+    def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
         self._request(dev_handle, Op.CLEAR, ep)
 
-    def reset_device(self, dev_handle: Handle) -> None:
+    def reset_device(self, dev_handle: _Handle) -> None:
         self._request(dev_handle, Op.RESET)
 
-    def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
+    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
         return False
 
-    def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+    def detach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
         """Has no effect: there is no kernel driver."""
 
-    def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
+    def attach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
         """Has no effect: there is no kernel driver."""
 
     def intr_write(self, *transfer: Any) -> NoReturn:
@@ -265,7 +263,7 @@ class SocketBackend:
 
     intr_read = iso_write = iso_read = intr_write
 
-    def _request(self, handle: Handle, op: Op, address: int = 0, **more: Any) -> bytes:
+    def _request(self, handle: _Handle, op: Op, address: int = 0, **more: Any) -> bytes:
         line = handle.inwards if op == Op.BULK and address & IN else handle.other
         return _as_usb_error(lambda: line.call(op, address, **more))
 

@@ -11,12 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
 from robot.drivers.head.decoder import Decoder, FrameDecoder, Frames
-from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, read_identity
+from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled
 from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.usb_protocol import (
     ANGLE,
@@ -25,7 +24,6 @@ from robot.drivers.head.usb_protocol import (
     Command,
     CommandKind,
     Request,
-    pack_command,
 )
 from robot.drivers.outcome import Fault, SessionOutcome
 from tactile.base.errors import InputError
@@ -46,13 +44,6 @@ class LinkState(Enum):
     GARBLED = "the head sends no valid samples"
     AWAY = "the head is not connected"
     CLOSED = "the reader is closed"
-
-
-class LinkStatus(NamedTuple):
-    """State of the link, and host time of its start, s."""
-
-    link: LinkState
-    since: float
 
 
 DEFAULT = HeadLinkConfig()
@@ -101,12 +92,12 @@ class HeadReader:
         self._overload = OverloadDetector(
             config.overload, np.ones(whiskers, bool) if alive is None else alive
         )
-        self._queue = CommandQueue()
+        self._queue = _CommandQueue()
         self._ending, self._tried = threading.Event(), threading.Event()
         self._refusal: Exception | None = None
         self._fault: Fault | None = None
-        self._away: float | None = None
-        self._sample = self._bytes = self._streaming = -np.inf
+        self._away = False
+        self._sample = self._bytes = -np.inf
         self._thread = threading.Thread(target=self._run, name="head reader", daemon=True)
 
     def start(self, timeout: float = 5.0) -> HeadReader:
@@ -115,7 +106,7 @@ class HeadReader:
         Raises:
             InputError: no head within `timeout` s, or one of another shape.
         """
-        self._sample = self._away = time.monotonic()
+        self._sample, self._away = time.monotonic(), True
         self._thread.start()
         if not self._tried.wait(timeout) or self._refusal is not None:
             self.close()
@@ -146,16 +137,16 @@ class HeadReader:
         self._queue.rest()
 
     @property
-    def state(self) -> LinkStatus:
+    def state(self) -> LinkState:
         """State of the link; also correct while the thread hangs in a transfer."""
         now, sample, away = time.monotonic(), self._sample, self._away
         if self._ending.is_set() or not self._thread.is_alive():
-            return LinkStatus(LinkState.CLOSED, sample)
-        if away is not None:
-            return LinkStatus(LinkState.AWAY, away)
+            return LinkState.CLOSED
+        if away:
+            return LinkState.AWAY
         if now - sample <= self.config.silence:
-            return LinkStatus(LinkState.STREAMING, self._streaming)
-        return LinkStatus(LinkState.GARBLED if self._bytes > sample else LinkState.SILENT, sample)
+            return LinkState.STREAMING
+        return LinkState.GARBLED if self._bytes > sample else LinkState.SILENT
 
     @property
     def age(self) -> float:
@@ -165,7 +156,7 @@ class HeadReader:
     @property
     def fault(self) -> Fault | None:
         """The reason to end the session, or None; a fault stays."""
-        link = self.state.link
+        link = self.state
         lost = link in OUTCOMES and self.age > self.config.patience
         if self._fault is None and lost:
             why = f" ({self._refusal})" if self._refusal else ""
@@ -182,7 +173,7 @@ class HeadReader:
                 except (Disconnected, Stalled, InputError) as error:
                     self._refusal = error
                 self._tried.set()
-                self._away = time.monotonic() if self._away is None else self._away
+                self._away = True
                 self._ending.wait(RETRY_PERIOD)
         except Exception as error:
             detail = f"the reader thread ended: {type(error).__name__}: {error}"
@@ -193,7 +184,7 @@ class HeadReader:
         """Opens the bridge, checks the head and sends it the persistent commands."""
         bridge = self._connect()
         try:
-            self.identity = found = read_identity(bridge)
+            self.identity = found = HeadIdentity.read(bridge)
             if (found.whiskers, found.channels) != (self._whiskers, CHANNELS):
                 shape = f"{found.whiskers} whiskers of {found.channels} channels"
                 raise InputError("head", f"{found.name} has {shape}", f"{self._whiskers} of {CHANNELS}")
@@ -206,7 +197,7 @@ class HeadReader:
         except BaseException:
             bridge.close()
             raise
-        self._refusal, self._away = None, None
+        self._refusal, self._away = None, False
         self._tried.set()
         return bridge
 
@@ -226,7 +217,7 @@ class HeadReader:
                     bridge.request(Request.START)
             with self._ignore_stall():
                 while (command := self._queue.next(now)) is not None:
-                    bridge.write(pack_command(command))
+                    bridge.write(command.pack())
                     self._queue.mark_sent(command, now)
         with self._ignore_stall():
             bridge.request(Request.STOP)
@@ -234,8 +225,6 @@ class HeadReader:
     def _accept(self, frames: Frames, now: float) -> None:
         if not len(frames.sequence):
             return
-        if now - self._sample > self.config.silence:
-            self._streaming = now
         self._sample = now
         self.ring.append(frames, now)
         whisker = self._overload.check(frames.values)
@@ -260,7 +249,7 @@ PERSISTENT = (CommandKind.CENTRE, CommandKind.DRIVE)
 """Commands that stay valid until replaced, in the order in which they are sent again."""
 
 
-class CommandQueue:
+class _CommandQueue:
     """Any thread adds commands; the reader's thread sends them."""
 
     def __init__(self) -> None:
@@ -383,7 +372,5 @@ class RingBuffer:
         """The present frames from `first` to `last`, both included, ordered by sequence number."""
         with self._lock:
             number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
-            return self._at(number[self._sequence[number % self._size] == number] % self._size)
-
-    def _at(self, place: np.ndarray) -> Frames:
-        return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])
+            place = number[self._sequence[number % self._size] == number] % self._size
+            return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])

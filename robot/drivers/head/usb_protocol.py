@@ -1,7 +1,7 @@
 """Wire format of a whisker head: frames from it, commands to it, and USB control requests.
 
 All numbers are little-endian; angles are int16 counts of `ANGLE`. The USB bridges of published heads
-(BIOTACT) are not documented, so this format is our own; another bridge needs its own
+(BIOTACT) are not documented, so this format is not theirs; another bridge needs its own
 `robot.drivers.head.decoder.FrameDecoder`.
 
 Each sample of the head is one frame of 20 + 2 n c bytes (128 for 18 whiskers of 3 channels):
@@ -122,6 +122,32 @@ class Command(NamedTuple):
     offset: float = 0.0
     numbers: np.ndarray = np.zeros(0, np.int16)
 
+    def pack(self) -> bytes:
+        """The bytes of the command."""
+        numbers = np.asarray(self.numbers, "<i2")
+        kind, mode, *drive = self[:-1]
+        body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
+        return body + struct.pack("<I", zlib.crc32(body))
+
+    @classmethod
+    def unpack(cls, packet: bytes) -> Command | None:
+        """The command in a packet; None if it is invalid."""
+        if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
+            return None
+        magic, version, kind, mode, count, *rest = _COMMAND.unpack_from(packet)
+        amplitude, frequency, gain, window, offset = rest
+        known = (
+            magic == COMMAND_MAGIC
+            and version == VERSION
+            and kind in set(CommandKind)
+            and mode in set(FeedbackMode)
+        )
+        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(rest).all():
+            return None
+        numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
+        kinds = CommandKind(kind), FeedbackMode(mode)
+        return cls(*kinds, amplitude, frequency, gain, window, offset, numbers)
+
 
 _COMMAND = struct.Struct("<4sBBBB5f")
 COMMAND_SIZE = _COMMAND.size + 4
@@ -180,31 +206,3 @@ def to_radians(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angles [N, W] and deflections [N, W, 2], rad, of counts [N, W, 3]."""
     value = values * ANGLE
     return value[..., 0], value[..., 1:]
-
-
-def pack_command(command: Command) -> bytes:
-    """The bytes of a command."""
-    numbers = np.asarray(command.numbers, "<i2")
-    kind, mode, *drive = command[:-1]
-    body = _COMMAND.pack(COMMAND_MAGIC, VERSION, kind, mode, len(numbers), *drive) + numbers.tobytes()
-    return body + struct.pack("<I", zlib.crc32(body))
-
-
-def unpack_command(packet: bytes) -> Command | None:
-    """The command in a packet; None if it is invalid."""
-    if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
-        return None
-    magic, version, kind, mode, count, amplitude, frequency, gain, window, offset = _COMMAND.unpack_from(
-        packet
-    )
-    drive = amplitude, frequency, gain, window, offset
-    known = (
-        magic == COMMAND_MAGIC
-        and version == VERSION
-        and kind in set(CommandKind)
-        and mode in set(FeedbackMode)
-    )
-    if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
-        return None
-    numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-    return Command(CommandKind(kind), FeedbackMode(mode), *drive, numbers)

@@ -48,16 +48,20 @@ def whisk_commands(
     """
     if whisking.mode == "spread" and rcp == "head":
         raise InputError(f"{WHERE}.mode", "spread", "rcp or open", "or set `live.head.rcp: host`")
+    in_head = whisking.mode == "rcp" and rcp == "head" and threshold is not None
+    numbers = np.zeros(0, np.int16)
+    if threshold is not None:
+        finite = np.isfinite(threshold)
+        counts = np.minimum(to_counts(np.where(finite, threshold, 0.0)), NO_THRESHOLD - 1)
+        numbers = np.where(finite, counts, NO_THRESHOLD).astype(np.int16)
     drive = Command(
         CommandKind.DRIVE,
-        FeedbackMode.RCP
-        if whisking.mode == "rcp" and rcp == "head" and threshold is not None
-        else FeedbackMode.OPEN,
+        FeedbackMode.RCP if in_head else FeedbackMode.OPEN,
         amplitude=float(np.radians(whisking.amplitude_deg)),
         frequency=whisking.rate,
         gain=whisking.gain,
         window=whisking.window,
-        numbers=np.zeros(0, np.int16) if threshold is None else _thresholds(threshold),
+        numbers=numbers,
     )
     return [drive] if centre is None else [Command(CommandKind.CENTRE, numbers=to_counts(centre)), drive]
 
@@ -157,10 +161,3 @@ class HeadDriver:
             amplitude = None if self._feedback is None else self._feedback.amplitudes(frames)
             if amplitude is not None:
                 self._reader.send(Command(CommandKind.AMPLITUDES, FeedbackMode.OPEN, numbers=amplitude))
-
-
-def _thresholds(threshold: np.ndarray) -> np.ndarray:
-    finite = np.isfinite(threshold)
-    return np.where(
-        finite, np.minimum(to_counts(np.where(finite, threshold, 0.0)), NO_THRESHOLD - 1), NO_THRESHOLD
-    ).astype(np.int16)

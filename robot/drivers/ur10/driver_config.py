@@ -1,6 +1,4 @@
-"""Settings of the arm: address, workspace, speeds, time limits.
-
-Transform between poses of the head in the map and tool poses in the arm's base frame.
+"""Settings of the arm (address, workspace, speeds, time limits), and its tool poses for poses in the map.
 
 A tool pose is an array [..., 6] in UR controllers' notation: x, y, z of the tool centre point in the base
 frame, m, and a rotation vector, rad. The tool points down: its rotation is Rz(heading) Rx(pi), half a turn
@@ -33,26 +31,27 @@ class BaseTransformConfig(Settings):
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """Angle from the base's x axis to the map's, degrees."""
 
+    @property
+    def _origin(self) -> np.ndarray:
+        """[3] pose of the map in the base frame, seen from above, m, m, rad."""
+        return np.array([self.x, self.y, np.radians(self.yaw_deg)])
 
-def tcp_from_pose(
-    config: BaseTransformConfig, pose: np.ndarray, lift: float | np.ndarray = 0.0
-) -> np.ndarray:
-    """Tool poses [..., 6] for poses of the head in the map.
+    def tcp_from_pose(self, pose: np.ndarray, lift: float | np.ndarray = 0.0) -> np.ndarray:
+        """Tool poses [..., 6] for poses of the head in the map.
 
-    Args:
-        pose: [..., 3] x, y (m) and heading (rad) in the map. lift: [...] m above working height.
-    """
-    x, y, heading = np.moveaxis(compose(_origin(config), np.asarray(pose, np.float64)), -1, 0)
-    z = np.broadcast_to(config.z + np.asarray(lift, np.float64), x.shape)
-    axis = np.pi * np.cos(heading / 2), np.pi * np.sin(heading / 2)
-    return np.stack([x, y, z, *axis, np.zeros_like(x)], axis=-1)
+        Args:
+            pose: [..., 3] x, y (m) and heading (rad) in the map. lift: [...] m above working height.
+        """
+        x, y, heading = np.moveaxis(compose(self._origin, np.asarray(pose, np.float64)), -1, 0)
+        z = np.broadcast_to(self.z + np.asarray(lift, np.float64), x.shape)
+        axis = np.pi * np.cos(heading / 2), np.pi * np.sin(heading / 2)
+        return np.stack([x, y, z, *axis, np.zeros_like(x)], axis=-1)
 
-
-def pose_from_tcp(config: BaseTransformConfig, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of the head in the map [..., 3], heading wrapped, and its lift above working height [...] m."""
-    tcp = np.asarray(tcp, np.float64)
-    pose = np.stack([tcp[..., 0], tcp[..., 1], tcp_heading(tcp)], axis=-1)
-    return between(_origin(config), pose), tcp[..., 2] - config.z
+    def pose_from_tcp(self, tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of the head in the map [..., 3], heading wrapped, and lift above working height [...] m."""
+        tcp = np.asarray(tcp, np.float64)
+        pose = np.stack([tcp[..., 0], tcp[..., 1], tcp_heading(tcp)], axis=-1)
+        return between(self._origin, pose), tcp[..., 2] - self.z
 
 
 def tcp_heading(tcp: np.ndarray) -> np.ndarray:
@@ -77,12 +76,9 @@ def _axis_angle(tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vector / np.where(turn > 0, turn, 1.0)[..., None], turn
 
 
-def _origin(config: BaseTransformConfig) -> np.ndarray:
-    return np.array([config.x, config.y, np.radians(config.yaw_deg)])
-
-
 SPEED_CAP = 0.25  # m/s; reduced speed of ISO 10218-1, the upper limit of every speed setting
 TURN_CAP = 1.0  # rad/s
+ROUNDING = 1e-6  # m; tolerance of the box for rounding
 
 Corner = tuple[float, float, float]
 
@@ -100,6 +96,12 @@ class BoxConfig(Settings):
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError(f"low {self.low} must be smaller than high {self.high} in every coordinate")
         return self
+
+    def contains(self, tcp: np.ndarray) -> bool:
+        """Whether the tool centre point of a tool pose is in the box."""
+        place = np.asarray(tcp, np.float64)[:3]
+        low, high = np.array(self.low), np.array(self.high)
+        return bool(((place >= low - ROUNDING) & (place <= high + ROUNDING)).all())
 
 
 class ArmConfig(Settings):

@@ -7,12 +7,9 @@ standard input, reports leave as JSON lines on the standard output; the output o
 standard error.
 
 This process stops the arm when a state requires it, when the session requests it, and when the session hangs
-or has ended. If this process ends as well, the controller's watchdog times out and stops the arm.
-
-Command thread of the RTDE process. Priority: stop, move, watchdog reset.
-
-A call of the control interface takes some 20 ms, and never returns when the controller stalls. The main
-thread of the process (rtde_process.py) therefore reads and checks states.
+or has ended. If this process ends as well, the controller's watchdog times out and stops the arm. A call of
+the control interface takes some 20 ms, and never returns when the controller stalls: a command thread calls
+it (priority: stop, move, watchdog reset), and the main thread reads and checks states.
 """
 
 from __future__ import annotations
@@ -36,9 +33,9 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import (
     MOVED_ON,
+    NO_STATE,
     RETREAT_SPEED,
     Finding,
-    StateMemory,
     TargetRefused,
     at_rest,
     check_command,
@@ -91,7 +88,7 @@ class CommandThread:
         self.script_unusable = False
         self.leaving = False
         self._retreating = False
-        self._watch = StateMemory()
+        self._watch = NO_STATE
         self._rest = np.zeros(6)
         self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
         self._own_stops = 0
@@ -105,7 +102,7 @@ class CommandThread:
     def set_rest_force(self, rest: np.ndarray) -> None:
         """Sets the force without contact [6] and starts the detection of contacts."""
         self._rest, self._force_limit = rest, self.config.force_limit
-        self._watch = self._watch._replace(loaded=0)
+        self._watch = 0, self._watch[1]
 
     def check_state(self, state: np.ndarray) -> None:
         """Stops if a state (ARM_STATE) requires it."""
@@ -178,7 +175,9 @@ class CommandThread:
         try:
             target = check_command(self.config, order.target, here["tcp"], order.speed)
             if order.do == "retreat":
-                _check_retreat(self.config, target, here["tcp"], order.speed)
+                way = math.dist(target[:3], here["tcp"][:3])
+                if way > self.config.backoff + 2 * MOVED_ON or order.speed > RETREAT_SPEED:
+                    raise TargetRefused(f"a retreat of {way:.3f} m at {order.speed:g} m/s exceeds the limits")
         except TargetRefused as refused:
             self.hold(Finding(SessionOutcome.NOT_ARRIVED, f"the RTDE process refused the target: {refused}"))
             return
@@ -194,7 +193,7 @@ class CommandThread:
         if order.do == "retreat":
             force = math.hypot(*(here["force"][:3] - self._rest[:3]))
             self._force_limit = max(force, self.config.force_limit) + self.config.force_limit
-            self._watch = self._watch._replace(loaded=0)
+            self._watch = 0, self._watch[1]
             self._retreating = True
         newest = self.shared.latest()
         assert newest is not None
@@ -209,16 +208,8 @@ class CommandThread:
         return int(self.shared.control["stops"]), self._own_stops
 
 
-def _check_retreat(config: ArmConfig, target: np.ndarray, here: np.ndarray, speed: float) -> None:
-    way = math.dist(target[:3], here[:3])
-    if way > config.backoff + 2 * MOVED_ON or speed > RETREAT_SPEED:
-        raise TargetRefused(f"a retreat of {way:.3f} m at {speed:g} m/s exceeds the limits")
-
-
 PLAYING = 2  # runtime state
-REST_TIME = (
-    0.25  # s of states at rest over which the force at rest is averaged and the session measures the rate
-)
+REST_TIME = 0.25  # s of states at rest, over which the force at rest is averaged
 LAST_STOP = 0.4  # s, duration of the last stop before the dashboard server is used
 
 VARIABLES = [
@@ -233,7 +224,7 @@ VARIABLES = [
 ]
 
 
-class RtdeProcess:
+class _RtdeProcess:
     """Reads and checks states, publishes them, and watches the session."""
 
     def __init__(
@@ -253,24 +244,35 @@ class RtdeProcess:
         threading.Thread(target=self.commands.run, daemon=True).start()
         period = 0.25 / self.config.hz
         lateness = LatenessMeter(period, began)
-        while not self._finished():
+        while True:
+            stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
+            if stands or time.monotonic() > self._leaving:  # the last stop has timed out
+                dashboard.stop_program(self.config.host)
+                return
             now = time.monotonic()
             self.shared.control["late"] = lateness.turn(now)
             if self._read(now):
                 self.commands.check_state(self._state)
                 if self._settled and self._state["runtime"] != PLAYING:
-                    self._lose_script(now)
+                    unreset, late = self.commands.unreset(now), float(self.shared.control["late"])
+                    self.commands.hold(ended_script_finding(self.config, unreset, late))
             elif (
                 now - self._state["host"] > MAX_MISSING_STATES / self.config.hz
                 and not self.receive.isConnected()
             ):
                 self.commands.hold(Finding(SessionOutcome.ARM_GONE, "the controller closed the connection"))
             if not self._settled and self.shared.newest and now - began > REST_TIME:
-                self._settle()
+                # The median force is that at rest, without contact.
+                states = self.shared.since(int(self.shared.control["first"]) - 1)
+                self.commands.set_rest_force(np.median(states["force"], axis=0))
+                self._settled = True
+                self.report(say="ready")
             self._listen()
             silent = now - float(self.shared.control["heartbeat"])
-            if silent > self.config.heartbeat:
-                self._leave_silent_session(silent)
+            if silent > self.config.heartbeat and not self.commands.leaving:
+                finding = silent_session_finding(silent)
+                self.report(say="fault", outcome=finding.outcome.name, detail=finding.detail)
+                self._leave(finding.detail)
             self.commands.check_stop_request()
             time.sleep(period)
 
@@ -306,17 +308,6 @@ class RtdeProcess:
         self.shared.publish(state)
         return True
 
-    def _settle(self) -> None:
-        """Takes the median force as the force at rest and reports that the arm is ready."""
-        states = self.shared.since(int(self.shared.control["first"]) - 1)
-        self.commands.set_rest_force(np.median(states["force"], axis=0))
-        self._settled = True
-        self.report(say="ready")
-
-    def _lose_script(self, now: float) -> None:
-        unreset, late = self.commands.unreset(now), float(self.shared.control["late"])
-        self.commands.hold(ended_script_finding(self.config, unreset, late))
-
     def _listen(self) -> None:
         """Reads commands; at the end of the input the session has ended."""
         try:
@@ -333,13 +324,6 @@ class RtdeProcess:
             else:
                 self.commands.put(order)
 
-    def _leave_silent_session(self, silent: float) -> None:
-        """Starts the shutdown because the session sent no heartbeat for some time, s."""
-        if not self.commands.leaving:
-            finding = silent_session_finding(silent)
-            self.report(say="fault", outcome=finding.outcome.name, detail=finding.detail)
-            self._leave(finding.detail)
-
     def _leave(self, reason: str) -> None:
         """Starts the shutdown by requesting a last stop."""
         if math.isinf(self._leaving):
@@ -348,16 +332,8 @@ class RtdeProcess:
             self.commands.leaving = True
             self.commands.stop()
 
-    def _finished(self) -> bool:
-        """Whether the arm is at rest or the last stop has timed out; also ends the controller's program."""
-        stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
-        if stands or time.monotonic() > self._leaving:
-            dashboard.stop_program(self.config.host)
-            return True
-        return False
 
-
-def connect(config: ArmConfig) -> tuple[Any, Any]:
+def _connect(config: ArmConfig) -> tuple[Any, Any]:
     """The receive and control interfaces of the library, with tool and watchdog set."""
     try:
         import rtde_control
@@ -373,7 +349,7 @@ def connect(config: ArmConfig) -> tuple[Any, Any]:
     return receive, control
 
 
-def main(shared_fd: str, text: str) -> None:
+def _main(shared_fd: str, text: str) -> None:
     """Runs the process. It ends without destructors, in which the library aborts after a lost connection."""
     reports = os.dup(1)
     os.dup2(2, 1)
@@ -384,14 +360,14 @@ def main(shared_fd: str, text: str) -> None:
     # The constructors hold the interpreter's lock and may never return; the alarm ends the process.
     signal.alarm(math.ceil(config.connect) + 1)
     try:
-        receive, control = connect(config)
+        receive, control = _connect(config)
     except Exception as error:
         os.write(reports, json.dumps({"say": "refused", "detail": str(error)}).encode() + b"\n")
         os._exit(1)
     signal.alarm(0)
-    RtdeProcess(config, shared, receive, control, reports).run()
+    _RtdeProcess(config, shared, receive, control, reports).run()
     os._exit(0)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    _main(*sys.argv[1:])

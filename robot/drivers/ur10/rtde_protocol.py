@@ -3,10 +3,8 @@
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". Everything is big-endian; a package is a
 length of 2 bytes (which counts itself), a kind of 1 byte and a body.
 
-Listener for the tool pose of a controller: a read-only RTDE client.
-
-It writes nothing to the controller and claims no registers, so it can run beside the program that moves the
-arm, with a real or an emulated controller.
+`PoseListener` is a client that only reads the tool's pose. It writes nothing to the controller and claims no
+registers, so it can run beside the program that moves the arm, with a real or an emulated controller.
 """
 
 from __future__ import annotations
@@ -76,13 +74,6 @@ OUTPUT_TYPES = _types("output", _OUTPUTS)
 INPUT_TYPES = _types("input", _INPUTS)
 
 
-class Package(NamedTuple):
-    """One package: its kind (character code) and body."""
-
-    kind: int
-    body: bytes
-
-
 def pack_package(kind: int, body: bytes = b"") -> bytes:
     """The bytes of a package."""
     return HEADER.pack(HEADER.size + len(body), kind) + body
@@ -99,8 +90,8 @@ class PackageSplitter:
     def __init__(self) -> None:
         self._rest = bytearray()
 
-    def feed(self, data: bytes) -> Iterator[Package]:
-        """The packages completed by these bytes.
+    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """The packages completed by these bytes: kind (character code) and body of each.
 
         Raises:
             ValueError: an invalid length."""
@@ -113,7 +104,7 @@ class PackageSplitter:
                 return
             body = bytes(self._rest[HEADER.size : length])
             del self._rest[:length]
-            yield Package(kind, body)
+            yield kind, body
 
 
 _FIELDS = ("timestamp", "actual_TCP_pose", "actual_TCP_speed")
@@ -166,26 +157,22 @@ class PoseListener:
         self.close()
 
     def _run(self) -> None:
-        while not self._closing.is_set():
-            # an invalid package makes the connection unusable
-            with contextlib.suppress(OSError, ValueError, struct.error):
-                self._listen()
-            self._closing.wait(0.1)
-
-    def _listen(self) -> None:
         layout = data_layout([OUTPUT_TYPES[name] for name in _FIELDS])
-        splitter = PackageSplitter()
-        with socket.create_connection(self._address, timeout=self._patience) as link:
-            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            link.sendall(pack_package(PROTOCOL, struct.pack(">H", VERSION)))
-            recipe = struct.pack(">d", self._hz) + ",".join(_FIELDS).encode()
-            link.sendall(pack_package(OUTPUTS, recipe) + pack_package(START))
-            while not self._closing.is_set():
-                data = link.recv(1 << 14)
-                if not data:
-                    return
-                host = time.monotonic()
-                for kind, body in splitter.feed(data):
-                    if kind == DATA:
-                        numbers = np.array(layout.unpack(body)[1:])
-                        self._latest = ToolPose(host, numbers[1:7], numbers[7:13], float(numbers[0]))
+        recipe = struct.pack(">d", self._hz) + ",".join(_FIELDS).encode()
+        while not self._closing.is_set():
+            # An invalid package makes the connection unusable.
+            with (
+                contextlib.suppress(OSError, ValueError, struct.error),
+                socket.create_connection(self._address, timeout=self._patience) as link,
+            ):
+                splitter = PackageSplitter()
+                link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                link.sendall(pack_package(PROTOCOL, struct.pack(">H", VERSION)))
+                link.sendall(pack_package(OUTPUTS, recipe) + pack_package(START))
+                while not self._closing.is_set() and (data := link.recv(1 << 14)):
+                    host = time.monotonic()
+                    for kind, body in splitter.feed(data):
+                        if kind == DATA:
+                            numbers = np.array(layout.unpack(body)[1:])
+                            self._latest = ToolPose(host, numbers[1:7], numbers[7:13], float(numbers[0]))
+            self._closing.wait(0.1)

@@ -1,12 +1,8 @@
-"""Checks of targets and states: pure functions, used in both processes.
+"""Checks of targets and states, used in both processes, and checks before the arm is armed.
 
-They complement the robot's own safety configuration and do not replace it.
-
-Findings about exceeded time limits: whether this machine was late, or the controller.
-
-A machine that is late by half of a limit explains why the limit was exceeded.
-
-Checks before the arm is armed: status of the controller and its first states.
+They complement the robot's own safety configuration and do not replace it. Checks of targets, commands and
+states are pure functions. Where a time limit was exceeded, the finding tells whether this machine was late or
+the controller: a machine that is late by half of a limit explains why it was exceeded.
 """
 
 from __future__ import annotations
@@ -21,13 +17,12 @@ import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10 import dashboard
-from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, tcp_tilt
+from robot.drivers.ur10.driver_config import ROUNDING, SPEED_CAP, ArmConfig, tcp_tilt
 from tactile.base.errors import InputError
 
 REACH = 3.0  # m; a UR-10 reaches 1.3. A larger distance means an invalid state
 JOINT_RANGE = 2.2 * np.pi  # rad; a UR joint turns by 2 pi either way
 MIN_LOADED = 2  # consecutive states above the force limit that count as a contact
-ROUNDING = 1e-6  # m; tolerance of the box for rounding
 RETREAT_SPEED = 0.02  # m/s; speed of backing off
 MIN_SPEED = 1e-3  # m/s; lowest speed of a move
 MOVED_ON = 1e-3  # m; possible motion of the arm since the session read a state
@@ -69,21 +64,15 @@ class Finding(NamedTuple):
     detail: str
 
 
-class StateMemory(NamedTuple):
-    """Memory between checks of consecutive states.
-
-    Attributes:
-        loaded: consecutive states above the force limit. robot: controller time of the last state, s.
-    """
-
-    loaded: int = 0
-    robot: float = -np.inf
+StateMemory = tuple[int, float]
+"""Memory between checks of consecutive states: number of consecutive states above the force limit, and the
+controller's time of the last state, s."""
+NO_STATE: StateMemory = (0, -np.inf)
 
 
 def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
     """Checks that the arm may move to a target in a straight line from its present pose; returns the target
     [6].
-
 
     The box is convex: a line between two points in it stays in it.
 
@@ -98,7 +87,7 @@ def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
         raise TargetRefused(f"a target must be six numbers, not of shape {target.shape}")
     if not np.isfinite(target).all():
         raise TargetRefused(f"a target must be finite: {target.tolist()}")
-    if not in_box(config, target):
+    if not config.box.contains(target):
         raise TargetRefused(f"{_place(target)} lies outside the box {_box(config)}")
     if math.hypot(*target[3:]) > 2 * np.pi:
         raise TargetRefused(f"a rotation vector is at most one turn long: {target[3:].tolist()}")
@@ -108,7 +97,7 @@ def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
             f"{config.tilt_deg:g} are allowed"
         )
     start = np.asarray(from_tcp, np.float64)
-    if start.shape != (6,) or not np.isfinite(start).all() or not in_box(config, start):
+    if start.shape != (6,) or not np.isfinite(start).all() or not config.box.contains(start):
         raise TargetRefused(
             f"the tool stands at {_place(start)}, outside the box {_box(config)}: bring it in by hand"
         )
@@ -167,13 +156,6 @@ def at_target(config: ArmConfig, tcp: np.ndarray, target: np.ndarray) -> bool:
     return near and np.degrees(rotation_angle(tcp, target)) <= config.arrive_turn_deg
 
 
-def in_box(config: ArmConfig, tcp: np.ndarray) -> bool:
-    """Whether the tool centre point is in the box."""
-    place = np.asarray(tcp, np.float64)[:3]
-    low, high = np.array(config.box.low), np.array(config.box.high)
-    return bool(((place >= low - ROUNDING) & (place <= high + ROUNDING)).all())
-
-
 def at_rest(state: np.ndarray) -> bool:
     """Whether a state (ARM_STATE) shows an arm at rest: under 0.5 mm/s and 0.3 degrees/s."""
     speed = state["speed"]
@@ -192,20 +174,20 @@ def check_state(
     numbers = [state["robot"], *state["tcp"], *state["speed"], *state["force"], *state["joints"]]
     limit = config.force_limit if most is None else most
     force = math.hypot(*(state["force"][:3] - rest[:3]))
-    loaded = 0 if force <= limit else watch.loaded + 1  # NaN counts as above the limit
-    after = StateMemory(loaded, float(state["robot"]))
+    loaded = 0 if force <= limit else watch[0] + 1  # NaN counts as above the limit
+    after = loaded, float(state["robot"])
     if not np.isfinite(numbers).all():
         return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
     if np.abs(state["tcp"][:3]).max() > REACH or np.abs(state["joints"]).max() > JOINT_RANGE:
         return after, Finding(
             SessionOutcome.ARM_MALFORMED, f"an impossible state: tool at {_place(state['tcp'])}"
         )
-    if state["robot"] <= watch.robot:
+    if state["robot"] <= watch[1]:
         return after, Finding(SessionOutcome.CLOCK_JUMPED, "the controller's clock went back")
     for bits, outcome, text in SAFETY_BITS:
         if int(state["safety"]) & bits:
             return after, Finding(outcome, text)
-    if not in_box(config, state["tcp"]):
+    if not config.box.contains(state["tcp"]):
         return after, Finding(
             SessionOutcome.OUT_OF_BOX, f"{_place(state['tcp'])} lies outside the box {_box(config)}"
         )
@@ -344,14 +326,18 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
 
     The rate may recover within `config.connect` s, since the host may have been busy.
 
-    Raises:
-        StartupRefused: the stream is too slow, or the tool is outside the box.
-
     Args:
         states: returns the states [N] (ARM_STATE) since the start of the RTDE process.
+
+    Raises:
+        StartupRefused: the stream is too slow, or the tool is outside the box.
     """
     until = time.monotonic() + config.connect
-    while (rate := state_rate(states(), config.hz)) < MIN_RATE_SHARE * config.hz:
+    while True:
+        recent = states()["host"][-int(RATE_WINDOW * config.hz) :]
+        rate = (len(recent) - 1) / float(np.ptp(recent)) if len(recent) > 1 else 0.0
+        if not rate < MIN_RATE_SHARE * config.hz:
+            break
         if time.monotonic() > until:
             raise StartupRefused(
                 f"stream at {rate:.0f} of {config.hz} Hz",
@@ -360,25 +346,8 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
             )
         time.sleep(0.05)
     here = states()[-1]["tcp"]
-    if not in_box(config, here):
+    if not config.box.contains(here):
         place = ", ".join(f"{v:.3f}" for v in here[:3])
         raise StartupRefused(
             f"the tool stands at ({place}) m, outside the box", "", "move it into the box by hand"
         )
-
-
-def state_rate(states: np.ndarray, hz: int) -> float:
-    """State rate over the last `RATE_WINDOW`, Hz."""
-    recent = states["host"][-int(RATE_WINDOW * hz) :]
-    return (len(recent) - 1) / float(np.ptp(recent)) if len(recent) > 1 else 0.0
-
-
-def explain_refusal(detail: str) -> StartupRefused:
-    """The refusal with the cause and cure for an error message of the library."""
-    if "in use" in detail:
-        return StartupRefused(
-            "registers in use",
-            "",
-            "end the other RTDE program, or disable EtherNet/IP, PROFINET and MODBUS on the controller",
-        )
-    return StartupRefused(detail)

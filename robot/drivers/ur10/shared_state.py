@@ -62,7 +62,14 @@ class SharedState:
 
     def __init__(self, fd: int | None = None) -> None:
         size = HEADER + SLOTS * ARM_STATE.itemsize
-        self.fd = _anonymous_file(size) if fd is None else fd
+        if fd is None:
+            if hasattr(os, "memfd_create"):
+                fd = os.memfd_create("arm states")
+            else:
+                with tempfile.TemporaryFile() as file:
+                    fd = os.dup(file.fileno())
+            os.ftruncate(fd, size)
+        self.fd = fd
         self._memory = mmap.mmap(self.fd, size)
         self.control = np.ndarray((), CONTROL, self._memory)
         self._ring = np.ndarray(SLOTS, ARM_STATE, self._memory, HEADER)
@@ -104,14 +111,3 @@ class SharedState:
             self._memory.close()
         with contextlib.suppress(OSError):  # already closed
             os.close(self.fd)
-
-
-def _anonymous_file(size: int) -> int:
-    """Descriptor of a file without a name."""
-    if hasattr(os, "memfd_create"):
-        fd = os.memfd_create("arm states")
-    else:
-        with tempfile.TemporaryFile() as file:
-            fd = os.dup(file.fileno())
-    os.ftruncate(fd, size)
-    return fd

@@ -1,6 +1,6 @@
-"""Supervisor thread: checks the RTDE process and its states, and repeats stops until the arm is at rest.
+"""Supervisor thread of a session: watches the RTDE process, which it starts, and its states.
 
-Handle of the RTDE subprocess, for the session.
+It repeats stops until the arm is at rest, and keeps the first reason to stop as the fault.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from robot.drivers.ur10.safety import (
     StartupRefused,
     at_rest,
     at_target,
-    explain_refusal,
     retreat_target,
     stale_finding,
 )
@@ -138,20 +137,10 @@ PROCESS_LOST = {
     SessionOutcome.HOST_LATE,
 }
 """Outcomes after which the RTDE process may not react: it is killed."""
+PendingMove = tuple[int, Move, float]
+"""A move in progress: number of the command, the move as planned, and its deadline, s, host's clock."""
 SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, SessionOutcome.EMERGENCY_STOP}
 """Outcomes after which a controller may resume its program: the program is ended."""
-
-
-class PendingMove(NamedTuple):
-    """A move in progress.
-
-    Attributes:
-        number: of the command. move: as planned. deadline: s, host's clock.
-    """
-
-    number: int
-    move: Move
-    deadline: float
 
 
 class Supervisor:
@@ -220,7 +209,7 @@ class Supervisor:
         """Sends a move command. The caller holds the lock."""
         deadline = time.monotonic() + move.most + self.config.patience
         self._elsewhere = None
-        self.pending = PendingMove(self._order("move", move.target, move.speed), move, deadline)
+        self.pending = self._order("move", move.target, move.speed), move, deadline
 
     def halt(self) -> None:
         """Revokes all commands and stops, by the dashboard server if the arm does not stop in time."""
@@ -285,7 +274,11 @@ class Supervisor:
             if report["say"] == "ready":
                 self.ready = True
             elif report["say"] == "refused":
-                self.refused = explain_refusal(report["detail"])
+                refusal, cure = report["detail"], ""  # an error message of the library
+                if "in use" in refusal:
+                    others = "disable EtherNet/IP, PROFINET and MODBUS on the controller"
+                    refusal, cure = "registers in use", f"end the other RTDE program, or {others}"
+                self.refused = StartupRefused(refusal, "", cure)
             elif report["say"] == "moving":
                 self._started = report["number"], report["operation"]
             elif report["say"] == "fault":
@@ -300,13 +293,14 @@ class Supervisor:
         age, pending = self.age(), self.pending
         if age > self.config.stale:
             return stale_finding(age, self.late, self.config.stale)
-        if pending is None or pending.number == self._done:
+        if pending is None or pending[0] == self._done:
             return None
+        number, move, deadline = pending
         off = self._deviation(pending)
         if off is None and self._ended(pending):
-            self._done = pending.number
-        elif off is not None and now > pending.deadline:
-            return Finding(SessionOutcome.NOT_ARRIVED, f"late (planned: {pending.move.seconds:.0f} s), {off}")
+            self._done = number
+        elif off is not None and now > deadline:
+            return Finding(SessionOutcome.NOT_ARRIVED, f"late (planned: {move.seconds:.0f} s), {off}")
         elif off is not None and self._ended(pending):
             self._elsewhere = self._elsewhere or now
             if now - self._elsewhere > ELSEWHERE_TIME:
@@ -317,16 +311,16 @@ class Supervisor:
         """Whether the operation of a move has started and ended and the arm is at rest."""
         state = self.shared.latest()
         number, before = self._started
-        if state is None or number != pending.number or int(state["operation"]) == before:
+        if state is None or number != pending[0] or int(state["operation"]) == before:
             return False
         return int(state["progress"]) < 0 and self.still()
 
     def _deviation(self, pending: PendingMove) -> str | None:
         """Distance of the arm from its target, in words; None at the target."""
-        state = self.shared.latest()
-        if state is None or at_target(self.config, state["tcp"], pending.move.target):
+        state, target = self.shared.latest(), pending[1].target
+        if state is None or at_target(self.config, state["tcp"], target):
             return None
-        way = float(np.linalg.norm(state["tcp"][:3] - pending.move.target[:3]))
+        way = float(np.linalg.norm(state["tcp"][:3] - target[:3]))
         return f"{way * 1e3:.1f} mm from its target"
 
     def _follow_up(self, now: float) -> None:

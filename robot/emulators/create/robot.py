@@ -66,7 +66,11 @@ class EmulatedCreate:
         self.drives: list[tuple[float, int, int]] = []
         self.speeds: list[tuple[float, int, int]] = []
         self.queries = self.unknown = 0
-        self._scales = _odometry_scales(config)
+        self._scales = np.ones((1, 2))  # measured share of lengths and turns, for each move [M, 2]
+        if config.world is not None:
+            random, moves = stream(config.seed, "wheels"), np.ones((MOVES, 4))
+            self._scales = simulate_wheel_odometry(config.world.wheels, moves, np.arange(MOVES) % 2, random)
+            self._scales = self._scales[:, [0, 2]]
         self._moves = 0
         self._measured = [0.0, 0.0]  # mm and degrees by the wheels' encoders
         self._reported = [0, 0]  # sums of all replies: mm and degrees
@@ -155,30 +159,22 @@ class EmulatedCreate:
                 self._set_wheels(*(max(-TOP_SPEED, min(TOP_SPEED, v)) for v in (right, left)))
         elif opcode == 149:
             self.queries += 1
-            return b"".join(self._packet(number) for number in data[1:])
+            reply = b""
+            for number in data[1:]:
+                if number in (19, 20):  # the remainder below one unit is added to the next reply
+                    whole = math.trunc(self._measured[number - 19] - self._reported[number - 19])
+                    whole = max(-(2**15), min(2**15 - 1, whole))
+                    self._reported[number - 19] += whole
+                    reply += whole.to_bytes(2, "big", signed=True)
+                else:
+                    reply += bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
+            return reply
         else:
             self.unknown += 1
         return b""
-
-    def _packet(self, number: int) -> bytes:
-        if number in (19, 20):  # the remainder below one unit is added to the next reply
-            whole = math.trunc(self._measured[number - 19] - self._reported[number - 19])
-            whole = max(-(2**15), min(2**15 - 1, whole))
-            self._reported[number - 19] += whole
-            return whole.to_bytes(2, "big", signed=True)
-        return bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
 
     def _set_wheels(self, right: int, left: int) -> None:
         if (right, left) != (self.right, self.left):
             self.right, self.left = right, left
             self._moves += 1
             self.speeds.append((self.time, right, left))
-
-
-def _odometry_scales(config: CreateEmulatorConfig) -> np.ndarray:
-    """Measured share of lengths and turns, for each of `MOVES` moves [M, 2]."""
-    if config.world is None:
-        return np.ones((1, 2))
-    random = stream(config.seed, "wheels")
-    scales = simulate_wheel_odometry(config.world.wheels, np.ones((MOVES, 4)), np.arange(MOVES) % 2, random)
-    return scales[:, [0, 2]]

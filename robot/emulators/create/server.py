@@ -1,9 +1,7 @@
 """The process of an emulated Create: its serial line and, with an arena, the bridge of its whiskers.
 
-Fault requests are lines of JSON, answered by a line: on standard input, or on the bridge's fault port with
-`"device": "create"`; without that the port takes those of the bridge.
-
-The emulated serial line: a pseudo-terminal, and its faults.
+The serial line is a pseudo-terminal. Fault requests are lines of JSON, answered by a line: on standard input,
+or on the bridge's fault port with `"device": "create"`; without that the port takes those of the bridge.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ from tactile.base.files import temporary_path
 from tactile.base.random_streams import stream
 
 
-class LineFaults:
+class _LineFaults:
     """Faults of the serial line."""
 
     def __init__(self, seed: int) -> None:
@@ -132,7 +130,7 @@ TICK = 0.005
 """Longest time between two moments at which the robot's motion is computed, s."""
 
 
-class CreateServer:
+class _CreateServer:
     """An emulated Create in real time; `start` begins to serve its serial line.
 
     Attributes:
@@ -142,7 +140,7 @@ class CreateServer:
     def __init__(self, config: CreateEmulatorConfig) -> None:
         world = config.world
         arena = None if world is None else make_arena(world.arena, config.seed)
-        self.robot, self.faults = EmulatedCreate(config, arena), LineFaults(config.seed)
+        self.robot, self.faults = EmulatedCreate(config, arena), _LineFaults(config.seed)
         self.terminal = Terminal(config.port)
         self.began = time.monotonic()
         self._free = 0.0  # loop time at which the line has sent everything
@@ -183,9 +181,13 @@ class CreateServer:
         elif do == "trickle":
             self.faults.trickle = float(order["seconds"])
         elif do == "unplug":
-            self._unplug()
+            if self.terminal.plugged and self._loop is not None:
+                self._loop.remove_reader(self.terminal.master)
+            self.terminal.unplug()
         elif do == "plug":
-            self._plug()
+            if not self.terminal.plugged and self._loop is not None:
+                self.terminal.plug()
+                self._loop.add_reader(self.terminal.master, self._receive)
         elif do == "die":
             os._exit(1)
         elif do == "state":
@@ -216,16 +218,6 @@ class CreateServer:
             "queries": robot.queries,
             "unknown": robot.unknown,
         }
-
-    def _unplug(self) -> None:
-        if self.terminal.plugged and self._loop is not None:
-            self._loop.remove_reader(self.terminal.master)
-        self.terminal.unplug()
-
-    def _plug(self) -> None:
-        if not self.terminal.plugged and self._loop is not None:
-            self.terminal.plug()
-            self._loop.add_reader(self.terminal.master, self._receive)
 
     def _receive(self) -> None:
         self.move(time.monotonic())
@@ -264,7 +256,7 @@ def serve(config: CreateEmulatorConfig) -> None:
         InputError: no pseudo-terminals, an invalid arena, the port's name is taken, or the address of the
             bridge cannot be used.
     """
-    server = CreateServer(config)
+    server = _CreateServer(config)
     try:
         with urgent():
             asyncio.run(_run(config, server))
@@ -272,10 +264,12 @@ def serve(config: CreateEmulatorConfig) -> None:
         server.terminal.unplug()
 
 
-async def _run(config: CreateEmulatorConfig, server: CreateServer) -> None:
+async def _run(config: CreateEmulatorConfig, server: _CreateServer) -> None:
     async with contextlib.AsyncExitStack() as stack:
         if config.world is not None:
-            bridge = _bridge(config, server)
+            random = stream(config.seed, "strain")
+            whiskers = CreateWhiskers(config.world, server.robot, server.move, random)
+            bridge = EmulatedHead(config.world.bridge, whiskers, time.monotonic())
 
             def do(request: dict[str, Any], now: float) -> dict[str, Any]:
                 if request.get("device") != "create":
@@ -293,15 +287,7 @@ async def _run(config: CreateEmulatorConfig, server: CreateServer) -> None:
             await asyncio.sleep(TICK)
 
 
-def _bridge(config: CreateEmulatorConfig, server: CreateServer) -> EmulatedHead:
-    """The bridge of the whiskers."""
-    assert config.world is not None
-    random = stream(config.seed, "strain")
-    whiskers = CreateWhiskers(config.world, server.robot, server.move, random)
-    return EmulatedHead(config.world.bridge, whiskers, time.monotonic())
-
-
-def _read_requests(server: CreateServer) -> None:
+def _read_requests(server: _CreateServer) -> None:
     """Answers requests from standard input, in the running event loop, until it ends."""
     loop = asyncio.get_running_loop()
 

@@ -1,8 +1,6 @@
-"""An emulated head at its USB interface: transfers, and frames over time.
+"""An emulated head at its USB interface: descriptors, transfers, frames over time, and its faults.
 
 Times are arguments: no function waits or reads a clock.
-
-USB descriptors of the emulated bridge.
 """
 
 from __future__ import annotations
@@ -26,12 +24,12 @@ from robot.drivers.head.usb_protocol import (
     REQUEST_IN,
     VENDOR,
     VERSION,
+    Command,
     FrameFlag,
     Request,
     frame_values,
     pack_frames,
     to_counts,
-    unpack_command,
 )
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
@@ -45,26 +43,15 @@ PACKET = 512
 """Size of a high-speed bulk packet, bytes."""
 
 
-def device() -> bytes:
-    """The device descriptor: USB 2.0, vendor-specific class."""
-    return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
-
-
-def configuration() -> bytes:
-    """The only configuration descriptor: self-powered, one interface, bulk endpoints in and out."""
-    interface = struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
-    ends = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
-    size = 9 + len(interface) + len(ends)
-    return struct.pack("<BBHBBBBB", 9, 2, size, 1, 1, 0, 0xC0, 0) + interface + ends
-
-
-def string(number: int) -> bytes | None:
-    """The string descriptor with an index; index 0 gives the language. None if it does not exist."""
-    if not 0 <= number < len(STRINGS):
-        return None
-    text = STRINGS[number].encode("utf-16-le") if number else struct.pack("<H", LANGUAGE)
-    return struct.pack("<BB", 2 + len(text), 3) + text
-
+_ENDS = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
+DESCRIPTORS = (
+    struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
+    + struct.pack("<BBHBBBBB", 9, 2, 9 + 9 + len(_ENDS), 1, 1, 0, 0xC0, 0)
+    + struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
+    + _ENDS
+)
+"""Descriptors of the device (USB 2.0, vendor-specific class) and of its only configuration (self-powered, one
+interface, bulk endpoints in and out)."""
 
 STRING, CONFIGURE, CONFIGURED, ALTERNATE = (0x80, 6), (0x00, 9), (0x80, 8), (0x01, 11)
 """Supported standard requests, by bmRequestType and bRequest."""
@@ -85,7 +72,7 @@ class EmulatedHead:
         self.config, self.whiskers, self.began = config, whiskers, now
         self.samples = block_samples(config.stream.rate)
         self.fifo = Fifo(config.fifo)
-        self.faults = HeadFaults(whiskers.count, stream(config.seed, "faults"))
+        self.faults = _HeadFaults(whiskers.count, stream(config.seed, "faults"))
         self.streaming = False
         self.received: Counter[str] = Counter()
         self._pace = 1 + config.drift_ppm * 1e-6  # clock rate
@@ -121,7 +108,7 @@ class EmulatedHead:
 
     def bulk_out(self, packet: bytes, now: float) -> None:
         """Executes a command packet; an invalid one is ignored and counted."""
-        command = unpack_command(packet)
+        command = Command.unpack(packet)
         if command is None:
             self.received[""] += 1
             return
@@ -134,16 +121,18 @@ class EmulatedHead:
         Raises:
             OSError: EPIPE for an unsupported request.
         """
+        answer: bytes | None = None
         if (kind, request) == STRING and value >> 8 == 3:
-            answer = string(value & 0xFF)
+            number = value & 0xFF
+            if number < len(STRINGS):  # index 0 gives the language
+                text = STRINGS[number].encode("utf-16-le") if number else struct.pack("<H", LANGUAGE)
+                answer = struct.pack("<BB", 2 + len(text), 3) + text
         elif (kind, request) == CONFIGURED:
             answer = b"\1"
         elif (kind, request) in (CONFIGURE, ALTERNATE):
             answer = b""
         elif kind & 0x60 == REQUEST_IN & 0x60 and request in set(Request):
             answer = self._vendor(Request(request), now)
-        else:
-            answer = None
         if answer is None:
             raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
         return answer[:size]
@@ -202,7 +191,8 @@ class EmulatedHead:
         elif request == Request.STOP:
             self.halt()
         elif request == Request.CLOCK:
-            return self._clock(now).to_bytes(8, "little")
+            seconds = self.config.age + (now - self.began) * self._pace
+            return max(round(seconds * 1e6) + self.faults.jump, 0).to_bytes(8, "little")
         else:
             identity = {
                 "name": "emulated head",
@@ -231,11 +221,6 @@ class EmulatedHead:
         frames = [raw[k : k + size] for k in range(0, len(raw), size)]
         self.fifo.push(self.faults.damage_frames(frames))
 
-    def _clock(self, now: float) -> int:
-        """Time since power-on by the head's clock, us."""
-        seconds = self.config.age + (now - self.began) * self._pace
-        return max(round(seconds * 1e6) + self.faults.jump, 0)
-
     def _when(self, sample: int) -> float:
         """Host time of a sample, s."""
         return self.began + sample / (self.config.stream.rate * self._pace)
@@ -245,7 +230,7 @@ HEADER = 20 - 4
 """Length of a frame before its values, bytes."""
 
 
-class HeadFaults:
+class _HeadFaults:
     """Active faults; times are the host's monotonic clock, s.
 
     Attributes:
@@ -261,16 +246,16 @@ class HeadFaults:
         self._saturated: dict[int, float] = {}
         self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
         self.known: dict[str, Callable[..., None]] = {
-            "unplug": self._unplug,
-            "plug": self._plug,
-            "stall": self._stall,
-            "silence": self._silence,
+            "unplug": self.unplug,
+            "plug": self.plug,
+            "stall": self.stall,
+            "silence": self.silence,
             "garbage": lambda now, bytes=64: self._count("_garbage", bytes),
             "corrupt": lambda now, frames=1: self._count("_corrupt", frames),
             "skip": lambda now, frames=1: self._count("_skip", frames),
             "swap": lambda now, frames=1: self._count("_swap", frames),
-            "clock": lambda now, jump_us: self._jump(jump_us),
-            "saturate": self._saturate,
+            "clock": self.jump_clock,
+            "saturate": self.saturate,
             "die": lambda now: os._exit(1),
         }
         """Faults by name; each takes the time and its arguments."""
@@ -333,23 +318,23 @@ class HeadFaults:
     def _count(self, name: str, more: int) -> None:
         setattr(self, name, getattr(self, name) + int(more))
 
-    def _unplug(self, now: float) -> None:
+    def unplug(self, now: float) -> None:
         self.plugged = False
 
-    def _plug(self, now: float) -> None:
+    def plug(self, now: float) -> None:
         self.plugs += not self.plugged
         self.plugged, self._halted, self._halted_until = True, False, -np.inf
 
-    def _stall(self, now: float, seconds: float = 0.0) -> None:
+    def stall(self, now: float, seconds: float = 0.0) -> None:
         self._halted, self._halted_until = True, now + float(seconds)
 
-    def _silence(self, now: float, seconds: float = 1.0) -> None:
+    def silence(self, now: float, seconds: float = 1.0) -> None:
         self._silent_until = now + float(seconds)
 
-    def _jump(self, jump_us: int) -> None:
+    def jump_clock(self, now: float, jump_us: int) -> None:
         self.jump += int(jump_us)
 
-    def _saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
+    def saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
         if not 0 <= whisker < self._whiskers:
             raise ValueError(f"whisker {whisker}; the head has 0 to {self._whiskers - 1}")
         self._saturated[whisker] = now + float(seconds)

@@ -19,8 +19,7 @@ from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op
 from robot.drivers.head.usb_protocol import ENDPOINT_IN
 from robot.drivers.processes import urgent
 from robot.drivers.ur10.rtde_protocol import PoseListener
-from robot.emulators.head import emulated_device
-from robot.emulators.head.emulated_device import EmulatedHead
+from robot.emulators.head.emulated_device import DESCRIPTORS, EmulatedHead
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, maze_whiskers
 from robot.emulators.listening import listening
@@ -42,17 +41,17 @@ def serve(config: HeadEmulatorConfig) -> None:
     head = ur10_head(config.head)
     made = make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
     with contextlib.ExitStack() as stack:
-        whiskers = maze_whiskers(config, made.surroundings.walls, _place(config, made.path, stack))
+        place: PoseSource
+        if config.arm is None:
+            path = made.path
+            place = AlongPath(path if config.follow else HeadPath(path.time[:1], path.pose[:1]))
+        else:
+            arm = PoseListener(config.arm, hz=config.arm_hz)
+            stack.callback(arm.close)
+            place = CarriedByArm(arm, config.placing)
+        whiskers = maze_whiskers(config, made.surroundings.walls, place)
         stack.enter_context(urgent())  # not before: building takes a core
         asyncio.run(_run_server(config, EmulatedHead(config, whiskers, time.monotonic())))
-
-
-def _place(config: HeadEmulatorConfig, path: HeadPath, stack: contextlib.ExitStack) -> PoseSource:
-    if config.arm is None:
-        return AlongPath(path if config.follow else HeadPath(path.time[:1], path.pose[:1]))
-    arm = PoseListener(config.arm, hz=config.arm_hz)
-    stack.callback(arm.close)
-    return CarriedByArm(arm, config.placing)
 
 
 async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
@@ -64,7 +63,7 @@ async def _run_server(config: HeadEmulatorConfig, bridge: EmulatedHead) -> None:
 @contextlib.asynccontextmanager
 async def open_server(
     config: BridgeEmulatorConfig, bridge: EmulatedHead, do: FaultHandler
-) -> AsyncIterator[HeadServer]:
+) -> AsyncIterator[_HeadServer]:
     """A server of the USB and of the fault requests of an emulated bridge, which listens.
 
     Args:
@@ -73,7 +72,7 @@ async def open_server(
     Raises:
         InputError: the address cannot be used.
     """
-    server = HeadServer(bridge, do)
+    server = _HeadServer(bridge, do)
     async with contextlib.AsyncExitStack() as stack:
         for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
             talk = _ignore_disconnects(client)
@@ -94,7 +93,7 @@ def _ignore_disconnects(client: Client) -> Client:
     return talk
 
 
-class HeadServer:
+class _HeadServer:
     """Connections of clients to the emulated head."""
 
     def __init__(self, bridge: EmulatedHead, do: FaultHandler) -> None:
@@ -145,7 +144,7 @@ class HeadServer:
         bridge, now = self.bridge, time.monotonic()
         self._present(plugs)
         if op == Op.DESCRIBE:
-            return emulated_device.device() + emulated_device.configuration()
+            return DESCRIPTORS
         if op == Op.CLAIM:
             if self._owner is not None and self._owner[0] is not connection and self._owner[1] == plugs:
                 raise _error(errno.EBUSY)

@@ -1,10 +1,7 @@
-"""The whiskers of an emulated head, simulated in blocks of samples.
+"""The whiskers of an emulated head, simulated in blocks of samples, and what its bridge asks of any whiskers.
 
-Drives of an emulated head: they whisk, rest, and retract if no commands arrive.
-
-A whisk starts at the start of a block of samples or at the end of the previous whisk.
-
-The whiskers behind an emulated bridge: what it asks of them.
+Their drives whisk, rest, and retract if no commands arrive. A whisk starts at the start of a block of samples
+or at the end of the previous whisk. The head stands, moves along a path or is carried by an arm.
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ from robot.drivers.head.usb_protocol import (
     CommandKind,
     FeedbackMode,
 )
-from robot.drivers.ur10.driver_config import BaseTransformConfig, pose_from_tcp
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.simulation.head.baseline import Baseline, make_baseline
@@ -129,7 +126,7 @@ class Whiskers:
         self.config, self.mechanics, self.head = config, mechanics, head
         self.baseline = baseline
         self.walls, self.place, self.random, self.samples = walls, place, random, samples
-        self.drives = ServoDrives(head, config.rate)
+        self.drives = _ServoDrives(head, config.rate)
         self.balance = whiskers_at_rest(1, len(head.length))
         self.pose: np.ndarray | None = None
         self.lift = np.inf
@@ -192,7 +189,17 @@ class Whiskers:
             # Time counts from the start of the whisk, possibly within the block.
             knots = np.array([first - done, first - done + size]) / rate
             time = (first + np.arange(count)) / rate
-            sweep = self._sweep(pose, knots, time, noise[:, done : done + count])
+            some = noise[:, done : done + count]
+            if self.lift < self._clear:
+                # The walls relative to a lifted head are lower by the lift, m.
+                lift = STEP * round(self.lift / STEP)
+                if self._around is None or lift != self._lowered:
+                    lower = self.walls._replace(height=self.walls.height - lift)
+                    self._around, self._lowered = Surroundings(lower, self.head), lift
+                sweep = sweep_walls(self._around, pose, knots, time, some)
+            else:
+                nothing = np.zeros((len(time), 1, len(self.head.length)))
+                sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, some)
             truth, self.balance = advance_balance(
                 self.config, self.mechanics, self.drives.law, sweep, self.balance
             )
@@ -201,20 +208,6 @@ class Whiskers:
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
         return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
-
-    def _sweep(self, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
-        if self.lift < self._clear:
-            return sweep_walls(self._surroundings(), pose, knots, time, noise)
-        nothing = np.zeros((len(time), 1, len(self.head.length)))
-        return WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
-
-    def _surroundings(self) -> Surroundings:
-        """The walls relative to a lifted head: lower by the lift, m."""
-        lift = STEP * round(self.lift / STEP)
-        if self._around is None or lift != self._lowered:
-            lower = self.walls._replace(height=self.walls.height - lift)
-            self._around, self._lowered = Surroundings(lower, self.head), lift
-        return self._around
 
 
 def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> Whiskers:
@@ -236,7 +229,7 @@ RETRACTION = 0.2
 """Duration of the retraction, s."""
 
 
-class WhiskCommand(NamedTuple):
+class _Whisk(NamedTuple):
     """A commanded whisk.
 
     Attributes:
@@ -253,7 +246,7 @@ class WhiskCommand(NamedTuple):
     amplitude: np.ndarray
 
 
-class ServoDrives:
+class _ServoDrives:
     """The drives of one head, sample by sample.
 
     Attributes:
@@ -262,9 +255,9 @@ class ServoDrives:
 
     def __init__(self, head: Head, rate: float) -> None:
         self.head, self.rate = head, rate
-        self.whisk: WhiskCommand | None = None
+        self.whisk: _Whisk | None = None
         self.sample = 0
-        self._next: WhiskCommand | None = None
+        self._next: _Whisk | None = None
         self._command_time, self._stopped = -np.inf, False
         self._centre = np.zeros(len(head.length))
         self._from: np.ndarray | None = None  # angles at the start of the retraction
@@ -347,7 +340,7 @@ class ServoDrives:
             aim = np.zeros_like(deflection) + whisk.amplitude * whisk_phase(whisk.whisking, time)
         return aim + whisk.offset if whisk.offset else aim, drive
 
-    def _make_whisk(self, command: Command) -> WhiskCommand | None:
+    def _make_whisk(self, command: Command) -> _Whisk | None:
         """The whisk of a command; None (no change) if it exceeds the limits of the drives."""
         threshold = np.full(len(self._centre), np.inf)
         numbers = command.numbers[: len(threshold)]
@@ -368,7 +361,7 @@ class ServoDrives:
         samples = round(self.rate / whisking.rate)
         if samples < 2:
             return None
-        return WhiskCommand(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))
+        return _Whisk(whisking, samples, offset, threshold, feedback, np.zeros(len(threshold)))
 
 
 AHEAD = 0.1
@@ -400,7 +393,7 @@ class CarriedByArm:
         ahead = min(max(time - newest.time, -AHEAD), AHEAD)
         tool = np.array(newest.tcp, float)
         tool[:3] += ahead * newest.speed[:3]
-        pose, lift = pose_from_tcp(self.placing, tool)
+        pose, lift = self.placing.pose_from_tcp(tool)
         # The rotation axes of the arm and of the map's headings are both vertical.
         return pose + np.array([0.0, 0.0, ahead * float(newest.speed[5])]), float(lift)
 

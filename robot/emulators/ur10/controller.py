@@ -1,41 +1,131 @@
-"""The emulated controller without sockets: arm, program, safety, registers."""
+"""The emulated controller without sockets: arm, safety, registers, and the programs that clients upload.
+
+Of uploaded programs it runs the control program of ur_rtde, emulated at its registers, and any other as the
+list of its linear moves.
+"""
 
 from __future__ import annotations
 
+import math
+import re
+import sys
 from collections import deque
-from collections.abc import Callable
-from enum import IntEnum, IntFlag
-from typing import Any, Protocol
+from enum import IntEnum
+from typing import Any
 
-from robot.emulators.ur10.emulated_arm import EmulatedArm, force_magnitude
+from robot.drivers.ur10.rtde_protocol import OUTPUT_TYPES, REGISTERS
+from robot.emulators.ur10.emulated_arm import (
+    EmulatedArm,
+    MoveL,
+    MoveOrder,
+    StopL,
+    Unreachable,
+    parse_moves,
+)
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.kinematics import Vector6
-from robot.emulators.ur10.motion import MoveL, MoveOrder, Unreachable
-from robot.emulators.ur10.registers import Registers
 
 MAX_TARGETS = 10_000  # orders kept for the fault request "state"
 
+Value = tuple[float, ...]
 
-class Program(Protocol):
-    """An uploaded program while it runs."""
+_LENGTH = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
+_CONSTANT: dict[str, Value] = {
+    "speed_scaling": (1.0,),
+    "target_speed_fraction": (1.0,),
+    "actual_main_voltage": (48.0,),
+    "actual_robot_voltage": (48.0,),
+    "actual_joint_voltage": (48.0,) * 6,
+    "joint_temperatures": (30.0,) * 6,
+    "actual_tool_accelerometer": (0.0, 0.0, 9.82),
+    "joint_mode": (253,) * 6,  # running
+}
 
-    def step(self) -> bool:
-        """Runs one control step; False when the program has ended."""
-        ...
+
+class Registers:
+    """Outputs and inputs of the controller.
+
+    Attributes:
+        fields: every output variable by name, as a tuple of its numbers.
+        ints, doubles: input registers. written: host time at which each input integer was last written, s.
+        inputs: the other input variables, by name.
+    """
+
+    def __init__(self) -> None:
+        self.fields: dict[str, Value] = {
+            name: _CONSTANT.get(name, (0,) * _LENGTH.get(kind, 1)) for name, kind in OUTPUT_TYPES.items()
+        }
+        self.ints = [0] * REGISTERS
+        self.doubles = [0.0] * REGISTERS
+        self.written = [0.0] * REGISTERS
+        self.inputs: dict[str, Value] = {}
+
+    def write(self, name: str, value: Value, time: float) -> None:
+        """Stores an input variable of a client, received at a host time, s."""
+        kind, _, index = name.rpartition("_")
+        if kind == "input_int_register":
+            self.ints[int(index)] = int(value[0])
+            self.written[int(index)] = time
+        elif kind == "input_double_register":
+            self.doubles[int(index)] = value[0]
+        else:
+            self.inputs[name] = value
+
+    def vector(self, first: int) -> tuple[float, float, float, float, float, float]:
+        """Six consecutive input doubles."""
+        a, b, c, d, e, f = self.doubles[first : first + 6]
+        return a, b, c, d, e, f
+
+    def put_int(self, index: int, value: int) -> None:
+        self.fields[f"output_int_register_{index}"] = (value,)
+
+
+class SafetyMode(IntEnum):
+    """Safety mode: the reason why the arm may not move, if any."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class RobotMode(IntEnum):
+    """Power state of the arm."""
+
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+class Runtime(IntEnum):
+    """State of the program."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+SAFETY_BITS = {
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SafetyMode.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
+    SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+}
+"""`safety_status_bits` of RTDE: 0 normal, 2 protective stop, 4 safeguard stop, 6 emergency stop of the robot,
+7 emergency stop, 10 stopped due to safety."""
+POWER_ON, PROGRAM_RUNNING = 1 << 0, 1 << 1
+"""`robot_status_bits` of RTDE."""
 
 
 class EmulatedController:
     """An emulated controller. `tick` runs a control step; clients call the other methods between steps."""
 
-    def __init__(
-        self, config: UrEmulatorConfig, load_program: Callable[[EmulatedController, str], Program]
-    ) -> None:
+    def __init__(self, config: UrEmulatorConfig) -> None:
         self.config = config
-        self._load_program = load_program
         self.dt: float = 1 / config.hz
         self.arm: EmulatedArm = EmulatedArm(config)
         self.registers = Registers()
-        self.program: Program | None = None
+        self.program: _ControlProgram | _ScriptProgram | None = None
         self.safety = SafetyMode.NORMAL
         self.robot_mode = RobotMode.RUNNING
         self.runtime = Runtime.STOPPED
@@ -59,7 +149,11 @@ class EmulatedController:
                 self.watchdog_stops += 1
                 self.stop_program()
         if self._uploaded is not None and self.time >= self._uploaded[0]:
-            self._run(self._uploaded[1])
+            text, self._uploaded = self._uploaded[1], None
+            self.programs += 1
+            self.runtime = Runtime.PLAYING
+            own = "def rtde_control" in text  # ur_rtde's control program
+            self.program = _ControlProgram(self, text) if own else _ScriptProgram(self, text)
         slider = self.registers.inputs.pop("speed_slider_fraction", None)
         if slider is not None and self.registers.inputs.get("speed_slider_mask", (0,))[0]:
             self.arm.scale = min(1.0, max(0.0, slider[0]))
@@ -72,10 +166,8 @@ class EmulatedController:
             self.arm.step(self.dt)
         except Unreachable:  # during a move: a real arm would make a safety stop
             self.protective_stop()
-        if (
-            force_magnitude(self.arm.force) > self.config.protective_force
-            and self.safety is SafetyMode.NORMAL
-        ):
+        pushed = math.hypot(*self.arm.force[:3]) > self.config.protective_force
+        if pushed and self.safety is SafetyMode.NORMAL:
             self.protective_stop()
         self.publish()
 
@@ -90,12 +182,6 @@ class EmulatedController:
         self.stop_program()
         if self.safety is SafetyMode.NORMAL and self.robot_mode is RobotMode.RUNNING:
             self._uploaded = (self.time + self.config.starting, text)
-
-    def _run(self, text: str) -> None:
-        self._uploaded = None
-        self.programs += 1
-        self.runtime = Runtime.PLAYING
-        self.program = self._load_program(self, text)
 
     def stop_program(self) -> None:
         """Ends the program and stops the arm."""
@@ -188,60 +274,159 @@ class EmulatedController:
         fields["runtime_state"] = (self.runtime,)
         fields["robot_mode"] = (self.robot_mode,)
         fields["safety_mode"] = (self.safety,)
-        fields["safety_status_bits"] = (BITS[self.safety],)
-        bits = StatusBits.POWER_ON * powered | StatusBits.PROGRAM_RUNNING * playing
+        fields["safety_status_bits"] = (SAFETY_BITS[self.safety],)
+        bits = POWER_ON * powered | PROGRAM_RUNNING * playing
         fields["robot_status_bits"] = (bits,)
         fields["target_speed_fraction"] = (self.arm.scale,)
 
 
-class SafetyMode(IntEnum):
-    """Safety mode: the reason why the arm may not move, if any."""
+class _ControlCommand(IntEnum):
+    """Commands that the emulated control program executes."""
 
-    NORMAL = 1
-    PROTECTIVE_STOP = 3
-    SAFEGUARD_STOP = 5
-    ROBOT_EMERGENCY_STOP = 7
-
-
-class RobotMode(IntEnum):
-    """Power state of the arm."""
-
-    POWER_OFF = 3
-    IDLE = 5
-    RUNNING = 7
+    NONE = 0
+    MOVE_L = 3
+    SET_TCP = 29
+    STOP_L = 33
+    SET_WATCHDOG = 35
+    POSE_WITHIN_SAFETY_LIMITS = 36
+    END = 255
 
 
-class Runtime(IntEnum):
-    """State of the program."""
+EMULATED = "moveL, setTcp, stopL, setWatchdog, isPoseWithinSafetyLimits, stopScript"
+"""Functions of ur_rtde that send these commands."""
 
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
+REFUSED = {
+    1: "moveJ", 2: "moveJ_IK", 4: "moveL_FK", 6: "forceMode", 7: "forceModeStop", 8: "zeroFtSensor",
+    9: "speedJ", 10: "speedL", 11: "servoJ", 12: "servoC", 15: "speedStop", 16: "servoStop", 17: "setPayload",
+    18: "teachMode", 19: "endTeachMode", 20: "forceModeSetDamping", 21: "forceModeSetGainScaling",
+    24: "servoL", 25: "toolContact", 26: "getStepTime", 27: "getActualJointPositionsHistory",
+    28: "getTargetWaypoint", 31: "triggerProtectiveStop", 34: "stopJ", 37: "isJointsWithinSafetyLimits",
+    38: "getJointTorques", 39: "poseTrans", 40: "getTCPOffset", 41: "jogStart", 42: "jogStop",
+    43: "getForwardKinematics", 45: "movePath", 46: "getInverseKinematics", 47: "isSteady",
+    51: "moveUntilContact", 52: "freedriveMode", 53: "endFreedriveMode", 54: "getFreedriveStatus",
+    56: "ftRtdeInputEnable", 57: "enableExternalFtSensor", 58: "getActualToolFlangePose", 59: "setGravity",
+    60: "getInverseKinematicsHasSolution", 62: "startContactDetection", 63: "stopContactDetection",
+    64: "readContactDetection", 65: "setTargetPayload", 66: "directTorque", 67: "getMassMatrix",
+    68: "getCoriolisAndCentrifugalTorques", 69: "getTargetJointAccelerations", 70: "getJacobian",
+    71: "getJacobianTimeDerivative",
+}  # fmt: skip
+"""Functions of ur_rtde by the number of a command that is not emulated."""
+
+READY, DONE = 1, 2
+RUNNING_BIT = 1 << 15
+
+_OFFSET = re.compile(r"# int register offset\n\s*(\d+)")
 
 
-class SafetyBits(IntFlag):
-    """`safety_status_bits`."""
+class _ControlProgram:
+    """The running control program of ur_rtde, emulated at its registers.
 
-    NORMAL = 1 << 0
-    PROTECTIVE_STOPPED = 1 << 2
-    SAFEGUARD_STOPPED = 1 << 4
-    ROBOT_EMERGENCY_STOPPED = 1 << 6
-    EMERGENCY_STOPPED = 1 << 7
-    STOPPED_DUE_TO_SAFETY = 1 << 10
+    The client writes the number of a command into integer register 0 and its arguments into others. The
+    program writes 1 to output register 0 when it is ready and 2 when it has executed a command; then the
+    client writes 0. Output register 2 describes the newest asynchronous operation: its number and whether it
+    is under way. Source: the interface described by ur_rtde 1.6.5 (its control script and documentation).
+
+    The commands of our driver are executed. Any other ends the program, as an error in a script does on a
+    controller: the function of ur_rtde returns False or raises an error, and the emulator names it on
+    standard error. Functions that do not wait for an answer (`servoJ`, `speedL`, ...) return True the first
+    time, but end the program too.
+
+    Args:
+        controller: executes the commands. text: the uploaded program.
+    """
+
+    def __init__(self, controller: EmulatedController, text: str) -> None:
+        offset = _OFFSET.search(text)
+        self._offset = int(offset[1]) if offset else 0  # first integer and double register in use
+        self._controller, self._registers = controller, controller.registers
+        self._executing = False
+        self._waiting = False  # the command is done when the arm is
+        self._operating = False  # an asynchronous move or stop is in progress
+        self._writes = self._operation = 0
+        self._report_operation(running=False)
+        self._answer(READY)
+
+    def step(self) -> bool:
+        """Runs one control step; False when the program has ended. `Unreachable` ends it too."""
+        busy = self._controller.arm.busy
+        if not busy:
+            self._end_operation()
+        if self._waiting:
+            if busy:
+                return True
+            self._waiting = False
+            self._answer(DONE)
+        command = self._registers.ints[self._offset]
+        if command == _ControlCommand.NONE:
+            self._executing = False
+            self._answer(READY)
+        elif not self._executing:
+            self._executing = True
+            if command == _ControlCommand.END:
+                return False
+            if command not in set(_ControlCommand):
+                refusal = f"{REFUSED.get(command, 'an unknown function')} (command {command}) is not emulated"
+                refusal += f" and ends the control program; emulated are {EMULATED}"
+                print(f"emulated controller: {refusal}", file=sys.stderr, flush=True)
+                return False
+            self._execute(command)
+            if not self._waiting:
+                self._answer(DONE)
+        return True
+
+    def _execute(self, command: int) -> None:
+        controller, first = self._controller, self._registers.doubles[self._offset]
+        vector = self._registers.vector(self._offset)
+        if command == _ControlCommand.MOVE_L:
+            controller.solve(vector)
+            speed, acceleration = self._registers.doubles[self._offset + 6 : self._offset + 8]
+            self._order("movel", MoveL(vector, speed, acceleration))
+        elif command == _ControlCommand.STOP_L:
+            self._order("stop", StopL(first))
+        elif command == _ControlCommand.SET_TCP:
+            controller.arm.set_tool(vector)
+        elif command == _ControlCommand.SET_WATCHDOG:
+            controller.watch(first, self._offset)
+        elif command == _ControlCommand.POSE_WITHIN_SAFETY_LIMITS:
+            self._registers.put_int(self._offset + 1, int(controller.solvable(vector)))
+
+    def _order(self, kind: str, order: MoveOrder) -> None:
+        """Replaces the arm's orders; an asynchronous command is done at once, any other with the arm."""
+        self._end_operation()
+        self._controller.record_target(kind, order)
+        self._controller.arm.order([order])
+        if self._registers.ints[self._offset + 1] == 1:
+            self._operating = True
+            self._report_operation(running=True)
+        else:
+            self._waiting = True
+
+    def _answer(self, word: int) -> None:
+        self._registers.put_int(self._offset, word)
+
+    def _end_operation(self) -> None:
+        if self._operating:
+            self._operating = False
+            self._report_operation(running=False)
+
+    def _report_operation(self, *, running: bool) -> None:
+        """Writes the state of the asynchronous operation; `running` starts a new one."""
+        self._writes = (self._writes + 1) % 128
+        self._operation = (self._operation + running) % 128
+        word = self._writes << 16 | self._operation << 24 | RUNNING_BIT * running
+        self._registers.put_int(self._offset + 2, word)
 
 
-class StatusBits(IntFlag):
-    """`robot_status_bits`."""
+class _ScriptProgram:
+    """Any other program: executes its linear moves in order, then ends."""
 
-    POWER_ON = 1 << 0
-    PROGRAM_RUNNING = 1 << 1
+    def __init__(self, controller: EmulatedController, text: str) -> None:
+        self._controller = controller
+        moves = parse_moves(text)
+        for move in moves:
+            controller.record_target("script", move)
+        controller.arm.order(moves)
 
-
-BITS = {
-    SafetyMode.NORMAL: SafetyBits.NORMAL,
-    SafetyMode.PROTECTIVE_STOP: SafetyBits.PROTECTIVE_STOPPED | SafetyBits.STOPPED_DUE_TO_SAFETY,
-    SafetyMode.SAFEGUARD_STOP: SafetyBits.SAFEGUARD_STOPPED | SafetyBits.STOPPED_DUE_TO_SAFETY,
-    SafetyMode.ROBOT_EMERGENCY_STOP: SafetyBits.ROBOT_EMERGENCY_STOPPED
-    | SafetyBits.EMERGENCY_STOPPED
-    | SafetyBits.STOPPED_DUE_TO_SAFETY,
-}
+    def step(self) -> bool:
+        """Runs one control step; False when the program has ended."""
+        return self._controller.arm.busy

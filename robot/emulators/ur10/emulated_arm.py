@@ -1,29 +1,189 @@
-"""The emulated arm: executes orders in control steps; walls push its tool."""
+"""The emulated arm: straight moves and stops as motions in control steps, and walls that push its tool.
+
+A motion is a value: its `advance` gives the arm's state after a time step and the rest of the motion. Moves
+are also read from URScript text.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from robot.emulators.ur10 import motion as motions
-from robot.emulators.ur10.emulator_config import UrEmulatorConfig, WallConfig
-from robot.emulators.ur10.kinematics import UR10, UR10E, Vector6
-from robot.emulators.ur10.motion import (
-    ZERO,
-    ArmModel,
-    LinearMotion,
-    Motion,
-    MotionState,
-    MoveL,
-    MoveOrder,
-    StopL,
-    ToolSpeedMotion,
-    Unreachable,
-    start_motion,
+from robot.emulators.ur10.emulator_config import UrEmulatorConfig
+from robot.emulators.ur10.kinematics import (
+    UR10,
+    UR10E,
+    Geometry,
+    Vector6,
+    compose_poses,
+    invert_pose,
+    rotate_by,
+    rotation_between,
 )
 
+ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NEAR: Vector6 = (0.0, -1.6, -1.6, -1.6, 1.57, 0.0)  # posture at the start, rad: elbow up, tool down
+SMALL = 1e-9  # least speed and acceleration; the client accepts 0, at which a move never ends
+
+
+class Unreachable(ValueError):
+    """No joint solution for a pose."""
+
+
+class _MotionState(NamedTuple):
+    """State of the arm.
+
+    Attributes:
+        tcp: [6] tool pose in the base frame, m and rotation vector rad. speed: [6] tool speed, m/s and rad/s.
+        joints: [6] rad. joint_speed: [6] rad/s.
+    """
+
+    tcp: Vector6
+    speed: Vector6
+    joints: Vector6
+    joint_speed: Vector6
+
+
+class _ArmModel(NamedTuple):
+    """The arm's lengths, and the tool's pose in the flange with its inverse."""
+
+    geometry: Geometry
+    tool: Vector6 = ZERO
+    tool_back: Vector6 = ZERO
+
+    def with_tool(self, tool: Vector6) -> _ArmModel:
+        return _ArmModel(self.geometry, tool, invert_pose(tool))
+
+    def forward(self, joints: Sequence[float]) -> Vector6:
+        return compose_poses(self.geometry.forward(joints), self.tool)
+
+    def backward(self, tcp: Sequence[float], near: Sequence[float]) -> Vector6:
+        joints = self.geometry.backward(compose_poses(tcp, self.tool_back), near)
+        if joints is None:
+            raise Unreachable(f"no joints for {[round(number, 4) for number in tcp]}")
+        return joints
+
+    def move_tool(self, state: _MotionState, tcp: Vector6, speed: Vector6, dt: float) -> _MotionState:
+        """The arm's state `dt` s later, with the tool at `tcp`. Raises `Unreachable`."""
+        joints = self.backward(tcp, state.joints)
+        turned = [after - before for after, before in zip(joints, state.joints, strict=True)]
+        return _MotionState(tcp, speed, joints, _scale(turned, 1 / dt))
+
+
+class Profile(NamedTuple):
+    """Trapezoidal speed profile from rest to rest over a length (m or rad)."""
+
+    length: float
+    speed: float
+    acceleration: float
+
+    @property
+    def ramp(self) -> float:
+        """Duration of acceleration, and of deceleration, s."""
+        return min(self.speed / self.acceleration, math.sqrt(self.length / self.acceleration))
+
+    @property
+    def duration(self) -> float:
+        """Duration, s."""
+        ramp = self.ramp
+        return ramp + self.length / (ramp * self.acceleration) if self.length > 0 else 0.0
+
+    def at(self, time: float) -> tuple[float, float]:
+        """Covered length and speed at a time, s."""
+        ramp, duration = self.ramp, self.duration
+        if time >= duration:
+            return self.length, 0.0
+        top = ramp * self.acceleration
+        if time < ramp:
+            return self.acceleration * time * time / 2, self.acceleration * time
+        if time < duration - ramp:
+            return top * (time - ramp / 2), top
+        left = duration - time
+        return self.length - self.acceleration * left * left / 2, self.acceleration * left
+
+
+class _LinearMotion(NamedTuple):
+    """A straight move of the tool to a pose; its rotation is proportional to the distance."""
+
+    start: Vector6
+    way: Vector6  # translation m and rotation vector rad, in the base frame
+    profile: Profile
+    time: float = 0.0
+
+    def advance(
+        self, model: _ArmModel, state: _MotionState, dt: float
+    ) -> tuple[_MotionState, _LinearMotion | None]:
+        time = self.time + dt
+        done, rate = self.profile.at(time)
+        length = self.profile.length or 1.0
+        x, y, z, rx, ry, rz = (done / length * number for number in self.way)
+        start = self.start
+        tcp = (start[0] + x, start[1] + y, start[2] + z, *rotate_by(start, (rx, ry, rz)))
+        speed = _scale(self.way, rate / length)
+        after = model.move_tool(state, tcp, speed, dt)
+        return after, None if time >= self.profile.duration else self._replace(time=time)
+
+
+def _scale(vector: Sequence[float], scale: float) -> Vector6:
+    a, b, c, d, e, f = (x * scale for x in vector)
+    return a, b, c, d, e, f
+
+
+class MoveL(NamedTuple):
+    """A straight move to a tool pose, with speed in m/s and acceleration in m/s^2."""
+
+    goal: Vector6
+    speed: float
+    acceleration: float
+
+
+class StopL(NamedTuple):
+    """A stop of the tool, with deceleration in m/s^2; it is its own motion."""
+
+    acceleration: float
+
+    def advance(
+        self, model: _ArmModel, state: _MotionState, dt: float, turn_ratio: float
+    ) -> tuple[_MotionState, StopL | None]:
+        """Slows translation and rotation down; `turn_ratio` (rad/m) relates their decelerations."""
+        slowed: list[float] = []
+        step = self.acceleration * dt
+        for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
+            length = math.hypot(*now)
+            slowed += [0.0 if length <= most else v - v * most / length for v in now]
+        x, y, z, rx, ry, rz = slowed
+        tcp = (
+            state.tcp[0] + x * dt,
+            state.tcp[1] + y * dt,
+            state.tcp[2] + z * dt,
+            *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
+        )
+        speed = (x, y, z, rx, ry, rz)
+        return model.move_tool(state, tcp, speed, dt), self if any(speed) else None
+
+
+MoveOrder = MoveL | StopL
+
+
+_MOVE = re.compile(r"^\s*movel\(p\[(?P<pose>[^]]*)\](?P<limits>[^)]*)\)\s*$")
+_LIMIT = re.compile(r"\b([av])\s*=\s*([-+.\deE]+)")
+
+
+def parse_moves(text: str) -> list[MoveL]:
+    """The lines `movel(p[...], a=..., v=...)` of URScript text; all other lines are ignored."""
+    moves = []
+    for match in filter(None, map(_MOVE.match, text.splitlines())):
+        with contextlib.suppress(ValueError):  # not numbers: the line is ignored
+            x, y, z, rx, ry, rz = map(float, match["pose"].split(","))
+            limits = {"a": 1.2, "v": 0.25} | {
+                name: float(value) for name, value in _LIMIT.findall(match["limits"])
+            }
+            moves.append(MoveL((x, y, z, rx, ry, rz), limits["v"], limits["a"]))
+    return moves
 
 
 class EmulatedArm:
@@ -31,21 +191,21 @@ class EmulatedArm:
 
     Attributes:
         state: joints and tool. force: [6] at the tool in the base frame, N and Nm. penetration_max: largest
-        depth in a wall, m. scale: speed slider, 0 to 1.
+            depth in a wall, m. scale: speed slider, 0 to 1.
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.model: ArmModel = ArmModel(UR10 if config.version.major < 5 else UR10E)
+        self.model: _ArmModel = _ArmModel(UR10 if config.version[0] < 5 else UR10E)
         self.walls = list(config.walls)
         self.turn_ratio = config.turn_ratio
         self.scale = 1.0
         self.force: Vector6 = ZERO
         self.penetration_max = 0.0
-        self._motion: Motion | None = None
+        self._motion: _LinearMotion | StopL | None = None
         self._order: MoveOrder | None = None
         self._queue: deque[MoveOrder] = deque()
         tcp = config.start
-        self.state: MotionState = MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
+        self.state: _MotionState = _MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
         self._update_force()
 
     @property
@@ -64,7 +224,7 @@ class EmulatedArm:
 
     def place(self, tcp: Vector6) -> None:
         """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
-        self.state = MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
+        self.state = _MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
         self._update_force()
@@ -85,14 +245,14 @@ class EmulatedArm:
         """Drops all orders and stops with a deceleration, m/s^2."""
         self._queue.clear()
         self._order = None
-        self._motion = ToolSpeedMotion(ZERO, acceleration, self.turn_ratio) if self.moving else None
+        self._motion = StopL(acceleration) if self.moving else None
 
     def step(self, dt: float) -> None:
         """Advances by a control step, s. Raises `Unreachable` and stops at once if the pose has no joints."""
         try:
             while self._motion is None and self._queue:
                 self._order = self._queue.popleft()
-                self._motion = start_motion(self._order, self.model, self.state, self.turn_ratio)
+                self._motion = self._start(self._order)
             if self._motion is not None:
                 self._advance(dt)
         except Unreachable:
@@ -102,15 +262,38 @@ class EmulatedArm:
             raise
         self._update_force()
 
+    def _start(self, order: MoveOrder) -> _LinearMotion | StopL | None:
+        """The motion that executes an order; None if the tool is at the goal already.
+
+        Raises:
+            Unreachable: no joint solution for the goal.
+        """
+        state, ratio, acceleration = self.state, self.turn_ratio, max(order.acceleration, SMALL)
+        if isinstance(order, StopL):
+            return StopL(acceleration)
+        self.model.backward(order.goal, state.joints)
+        speed = max(order.speed, SMALL)
+        x, y, z = (g - s for g, s in zip(order.goal[:3], state.tcp[:3], strict=True))
+        way = (x, y, z, *rotation_between(state.tcp, order.goal))
+        # The slower of translation and rotation sets the duration.
+        straight = Profile(math.hypot(*way[:3]), speed, acceleration)
+        turning = Profile(math.hypot(*way[3:]), speed * ratio, acceleration * ratio)
+        slower = max(straight, turning, key=lambda profile: profile.duration)
+        return _LinearMotion(state.tcp, way, slower) if slower.length > 0 else None
+
     def _advance(self, dt: float) -> None:
-        assert self._motion is not None
-        scale = self.scale if isinstance(self._motion, LinearMotion) else 1.0
+        motion = self._motion
+        assert motion is not None
+        scale = 1.0 if isinstance(motion, StopL) else self.scale
         if scale <= 0:
             self._rest()
             return
-        state, self._motion = self._motion.advance(self.model, self.state, dt * scale)
+        if isinstance(motion, StopL):
+            state, self._motion = motion.advance(self.model, self.state, dt, self.turn_ratio)
+        else:
+            state, self._motion = motion.advance(self.model, self.state, dt * scale)
         if scale != 1.0:
-            speed, rate = motions.scale(state.speed, scale), motions.scale(state.joint_speed, scale)
+            speed, rate = _scale(state.speed, scale), _scale(state.joint_speed, scale)
             state = state._replace(speed=speed, joint_speed=rate)
         self.state = state
         if self._motion is None:
@@ -121,27 +304,10 @@ class EmulatedArm:
         self.state = self.state._replace(speed=ZERO, joint_speed=ZERO)
 
     def _update_force(self) -> None:
-        if not self.walls:
-            self.force = ZERO
-            return
-        self.force = wall_force(self.walls, self.state.tcp)
-        deepest = max(penetration(wall, self.state.tcp) for wall in self.walls)
-        self.penetration_max = max(self.penetration_max, deepest)
-
-
-def penetration(wall: WallConfig, tcp: Vector6) -> float:
-    """Depth of the tool in a wall, m; 0 outside."""
-    return max(0.0, wall.solid * (tcp["xyz".index(wall.axis)] - wall.at))
-
-
-def wall_force(walls: Iterable[WallConfig], tcp: Vector6) -> Vector6:
-    """Force [6] of the walls on the tool, N: linear springs."""
-    force = [0.0, 0.0, 0.0]
-    for wall in walls:
-        force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * penetration(wall, tcp)
-    return force[0], force[1], force[2], 0.0, 0.0, 0.0
-
-
-def force_magnitude(force: Vector6) -> float:
-    """Magnitude of a force, N."""
-    return math.hypot(*force[:3])
+        """Walls are linear springs."""
+        depths = [wall.depth(self.state.tcp) for wall in self.walls]
+        force = [0.0, 0.0, 0.0]
+        for wall, depth in zip(self.walls, depths, strict=True):
+            force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * depth
+        self.force = (force[0], force[1], force[2], 0.0, 0.0, 0.0)
+        self.penetration_max = max([self.penetration_max, *depths])

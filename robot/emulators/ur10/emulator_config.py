@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
@@ -25,13 +25,9 @@ class WallConfig(Settings):
     stiffness: PositiveFloat = 5000.0
     """Force by penetration, N/m."""
 
-
-class Version(NamedTuple):
-    """Version of PolyScope and of the controller."""
-
-    major: int
-    minor: int
-    bugfix: int = 0
+    def depth(self, tcp: Vector6) -> float:
+        """Depth of the tool in the wall, m; 0 outside."""
+        return max(0.0, self.solid * (tcp["xyz".index(self.axis)] - self.at))
 
 
 class UrEmulatorConfig(Settings):
@@ -65,7 +61,8 @@ class UrEmulatorConfig(Settings):
     """Time for which a protective stop cannot be unlocked, s."""
 
     @property
-    def version(self) -> Version:
-        """Version that the controller reports."""
+    def version(self) -> tuple[int, int, int]:
+        """Version that the controller reports: major, minor and bugfix."""
         written = self.polyscope or ("3.15.8" if self.hz == 125 else "5.11.0")
-        return Version(*map(int, written.split(".")))
+        major, minor, bugfix, *_ = *map(int, written.split(".")), 0
+        return major, minor, bugfix

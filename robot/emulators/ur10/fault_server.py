@@ -30,14 +30,13 @@ import time
 from typing import Any, Protocol
 
 from robot.drivers.ur10 import rtde_protocol
-from robot.emulators.ur10.controller import EmulatedController
+from robot.emulators.ur10.controller import EmulatedController, Value
 from robot.emulators.ur10.emulator_config import WallConfig
-from robot.emulators.ur10.registers import Value
 
 NAN: Value = (math.nan,) * 6
 
 
-class FaultyServer(Protocol):
+class _FaultyServer(Protocol):
     """What faults need of a server: its controller, the owners of its inputs, its clients of states."""
 
     controller: EmulatedController
@@ -57,7 +56,7 @@ class FaultyServer(Protocol):
 class ControllerFaults:
     """Active faults and their effect on published states."""
 
-    def __init__(self, server: FaultyServer) -> None:
+    def __init__(self, server: _FaultyServer) -> None:
         self._server = server
         self._controller = server.controller
         self._stalled_until = -math.inf
@@ -210,13 +209,13 @@ class FaultSession:
     def receive(self, data: bytes, host: float) -> bytes:
         """Executes complete lines; returns one JSON line of answer for each."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        return b"".join(json.dumps(self._answer(line)).encode() + b"\n" for line in lines if line.strip())
+        answers: list[dict[str, Any]] = []
+        for line in filter(bytes.strip, lines):
+            try:
+                answers.append(self._faults.do(json.loads(line)))
+            except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+                answers.append({"ok": False, "error": f"{type(error).__name__}: {error}"})
+        return b"".join(json.dumps(answer).encode() + b"\n" for answer in answers)
 
     def close(self) -> None:
         """Has no effect: faults stay active."""
-
-    def _answer(self, line: bytes) -> dict[str, Any]:
-        try:
-            return self._faults.do(json.loads(line))
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            return {"ok": False, "error": f"{type(error).__name__}: {error}"}

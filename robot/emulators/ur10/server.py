@@ -1,11 +1,8 @@
-"""Main loop of the emulator: control steps at absolute times, client data in between.
+"""Main loop of the emulator, control steps at absolute times with client data in between, and its sessions.
 
 One thread, no locks. Late steps are made up for, up to `BACKLOG`, so that the mean rate holds on a busy
-machine; steps later than that are skipped, and the robot's clock jumps.
-
-The dashboard port: answers each line of text with one line.
-
-Source: Universal Robots, "Dashboard Server", CB3 and e-Series.
+machine; steps later than that are skipped, and the robot's clock jumps. Sources of the sessions: Universal
+Robots, "Real-Time Data Exchange (RTDE) Guide" and "Dashboard Server", CB3 and e-Series.
 """
 
 from __future__ import annotations
@@ -23,19 +20,17 @@ from robot.drivers.processes import urgent
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.listening import listening
-from robot.emulators.ur10.control_program import load_program
-from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime
+from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime, Value
+from robot.emulators.ur10.emulated_arm import Unreachable
 from robot.emulators.ur10.emulator_config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
 from robot.emulators.ur10.fault_server import ControllerFaults, FaultSession
-from robot.emulators.ur10.motion import Unreachable
-from robot.emulators.ur10.registers import Value
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s
 PENDING = 1 << 18  # unread bytes of a client above which it gets no states
 
 
-class ClientSession(Protocol):
+class _ClientSession(Protocol):
     """State of one client of a port."""
 
     def receive(self, data: bytes, host: float) -> bytes: ...
@@ -43,10 +38,10 @@ class ClientSession(Protocol):
     def close(self) -> None: ...
 
 
-class Connection:
+class _Connection:
     """A socket with its session and its unsent bytes."""
 
-    def __init__(self, link: socket.socket, session: ClientSession) -> None:
+    def __init__(self, link: socket.socket, session: _ClientSession) -> None:
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.link = link
@@ -65,17 +60,17 @@ class Connection:
             self._pending = data
 
 
-class ControllerServer:
+class _ControllerServer:
     """Four listening ports around one controller."""
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.controller = emulated_controller(config)
+        self.controller = EmulatedController(config)
         self.claims = Claims()
         self.faults = ControllerFaults(self)
-        self.clients: list[Connection] = []
+        self.clients: list[_Connection] = []
         self._selector = selectors.SelectSelector()  # resolution 1 us; epoll has 1 ms
         self._steps = 0
-        ports: dict[int, Callable[[], ClientSession]] = {
+        ports: dict[int, Callable[[], _ClientSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
             DASHBOARD_PORT: lambda: DashboardSession(self.controller),
@@ -88,7 +83,7 @@ class ControllerServer:
             self._selector.register(listener, selectors.EVENT_READ, make_session)
 
     @property
-    def rtde(self) -> list[tuple[Connection, RtdeSession]]:
+    def rtde(self) -> list[tuple[_Connection, RtdeSession]]:
         """RTDE clients: connections and sessions."""
         return [(c, c.session) for c in self.clients if isinstance(c.session, RtdeSession)]
 
@@ -108,7 +103,7 @@ class ControllerServer:
                 self._step(now)
                 due += dt
 
-    def close(self, connection: Connection) -> None:
+    def close(self, connection: _Connection) -> None:
         """Closes a client's connection, if open."""
         if connection in self.clients:
             self.clients.remove(connection)
@@ -127,8 +122,14 @@ class ControllerServer:
                 self.send(connection, session.state(overrides))
 
     def _serve(self, key: selectors.SelectorKey) -> None:
-        if not isinstance(key.data, Connection):
-            self._accept(key)
+        if not isinstance(key.data, _Connection):
+            assert isinstance(key.fileobj, socket.socket)
+            with contextlib.suppress(OSError):
+                joined = _Connection(key.fileobj.accept()[0], key.data())
+                self.clients.append(joined)
+                self._selector.register(joined.link, selectors.EVENT_READ, joined)
+                if isinstance(joined.session, DashboardSession):
+                    self.send(joined, WELCOME)
             return
         connection = key.data
         if connection not in self.clients:
@@ -148,26 +149,12 @@ class ControllerServer:
         elif reply:
             self.send(connection, reply)
 
-    def _accept(self, key: selectors.SelectorKey) -> None:
-        assert isinstance(key.fileobj, socket.socket)
-        with contextlib.suppress(OSError):
-            connection = Connection(key.fileobj.accept()[0], key.data())
-            self.clients.append(connection)
-            self._selector.register(connection.link, selectors.EVENT_READ, connection)
-            if isinstance(connection.session, DashboardSession):
-                self.send(connection, WELCOME)
-
-    def send(self, connection: Connection, data: bytes) -> None:
+    def send(self, connection: _Connection, data: bytes) -> None:
         """Sends to a client; closes the connection if that fails."""
         try:
             connection.send(data)
         except OSError:
             self.close(connection)
-
-
-def emulated_controller(config: UrEmulatorConfig) -> EmulatedController:
-    """A controller that runs the control program of ur_rtde."""
-    return EmulatedController(config, load_program)
 
 
 def serve(config: UrEmulatorConfig) -> None:
@@ -177,7 +164,7 @@ def serve(config: UrEmulatorConfig) -> None:
         InputError: the arm cannot reach its start pose, or the address cannot be used.
     """
     try:
-        server = ControllerServer(config)
+        server = _ControllerServer(config)
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
     with urgent():
@@ -215,7 +202,13 @@ class ScriptSession:
 
 
 WELCOME = b"Connected: Universal Robots Dashboard Server\n"
-SINCE_5_6 = ("is in remote control", "get serial number")
+LOCKED = "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
+POWER = {
+    "power on": (RobotMode.IDLE, "Powering on"),
+    "brake release": (RobotMode.RUNNING, "Brake releasing"),
+    "power off": (RobotMode.POWER_OFF, "Powering off"),
+}
+"""Power mode and answer of a command of the dashboard."""
 
 
 class DashboardSession:
@@ -228,54 +221,35 @@ class DashboardSession:
     def receive(self, data: bytes, host: float) -> bytes:
         """Executes complete lines; returns one line of answer for each."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        return b"".join(
-            f"{answer_command(self._controller, line.decode().strip())}\n".encode() for line in lines
-        )
+        return b"".join(f"{self._answer(line.decode().strip())}\n".encode() for line in lines)
 
     def close(self) -> None:
         """Has no effect."""
 
-
-def answer_command(controller: EmulatedController, command: str) -> str:
-    """Executes a command; returns the answer."""
-    do = _COMMANDS.get(command.lower())
-    if do is None or (command.lower() in SINCE_5_6 and controller.config.version < (5, 6)):
-        return f"could not understand: '{command}'"
-    return do(controller)
-
-
-def _stop(controller: EmulatedController) -> str:
-    controller.stop_program()
-    return "Stopped"
-
-
-def _unlock(controller: EmulatedController) -> str:
-    if controller.unlock():
-        return "Protective stop releasing"
-    return "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
-
-
-def _power(mode: RobotMode, answer: str) -> Callable[[EmulatedController], str]:
-    def do(controller: EmulatedController) -> str:
-        controller.power(mode)
-        return answer
-
-    return do
-
-
-_COMMANDS: dict[str, Callable[[EmulatedController], str]] = {
-    "stop": _stop,
-    "unlock protective stop": _unlock,
-    "power on": _power(RobotMode.IDLE, "Powering on"),
-    "brake release": _power(RobotMode.RUNNING, "Brake releasing"),
-    "power off": _power(RobotMode.POWER_OFF, "Powering off"),
-    "robotmode": lambda c: f"Robotmode: {c.robot_mode.name}",
-    "is in remote control": lambda c: str(c.remote).lower(),
-    "get serial number": lambda c: "20163000000",
-    "safetymode": lambda c: f"Safetymode: {c.safety.name}",
-    "running": lambda c: f"Program running: {str(c.runtime is Runtime.PLAYING).lower()}",
-    "polyscopeversion": lambda c: "URSoftware {}.{}.{}.0 (emulated)".format(*c.config.version),
-}
+    def _answer(self, command: str) -> str:
+        """Executes a command; returns the answer."""
+        controller, name = self._controller, command.lower()
+        power = POWER.get(name)
+        if power is not None:
+            controller.power(power[0])
+            return power[1]
+        if name == "stop":
+            controller.stop_program()
+            return "Stopped"
+        if name == "unlock protective stop":
+            return "Protective stop releasing" if controller.unlock() else LOCKED
+        answers = {
+            "robotmode": f"Robotmode: {controller.robot_mode.name}",
+            "safetymode": f"Safetymode: {controller.safety.name}",
+            "running": f"Program running: {str(controller.runtime is Runtime.PLAYING).lower()}",
+            "polyscopeversion": "URSoftware {}.{}.{}.0 (emulated)".format(*controller.config.version),
+        }
+        if controller.config.version >= (5, 6):
+            answers |= {
+                "is in remote control": str(controller.remote).lower(),
+                "get serial number": "20163000000",
+            }
+        return answers.get(name, f"could not understand: '{command}'")
 
 
 class Claims:
@@ -299,7 +273,7 @@ class Claims:
 
 
 class RtdeSession:
-    """Connection of one client.
+    """_Connection of one client.
 
     Args:
         controller: the emulated controller. claims: shared by all clients.
@@ -338,7 +312,7 @@ class RtdeSession:
             numbers += overrides.get(name) or fields[name]
         return rtde_protocol.pack_package(rtde_protocol.DATA, self._layout.pack(1, *numbers))
 
-    def _answer(self, package: rtde_protocol.Package, host: float) -> bytes:
+    def _answer(self, package: tuple[int, bytes], host: float) -> bytes:
         kind, body = package
         if kind == rtde_protocol.DATA:
             self._take(body, host)
@@ -359,7 +333,7 @@ class RtdeSession:
 
     def _set_outputs(self, body: bytes) -> bytes:
         (frequency,) = struct.unpack_from(">d", body)
-        names = split(body[8:])
+        names = _split(body[8:])
         hz = self._controller.config.hz
         self.every = max(1, round(hz / frequency)) if 0 < frequency <= hz else 1
         types = [rtde_protocol.OUTPUT_TYPES.get(name, "NOT_FOUND") for name in names]
@@ -369,7 +343,7 @@ class RtdeSession:
         return bytes([known]) + ",".join(types).encode()
 
     def _set_inputs(self, body: bytes) -> bytes:
-        names = split(body)
+        names = _split(body)
         types = [rtde_protocol.INPUT_TYPES.get(name, "NOT_FOUND") for name in names]
         types = [
             kind if self._claims.free(name, self) else "IN_USE"
@@ -398,6 +372,6 @@ class RtdeSession:
             first += length
 
 
-def split(names: bytes) -> list[str]:
+def _split(names: bytes) -> list[str]:
     """Names in a comma-separated list; a trailing comma is allowed."""
     return [name for name in names.decode("ascii", "replace").split(",") if name]

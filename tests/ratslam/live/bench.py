@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import HEAD_FAULTS, PATIENCE, Faults, emulator, until, ur_emulator
 from tests.ratslam.live.forked_process import raise_priority
@@ -21,7 +21,7 @@ from tests.ratslam.live.server_process import SessionServer
 
 LEGS = tuple((0.63 + 0.07 * x, 0.45 + 0.02 * (x % 2), 0.0) for x in (0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0))
 """Route of quick sessions: legs of 1.6 s."""
-START = tcp_from_pose(BaseTransformConfig(), np.array(LEGS[0]), 0.005)
+START = BaseTransformConfig().tcp_from_pose(np.array(LEGS[0]), 0.005)
 HIGH = BaseTransformConfig(z=BaseTransformConfig().z - 0.3)
 """Pose of the map for the emulated head in quick sessions, too low for its whiskers to touch walls."""
 

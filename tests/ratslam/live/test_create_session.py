@@ -13,8 +13,8 @@ import pytest
 
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config
-from robot.live.create_selftest import check_create
 from robot.live.live_config import LiveConfig
+from robot.live.selftest import check_create
 from robot.recordings.mcap_reader import Recording
 from tactile.base.errors import InputError
 from tactile.base.types import MotionKind, StepEnd

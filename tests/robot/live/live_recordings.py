@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.head.decoder import Frames, assemble_cycle, make_cut
+from robot.drivers.head.decoder import Cut, Frames, assemble_cycle
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
@@ -87,7 +87,7 @@ def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames, np.ndarra
                 ]
             )
         mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-        cut = make_cut(k, START + k + 0.25, START + k, mine, motion_of_whisk(k), seen=k != 1)
+        cut = Cut.of(k, START + k + 0.25, START + k, mine, motion_of_whisk(k), seen=k != 1)
         recorder.add_whisk(cut, mine, np.array([0.01 * k, 0.0, 0.05 * k]) if k != 2 else None)
         cycles.append(assemble_cycle(mine, cut))
     recorder.add_event(START + whisks, "dropped", "1 image")

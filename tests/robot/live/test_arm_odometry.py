@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.ur10.driver_config import tcp_from_pose
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmOdometry
 from robot.simulation.head.odometry_errors import OdometryConfig
@@ -23,7 +22,7 @@ def arc(config: LiveConfig, seconds: float, speed: float, turn: float) -> tuple[
     step = np.stack([np.cos(heading), np.sin(heading)], axis=1) * speed / HZ
     place = np.array([0.2, 0.4]) + np.concatenate([np.zeros((1, 2)), np.cumsum(step[:-1], axis=0)])
     pose = np.column_stack([place, heading])
-    tcp = tcp_from_pose(config.arm.placing, pose)
+    tcp = config.arm.placing.tcp_from_pose(pose)
     rate = np.zeros((len(time), 6))
     rate[:, :3] = np.gradient(tcp[:, :3], 1 / HZ, axis=0)
     rate[:, 5] = turn

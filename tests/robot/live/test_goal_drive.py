@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.goal_drive import MOVED, ContactMap, DriveState, GoalDrive, GoalRoute, PlannedWay, Sighting
+from robot.live.goal_drive import MOVED, ContactMap, DriveState, GoalDrive, GoalRoute, PlannedWay
 from robot.live.live_config import GoalConfig, LiveConfig
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
@@ -50,66 +50,66 @@ def drive_on(*ways: PlannedWay) -> tuple[GoalDrive, StubPlanner]:
     return GoalDrive(CONFIG, planner, 0.05, 2), planner
 
 
-def at(x, y, heading=0.0, points=FREE) -> Sighting:
-    return Sighting(np.array([x, y, heading]), np.asarray(points, float))
+def at(x, y, heading=0.0, points=FREE) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([x, y, heading]), np.asarray(points, float)
 
 
 def test_legs_are_driven_one_after_the_other_with_turns_on_the_spot():
     drive, _ = drive_on()
-    assert drive.observe(at(0.0, 0.0)) is DriveState.DRIVING
+    assert drive.observe(*at(0.0, 0.0)) is DriveState.DRIVING
     assert np.allclose(drive.target, [0.2, 0.0, 0.0])
-    drive.observe(at(0.199, 0.0))
+    drive.observe(*at(0.199, 0.0))
     assert np.allclose(drive.target, [0.199, 0.0, np.pi / 2])
-    drive.observe(at(0.2, 0.0, 1.55))
+    drive.observe(*at(0.2, 0.0, 1.55))
     assert np.allclose(drive.target, [0.2, 0.2, 1.55]), "small errors of heading are left alone"
-    assert drive.observe(at(0.2, 0.19, 1.55)) is DriveState.REACHED
+    assert drive.observe(*at(0.2, 0.19, 1.55)) is DriveState.REACHED
     assert drive.target is None
     assert not drive.finished, "there is another goal"
     drive.next_goal()
-    assert drive.observe(at(0.2, 0.19, 1.55)) is not DriveState.BLOCKED
+    assert drive.observe(*at(0.2, 0.19, 1.55)) is not DriveState.BLOCKED
 
 
 def test_a_contact_ahead_stops_at_once_and_blocks_when_confirmed():
     ahead, beside = [[0.15, 0.02]], [[0.15, 0.08]]
     drive, planner = drive_on(PlannedWay(WAY), PlannedWay(None, DriveState.BLOCKED, "no other way"))
-    assert drive.observe(at(0.0, 0.0, points=beside)) is DriveState.DRIVING
-    assert drive.observe(at(0.02, 0.0, points=ahead)) is DriveState.WAITING
+    assert drive.observe(*at(0.0, 0.0, points=beside)) is DriveState.DRIVING
+    assert drive.observe(*at(0.02, 0.0, points=ahead)) is DriveState.WAITING
     assert drive.target is None
-    assert drive.observe(at(0.02, 0.0)) is DriveState.DRIVING, "a single contact is not confirmed"
-    drive.observe(at(0.02, 0.0, points=ahead))
-    assert drive.observe(at(0.02, 0.0, points=ahead)) is DriveState.BLOCKED
+    assert drive.observe(*at(0.02, 0.0)) is DriveState.DRIVING, "a single contact is not confirmed"
+    drive.observe(*at(0.02, 0.0, points=ahead))
+    assert drive.observe(*at(0.02, 0.0, points=ahead)) is DriveState.BLOCKED
     assert drive.finished
     assert np.allclose(planner.asked[-1][2], ahead)
-    assert drive.observe(at(0.02, 0.0)) is DriveState.BLOCKED, "an end is final"
+    assert drive.observe(*at(0.02, 0.0)) is DriveState.BLOCKED, "an end is final"
 
 
 def test_a_new_way_is_driven_and_their_number_is_limited():
     drive, _ = drive_on()
-    states = [drive.observe(at(0.02, 0.0, points=[[0.15, 0.0]])) for _ in range(6)]
+    states = [drive.observe(*at(0.02, 0.0, points=[[0.15, 0.0]])) for _ in range(6)]
     assert states == [DriveState.WAITING, DriveState.DRIVING] * 2 + [DriveState.WAITING, DriveState.BLOCKED]
     assert drive.replans == CONFIG.replans
 
 
 def test_without_estimates_the_robot_rests_and_is_lost_in_the_end():
     drive, _ = drive_on()
-    drive.observe(at(0.0, 0.0))
+    drive.observe(*at(0.0, 0.0))
     for _ in range(CONFIG.patience):
-        assert drive.observe(Sighting(None, FREE)) is DriveState.WAITING
+        assert drive.observe(None, FREE) is DriveState.WAITING
         assert drive.target is None
-    assert drive.observe(Sighting(None, FREE)) is DriveState.LOST
+    assert drive.observe(None, FREE) is DriveState.LOST
     off_map = PlannedWay(None, DriveState.LOST, "no experience near")
     drive, _ = drive_on(off_map)
-    ends = [drive.observe(at(5.0, 5.0)) for _ in range(CONFIG.patience + 1)]
+    ends = [drive.observe(*at(5.0, 5.0)) for _ in range(CONFIG.patience + 1)]
     assert ends[-1] is DriveState.LOST
     assert DriveState.LOST not in ends[:-1]
 
 
 def test_a_robot_that_is_elsewhere_gets_a_new_way():
     drive, planner = drive_on()
-    drive.observe(at(0.0, 0.0))
-    drive.observe(at(0.1, drive.off_way - 0.01))
+    drive.observe(*at(0.0, 0.0))
+    drive.observe(*at(0.1, drive.off_way - 0.01))
     assert len(planner.asked) == 1
-    drive.observe(at(0.1, drive.off_way + 0.01))
+    drive.observe(*at(0.1, drive.off_way + 0.01))
     assert len(planner.asked) == 2
 
 
@@ -166,12 +166,12 @@ def test_a_refused_target_blocks_the_way_there():
 
 def test_a_goal_is_reached_only_by_a_sure_pose():
     drive, _ = drive_on()
-    here = at(0.2, 0.2, np.pi / 2)._replace(sure=False)
-    drive.observe(here)
+    here = np.array([0.2, 0.2, np.pi / 2])
+    drive.observe(here, FREE, sure=False)
     ends = []
     for _ in range(200):
-        pose = drive.target if drive.target is not None else here.pose
-        ends.append(drive.observe(Sighting(pose, FREE, sure=False)))
+        pose = drive.target if drive.target is not None else here
+        ends.append(drive.observe(pose, FREE, sure=False))
         if drive.finished:
             break
     assert drive.state is DriveState.LOST

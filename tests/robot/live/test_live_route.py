@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.drivers.ur10.driver_config import pose_from_tcp
 from robot.live.arm_route import approach_route, descent_route, main_route, plan_path
 from robot.live.live_config import LiveConfig
 from robot.world.scene import make_scene, poses_at
@@ -62,12 +61,12 @@ def test_the_path_is_that_of_the_simulated_session():
     plan, path = config.plan, plan_path(config, HEAD)
     scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
     assert np.array_equal(path.pose, poses_at(scene.path, path.time))
-    pose, lift = pose_from_tcp(config.arm.placing, main_route(config, path).targets)
+    pose, lift = config.arm.placing.pose_from_tcp(main_route(config, path).targets)
     assert np.allclose(pose[:, :2], path.pose[1:, :2])
     assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)
     assert np.allclose(lift, 0.0)
     for route, height in ((approach_route(config, path), config.lift), (descent_route(config, path), 0.0)):
-        pose, lift = pose_from_tcp(config.arm.placing, route.targets)
+        pose, lift = config.arm.placing.pose_from_tcp(route.targets)
         assert np.allclose(pose[0, :2], path.pose[0, :2])
         assert np.allclose(lift, height)
 

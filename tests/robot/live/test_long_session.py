@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from robot.drivers.head.decoder import make_cut
-from robot.drivers.ur10.driver_config import tcp_from_pose
+from robot.drivers.head.decoder import Cut
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmOdometry
 from robot.simulation.head.odometry_errors import OdometryConfig
@@ -56,13 +55,13 @@ def work_of_blocks(path: Path, whisks: int, block: int, kind: str) -> list[Work]
         begin = START + k
         pose = np.column_stack([0.02 * np.sin(k + time), 0.02 * np.cos(k + time), 0.1 * (k + time)])
         speed = np.full((HZ, 6), 0.02)
-        odometer.add(begin + time, tcp_from_pose(config.arm.placing, pose), speed)
+        odometer.add(begin + time, config.arm.placing.tcp_from_pose(pose), speed)
         states["host"] = begin + time
         recorder.add_states(states)
         mine = frames._replace(sequence=frames.sequence + k * RATE, time=frames.time + k * 1_000_000)
         recorder.add_frames(mine, begin + 1.0)
         odometry, truth = odometer.step(float(k), begin + 0.5)
-        recorder.add_whisk(make_cut(k, begin + 0.5, begin, mine, odometry), mine, truth)
+        recorder.add_whisk(Cut.of(k, begin + 0.5, begin, mine, odometry), mine, truth)
 
     found = []
     with recorder:

@@ -15,16 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.decoder import (
-    MAX_FRAMES,
-    Cut,
-    Frames,
-    FrameWindow,
-    assemble_cycle,
-    empty_frames,
-    make_cut,
-    select_frames,
-)
+from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, assemble_cycle, empty_frames
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr import (
@@ -82,7 +73,7 @@ def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
 
 def test_a_whisk_is_assembled_from_its_frames() -> None:
     frames = some_frames(10, first=90)
-    cycle = assemble_cycle(frames, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0)))
+    cycle = assemble_cycle(frames, Cut.of(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0)))
     np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
     np.testing.assert_allclose(cycle.angle, frames.values[2:7, :, 0] * np.pi / 32768)
     np.testing.assert_allclose(cycle.deflection, frames.values[2:7, :, 1:] * np.pi / 32768)
@@ -90,7 +81,7 @@ def test_a_whisk_is_assembled_from_its_frames() -> None:
     assert all(part.flags.c_contiguous for part in cycle[:3])
     mixed = rows(frames, np.random.default_rng(0).permutation(10))
     assert same_bits(
-        assemble_cycle(mixed, make_cut(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0))), cycle
+        assemble_cycle(mixed, Cut.of(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0))), cycle
     )
 
 
@@ -111,8 +102,8 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
             block = rows(came, slice(at, at + step))
             ahead = rows(came, slice(0, at + step))  # the ring buffer has frames before the recorder
             first = int(frames.sequence[0]) + data.draw(st.integers(-5, 120)) if count else 0
-            mine = select_frames(ahead, first, first + data.draw(st.integers(0, 60)))
-            cut = make_cut(
+            mine = ahead.select(first, first + data.draw(st.integers(0, 60)))
+            cut = Cut.of(
                 len(cycles), START + at, START, mine, motion_of_whisk(at), seen=data.draw(st.booleans())
             )
             early = data.draw(st.booleans())
@@ -143,7 +134,7 @@ def test_blocks_round_trip(count: int, seed: int, first: int) -> None:
     assert at == states["host"][-1]
     assert again.dtype == ARM_STATE
     assert all((again[name] == states[name]).all() for name in ARM_STATE.names or ())
-    cut = make_cut(count, 1.5, 1.0, frames, motion_of_whisk(seed))
+    cut = Cut.of(count, 1.5, 1.0, frames, motion_of_whisk(seed))
     assert same_bits(decode_cut(encode_cut(cut)), cut)
     assert cut.seen == (count > 0)
     event = Event(0.1, "fault", "ünder: way")
@@ -156,7 +147,7 @@ def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, numbe
     decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
     good = (
         encode_frames(1.0, frames), encode_states(some_states(2)),
-        encode_cut(make_cut(0, 1.0, 1.0, frames, motion_of_whisk(0))), encode_event(Event(1.0, "a", "b")),
+        encode_cut(Cut.of(0, 1.0, 1.0, frames, motion_of_whisk(0))), encode_event(Event(1.0, "a", "b")),
     )[kind]  # fmt: skip
     place = place % len(good)
     for bad in (
@@ -190,14 +181,14 @@ def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
     assert max(late) / RATE < 0.2
     assert len(content(path, Frames)) >= 5  # in blocks, not one by one
     mine = rows(frames, slice(0, RATE))
-    recorder.add_whisk(make_cut(0, START + 1.0, START, mine, motion_of_whisk(0)), mine)
+    recorder.add_whisk(Cut.of(0, START + 1.0, START, mine, motion_of_whisk(0)), mine)
     assert McapScanner(path).__iter__().__next__().reading.angle.shape == (RATE, W)
     recorder.close()
 
 
 def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:
     frames, recorder = some_frames(20), open_recorder(tmp_path / "a.mcap")
-    cut = make_cut(0, START, START, frames, motion_of_whisk(0))
+    cut = Cut.of(0, START, START, frames, motion_of_whisk(0))
     for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
         with pytest.raises(ValueError, match="frames for a whisk"):
             recorder.add_whisk(wrong, frames)
@@ -217,7 +208,7 @@ def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
             "robot.live.recorder.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
         )
         frames = some_frames(20)
-        recorder.add_whisk(make_cut(0, START, START, frames, motion_of_whisk(0)), frames)
+        recorder.add_whisk(Cut.of(0, START, START, frames, motion_of_whisk(0)), frames)
     scanner = McapScanner(tmp_path / "a.mcap")
     assert list(scanner) == []
     assert scanner.broken == "a whisk of 21 frames, of which 20 are present"
@@ -251,7 +242,7 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     def loop() -> None:
         for k in range(4):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-            recorder.add_whisk(make_cut(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
+            recorder.add_whisk(Cut.of(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
 
     threads = [threading.Thread(target=target) for target in (head, arm, loop)]
     interval = sys.getswitchinterval()
@@ -290,7 +281,7 @@ def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
 
 def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     with open_recorder(tmp_path / "a.mcap") as recorder:
-        cut = make_cut(0, START, START, empty_frames(W), motion_of_whisk(0))
+        cut = Cut.of(0, START, START, empty_frames(W), motion_of_whisk(0))
         assert not cut.seen
         recorder.add_whisk(cut, empty_frames(W))
     (sample,) = Recording(tmp_path / "a.mcap")

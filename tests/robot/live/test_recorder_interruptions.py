@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.drivers.head.decoder import Frames, make_cut
+from robot.drivers.head.decoder import Cut, Frames
 from robot.drivers.outcome import SessionOutcome
 from robot.recordings.mcap_reader import Recording, recover
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner
@@ -34,7 +34,7 @@ import mmap, struct, sys
 from pathlib import Path
 import numpy as np
 from robot.drivers.head.decoder import Frames
-from robot.drivers.head.decoder import make_cut
+from robot.drivers.head.decoder import Cut
 from robot.live.recorder import LiveRecorder
 from robot.sources.source import SourceInfo
 from tactile.base.types import Odometry
@@ -54,7 +54,7 @@ while True:
         number = np.arange(20 * k - 1980, 20 * k + 20)
         mine = Frames(number, number * 500, np.zeros(2000, np.uint8), pool[number % 2000])
         motion = Odometry(0.01, 0.0, 0.0, 1.0)
-        recorder.add_whisk(make_cut(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
+        recorder.add_whisk(Cut.of(k // 100, 0.01 * k, 0.01 * k - 1, mine, motion), mine)
     k += 1
     counters[:16] = struct.pack("<qq", k, k // 100)
 """
@@ -115,7 +115,7 @@ def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path)
             recorder.add_frames(mine, START + 4 * k / RATE)
             if k % 50 == 49:
                 mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
-                recorder.add_whisk(make_cut(k, START + k, START, mine, motion_of_whisk(k)), mine)
+                recorder.add_whisk(Cut.of(k, START + k, START, mine, motion_of_whisk(k)), mine)
             sizes.append(path.stat().st_size)
         fault = recorder.fault
         recorder.add_event(START, "late", "after the fault")
@@ -143,7 +143,7 @@ def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(tmp_path: Path, 
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
             if k == 1:
                 patch.setattr(WholeChunkFile, "flush", _no_room)
-            recorder.add_whisk(make_cut(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
+            recorder.add_whisk(Cut.of(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
     assert recorder.fault is not None
     recorder.close()
     recording = Recording(path)

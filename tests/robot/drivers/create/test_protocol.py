@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver_config import CommandRefused, CreateConfig, wheel_speeds
+from robot.drivers.create.driver_config import CommandRefused, CreateConfig
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
@@ -53,7 +53,7 @@ def test_valid_replies_are_accepted(right: int, left: int, elapsed: float, bumps
     robot.touch(protocol.Bumps(bumps))
     robot.advance(elapsed)
     (reply,) = robot.receive(protocol.QUERY)
-    found = protocol.parse_reply(reply, elapsed)
+    found = protocol.SensorReply.parse(reply, elapsed)
     assert found is not None
     assert found.bumps == bumps
     assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
@@ -69,7 +69,7 @@ def test_valid_replies_are_accepted(right: int, left: int, elapsed: float, bumps
 @example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
 @example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
 def test_accepted_replies_are_possible(data: bytes, elapsed: float) -> None:
-    found = protocol.parse_reply(data, elapsed)
+    found = protocol.SensorReply.parse(data, elapsed)
     if found is not None:
         assert protocol.REPLY.pack(*found) == data
         assert found.mode in (1, 2, 3)
@@ -90,7 +90,7 @@ def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: flo
     apart = turn * config.wheel_base / 2
     fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False for NaN
     try:
-        right, left = wheel_speeds(config, forward, turn)
+        right, left = config.wheel_speeds(forward, turn)
     except CommandRefused:
         assert not fits
         return
@@ -101,6 +101,6 @@ def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: flo
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.7, 0.7))
 def test_wheel_speeds_of_forward_and_turn(forward: float, turn: float) -> None:
-    right, left = wheel_speeds(CreateConfig(), forward, turn)
+    right, left = CreateConfig().wheel_speeds(forward, turn)
     assert (right + left) / 2000 == pytest.approx(forward, abs=1e-3)
     assert (right - left) / 1000 / 0.258 == pytest.approx(turn, abs=4e-3)

@@ -9,7 +9,7 @@ import threading
 import numpy as np
 
 from robot.drivers.head.device import Disconnected, Stalled
-from robot.drivers.head.usb_protocol import CHANNELS, Command, Request, pack_frames, unpack_command
+from robot.drivers.head.usb_protocol import CHANNELS, Command, Request, pack_frames
 
 WHISKERS = 2
 
@@ -85,7 +85,7 @@ class Wire:
 
     def write(self, data: bytes) -> None:
         self.head.check()
-        command = unpack_command(data)
+        command = Command.unpack(data)
         assert command is not None
         self.head.commands.append(command)
 

@@ -9,14 +9,7 @@ from array import array
 
 import pytest
 
-from robot.drivers.head.device import (
-    Disconnected,
-    HeadIdentity,
-    Stalled,
-    UsbBridge,
-    open_bridge,
-    read_identity,
-)
+from robot.drivers.head.device import Disconnected, HeadIdentity, Stalled, UsbBridge, open_bridge
 from robot.drivers.head.driver_config import Address, HeadLinkConfig
 from robot.drivers.head.usb_protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
 from tactile.base.errors import InputError
@@ -193,8 +186,8 @@ print([name for name in ("usb", "libusb_package", "jax", "robot.emulators") if n
 
 def test_identities():
     bridge = MemoryHead(18).connect()
-    assert read_identity(bridge) == HeadIdentity("memory", "1", 18, 3, 2000.0)
+    assert HeadIdentity.read(bridge) == HeadIdentity("memory", "1", 18, 3, 2000.0)
     for wrong in (b"", b"[]", b"{}", b'{"name": 1', b'{"name":"","version":"","whiskers":null}'):
         bridge.request = lambda request, wrong=wrong: wrong
         with pytest.raises(InputError, match="identity"):
-            read_identity(bridge)
+            HeadIdentity.read(bridge)

@@ -18,11 +18,9 @@ from robot.drivers.head.usb_protocol import (
     FeedbackMode,
     frame_dtype,
     frame_values,
-    pack_command,
     pack_frames,
     to_counts,
     to_radians,
-    unpack_command,
 )
 
 NUMBERS = st.lists(st.integers(-32768, 32767), max_size=255)
@@ -40,9 +38,9 @@ def test_frame_layout():
 @given(st.sampled_from(CommandKind), st.sampled_from(FeedbackMode), st.tuples(*[FLOAT] * 5), NUMBERS)
 def test_commands_round_trip(kind, mode, drive, numbers):
     sent = Command(kind, mode, *drive, np.array(numbers, np.int16))
-    packet = pack_command(sent)
+    packet = sent.pack()
     assert len(packet) == 32 + 2 * len(numbers)
-    got = unpack_command(packet)
+    got = Command.unpack(packet)
     assert got is not None
     assert got[:-1] == sent[:-1]
     assert got.numbers.tolist() == numbers
@@ -50,23 +48,21 @@ def test_commands_round_trip(kind, mode, drive, numbers):
 
 @given(st.data())
 def test_damaged_commands_are_refused(data):
-    packet = bytearray(
-        pack_command(Command(CommandKind.DRIVE, FeedbackMode.RCP, 1, 1, 4, 0.01, 0, np.arange(18)))
-    )
+    packet = bytearray(Command(CommandKind.DRIVE, FeedbackMode.RCP, 1, 1, 4, 0.01, 0, np.arange(18)).pack())
     where = data.draw(st.integers(0, len(packet) - 1))
     packet[where] ^= data.draw(st.integers(1, 255))
-    assert unpack_command(bytes(packet)) is None
-    assert unpack_command(bytes(packet[:where])) is None
+    assert Command.unpack(bytes(packet)) is None
+    assert Command.unpack(bytes(packet[:where])) is None
 
 
 @pytest.mark.parametrize(
     ("place", "value"), [(0, b"WHK1"), (4, b"\2"), (5, b"\t"), (6, b"\2"), (7, b"\1"), (8, b"\0\0\xc0\x7f")]
 )
 def test_unknown_commands_are_refused(place, value):
-    body = bytearray(pack_command(KEEP_ALIVE)[:-4])
-    assert unpack_command(bytes(body) + struct.pack("<I", zlib.crc32(body))) is not None
+    body = bytearray(KEEP_ALIVE.pack()[:-4])
+    assert Command.unpack(bytes(body) + struct.pack("<I", zlib.crc32(body))) is not None
     body[place : place + len(value)] = value
-    assert unpack_command(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
+    assert Command.unpack(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
 
 
 @given(st.lists(st.integers(-32768, 32767), min_size=3, max_size=3))

@@ -59,7 +59,7 @@ def test_samples_reach_the_ring_and_every_listener(head, reader):
     assert reader.ring.between(0, 99).sequence.tolist() == list(range(50))
     until(lambda: sum(len(frames.sequence) for frames, _ in calls) == 50)
     assert all(began <= arrival <= time.monotonic() for _, arrival in calls)
-    assert reader.state.link == LinkState.STREAMING
+    assert reader.state == LinkState.STREAMING
     assert reader.fault is None
 
 
@@ -73,12 +73,12 @@ def test_times_are_those_of_the_device_clock(head):
 
 def test_the_stream_is_started_and_stopped(head):
     reader = HeadReader(head.connect, WHISKERS, QUICK)
-    assert reader.state.link == LinkState.CLOSED
+    assert reader.state == LinkState.CLOSED
     with reader:
         assert head.requests == [Request.IDENTITY, Request.CLOCK, Request.START]
     assert head.requests[-1] == Request.STOP
     assert (head.opened, head.closed) == (1, 1)
-    assert reader.state.link == LinkState.CLOSED
+    assert reader.state == LinkState.CLOSED
     assert reader.fault is None
 
 
@@ -144,11 +144,11 @@ def test_a_reconnected_head_gets_its_commands_again_and_new_numbers(head, reader
     head.send(0)
     until(lambda: good(reader) == 10 and len(head.commands) >= 3)
     head.unplug()
-    until(lambda: reader.state.link == LinkState.AWAY)
+    until(lambda: reader.state == LinkState.AWAY)
     assert reader.fault is None
     head.commands.clear()
     head.clock, head.plugged = 12345, True
-    until(lambda: reader.state.link != LinkState.AWAY)
+    until(lambda: reader.state != LinkState.AWAY)
     head.send(0)
     until(lambda: good(reader) == 20)
     until(lambda: len(head.commands) >= 2)
@@ -158,7 +158,7 @@ def test_a_reconnected_head_gets_its_commands_again_and_new_numbers(head, reader
     assert reader.ring.newest is not None
     assert reader.ring.newest[0] == 2**32 + 9
     assert reader.decoder.counts.restarts == 1
-    assert reader.state.link == LinkState.STREAMING
+    assert reader.state == LinkState.STREAMING
     assert reader.fault is None
 
 
@@ -171,13 +171,13 @@ def test_a_head_that_stays_disconnected_is_a_fault(head, quick_reader):
     assert quick_reader.fault.outcome == SessionOutcome.HEAD_GONE
     assert "pulled out" in quick_reader.fault.detail
     head.plugged = True
-    until(lambda: quick_reader.state.link != LinkState.AWAY)
+    until(lambda: quick_reader.state != LinkState.AWAY)
     assert quick_reader.fault.outcome == SessionOutcome.HEAD_GONE  # a fault stays
 
 
 def test_a_silent_head_is_reported_and_started_again(head, quick_reader):
     head.send(0)
-    until(lambda: quick_reader.state.link == LinkState.SILENT)
+    until(lambda: quick_reader.state == LinkState.SILENT)
     until(lambda: quick_reader.fault is not None)
     assert quick_reader.fault is not None
     assert quick_reader.fault.outcome == SessionOutcome.HEAD_SILENT
@@ -213,7 +213,7 @@ def test_a_hanging_thread_is_detected(head):
     with HeadReader(head.connect, WHISKERS, QUICK) as reader:
         reader.listeners.append(lambda frames, arrival: held.wait(5))
         head.send(0)
-        until(lambda: reader.state.link == LinkState.SILENT)
+        until(lambda: reader.state == LinkState.SILENT)
         until(lambda: reader.fault is not None)
         held.set()
 
@@ -229,7 +229,7 @@ def test_an_exception_in_the_thread_is_a_fault(head, reader, monkeypatch):
     until(lambda: reader.fault is not None)
     assert reader.fault is not None
     assert "a listener's bug" in reader.fault.detail
-    until(lambda: reader.state.link == LinkState.CLOSED)
+    until(lambda: reader.state == LinkState.CLOSED)
 
 
 def test_overload_is_reported_with_the_whisker(head):

@@ -28,7 +28,6 @@ from robot.drivers.head.usb_protocol import (
     VENDOR,
     FrameFlag,
     Request,
-    pack_command,
 )
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from tests.helpers.live import Faults, until
@@ -118,14 +117,14 @@ def test_all_frames_are_transferred(head: Faults, device: Any) -> None:
     before, earlier = head(do="counts"), head.state()["commands"]
     decoder, samples = Decoder(18, 3), 500
     start(device)
-    device.write(ENDPOINT_OUT, pack_command(drive(frequency=2000 / samples)), 30_000)
+    device.write(ENDPOINT_OUT, drive(frequency=2000 / samples).pack(), 30_000)
     parts: list[Frames] = []
     begins = np.zeros(0, int)
     while (
         len(parts) < 3 or not len(begins) or sum(len(part.flags) for part in parts) < begins[0] + 2 * samples
     ):
         parts.append(read(device, 800, decoder))
-        device.write(ENDPOINT_OUT, pack_command(KEEP_ALIVE), 30_000)
+        device.write(ENDPOINT_OUT, KEEP_ALIVE.pack(), 30_000)
         begins = np.flatnonzero(np.concatenate([part.flags for part in parts]) & FrameFlag.CYCLE)
     frames = Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     assert (np.diff(frames.sequence) == 1).all()
@@ -196,7 +195,7 @@ def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head: Faults, d
     assert find_device(head) is None
     head(do="plug")
     with pytest.raises(core.USBError) as caught:
-        device.write(ENDPOINT_OUT, pack_command(KEEP_ALIVE), 30_000)
+        device.write(ENDPOINT_OUT, KEEP_ALIVE.pack(), 30_000)
     assert caught.value.errno == errno.ENODEV
     again = until(lambda: find_device(head))
     start(again)

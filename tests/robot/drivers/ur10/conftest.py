@@ -11,11 +11,11 @@ import pytest
 
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import Dashboard
-from robot.drivers.ur10.driver_config import ArmConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import ArmConfig
 from tests.helpers.live import Faults, until, ur_emulator
 
-HOME = tcp_from_pose(ArmConfig().placing, np.array([0.63, 0.45, 0.0]))
-AWAY = tcp_from_pose(ArmConfig().placing, np.array([0.93, 0.45, 0.0]))  # 6 s away
+HOME = ArmConfig().placing.tcp_from_pose(np.array([0.63, 0.45, 0.0]))
+AWAY = ArmConfig().placing.tcp_from_pose(np.array([0.93, 0.45, 0.0]))  # 6 s away
 
 
 def settings(host: str, **others: Any) -> ArmConfig:

@@ -4,13 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.ur10.driver_config import (
-    BaseTransformConfig,
-    pose_from_tcp,
-    tcp_from_pose,
-    tcp_heading,
-    tcp_tilt,
-)
+from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_heading, tcp_tilt
 from tactile.base.se2 import between, wrap
 
 metres = st.floats(-2, 2)
@@ -21,7 +15,7 @@ placings = st.builds(BaseTransformConfig, x=metres, y=metres, z=metres, yaw_deg=
 
 @given(placings, poses, metres)
 def test_round_trip(config: BaseTransformConfig, pose: np.ndarray, lift: float) -> None:
-    back, height = pose_from_tcp(config, tcp_from_pose(config, pose, lift))
+    back, height = config.pose_from_tcp(config.tcp_from_pose(pose, lift))
     np.testing.assert_allclose(back[:2], pose[:2], atol=1e-12)
     assert abs(wrap(back[2] - pose[2])) < 1e-9
     assert -np.pi < back[2] <= np.pi
@@ -30,14 +24,14 @@ def test_round_trip(config: BaseTransformConfig, pose: np.ndarray, lift: float) 
 
 @given(placings, poses)
 def test_the_tool_points_down(config: BaseTransformConfig, pose: np.ndarray) -> None:
-    assert tcp_tilt(tcp_from_pose(config, pose)) < 1e-6
+    assert tcp_tilt(config.tcp_from_pose(pose)) < 1e-6
 
 
 @given(placings, poses, poses)
 def test_motions_in_the_map_are_motions_of_the_tool(
     config: BaseTransformConfig, a: np.ndarray, b: np.ndarray
 ) -> None:
-    tools = tcp_from_pose(config, np.stack([a, b]))
+    tools = config.tcp_from_pose(np.stack([a, b]))
     seen = np.concatenate([tools[:, :2], tcp_heading(tools)[:, None]], axis=1)
     moved, meant = between(*seen), between(a, b)
     np.testing.assert_allclose(moved[:2], meant[:2], atol=1e-9)
@@ -48,7 +42,7 @@ def test_the_rotation_is_rz_times_rx_pi() -> None:
     from scipy.spatial.transform import Rotation
 
     for heading in np.linspace(-3, 3, 13):
-        tool = tcp_from_pose(BaseTransformConfig(yaw_deg=0.0), np.array([0.1, 0.2, heading]))
+        tool = BaseTransformConfig(yaw_deg=0.0).tcp_from_pose(np.array([0.1, 0.2, heading]))
         meant = Rotation.from_euler("z", heading) * Rotation.from_euler("x", np.pi)
         np.testing.assert_allclose(Rotation.from_rotvec(tool[3:]).as_matrix(), meant.as_matrix(), atol=1e-12)
 
@@ -63,8 +57,8 @@ def test_tilt() -> None:
 
 
 def test_shapes() -> None:
-    tools = tcp_from_pose(BaseTransformConfig(), np.zeros((4, 5, 3)), np.zeros((4, 5)))
-    pose, lift = pose_from_tcp(BaseTransformConfig(), tools)
+    tools = BaseTransformConfig().tcp_from_pose(np.zeros((4, 5, 3)), np.zeros((4, 5)))
+    pose, lift = BaseTransformConfig().pose_from_tcp(tools)
     assert tools.shape == (4, 5, 6)
     assert pose.shape == (4, 5, 3)
     assert lift.shape == (4, 5)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
-from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig
 from robot.drivers.ur10.rtde_process import ArmCommand, CommandThread
-from robot.drivers.ur10.safety import MIN_SPEED, TargetRefused, in_box
+from robot.drivers.ur10.safety import MIN_SPEED, TargetRefused
 from robot.drivers.ur10.shared_state import SharedState
 from tests.robot.drivers.ur10.conftest import HOME
 from tests.robot.drivers.ur10.test_safety import a_state
@@ -26,7 +26,7 @@ number = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-1.
 poses = st.one_of(
     st.lists(number, min_size=0, max_size=8),
     st.tuples(st.floats(-0.3, 1.6), st.floats(-0.3, 1.2), st.floats(-4, 4), st.floats(-0.2, 0.5)).map(
-        lambda v: tcp_from_pose(CONFIG.placing, np.array(v[:3]), v[3]).tolist()
+        lambda v: CONFIG.placing.tcp_from_pose(np.array(v[:3]), v[3]).tolist()
     ),
 )
 speeds = st.one_of(number, st.floats(0.001, 0.06), st.sampled_from([0.25, 0.2501, 0.05, 0.1, 0.0, -0.05]))
@@ -86,7 +86,7 @@ def test_no_invalid_move_is_sent_to_the_controller(
     assert target == pose
     assert len(target) == 6
     assert np.isfinite(target).all()
-    assert in_box(CONFIG, np.array(target))
+    assert CONFIG.box.contains(np.array(target))
     assert 0 < speed <= SPEED_CAP
     way = math.dist(target[:3], HOME[:3])
     assert min(speed, math.sqrt(CONFIG.acceleration * way)) <= CONFIG.speed
@@ -181,6 +181,6 @@ def test_no_invalid_move_is_sent_to_the_rtde_process(
     (order,) = link.orders
     assert order["target"] == pose
     assert np.isfinite(pose).all()
-    assert in_box(CONFIG, np.array(pose))
+    assert CONFIG.box.contains(np.array(pose))
     assert speed is None or MIN_SPEED <= speed <= CONFIG.speed
     assert 0 < order["speed"] == move.speed <= SPEED_CAP

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.driver_config import SPEED_CAP
-from robot.drivers.ur10.safety import TargetRefused, in_box
+from robot.drivers.ur10.safety import TargetRefused
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.test_command_thread import poses, speeds
 
@@ -43,7 +43,7 @@ def test_no_invalid_move_reaches_the_controller(arm: Arm, controller: Faults) ->
     for order in sent:
         assert order["goal"] in requested
         assert np.isfinite(order["goal"]).all()
-        assert in_box(arm.config, np.array(order["goal"]))
+        assert arm.config.box.contains(np.array(order["goal"]))
         assert 0 < order["speed"] <= SPEED_CAP
         assert order["acceleration"] == arm.config.acceleration
     top = max(math.hypot(*state["speed"][:3]) for state in arm.states())

@@ -9,19 +9,18 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from robot.drivers.outcome import SessionOutcome
-from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import SPEED_CAP, ArmConfig, BoxConfig
 from robot.drivers.ur10.safety import (
     MIN_SPEED,
     MOVED_ON,
+    NO_STATE,
     REACH,
     SAFETY_BITS,
-    StateMemory,
     TargetRefused,
     at_target,
     check_command,
     check_state,
     check_target,
-    in_box,
     plan_move,
     retreat_target,
     rotation_angle,
@@ -29,14 +28,14 @@ from robot.drivers.ur10.safety import (
 from robot.drivers.ur10.shared_state import ARM_STATE
 
 CONFIG = ArmConfig()
-HOME = tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 0.0]))
+HOME = CONFIG.placing.tcp_from_pose(np.array([0.63, 0.45, 0.0]))
 NORMAL = 1
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 near = st.one_of(anything, st.floats(-1.5, 1.5))
 targets = st.lists(near, min_size=6, max_size=6)
 down = st.tuples(st.floats(0.02, 1.2), st.floats(0.02, 0.85), st.floats(-4, 4), st.floats(0, 0.2)).map(
-    lambda v: tcp_from_pose(CONFIG.placing, np.array(v[:3]), v[3])
+    lambda v: CONFIG.placing.tcp_from_pose(np.array(v[:3]), v[3])
 )
 
 
@@ -57,7 +56,7 @@ def test_only_finite_targets_in_the_box_with_the_tool_down_pass(target: list[flo
     except TargetRefused:
         return
     assert np.isfinite(passed).all()
-    assert in_box(CONFIG, passed)
+    assert CONFIG.box.contains(passed)
     np.testing.assert_array_equal(passed, target)
 
 
@@ -113,8 +112,8 @@ def test_planned_speeds_are_within_the_settings(speed: float, target: np.ndarray
 
 @pytest.mark.parametrize("way", [0.0, 0.0031, 0.0063, 0.02, 0.1])
 def test_a_turn_on_a_short_way_takes_no_longer_than_one_on_a_long_way(way: float) -> None:
-    start = tcp_from_pose(CONFIG.placing, np.array([0.6, 0.45, 0.0]))
-    target = tcp_from_pose(CONFIG.placing, np.array([0.6 + way, 0.45, np.radians(176)]))
+    start = CONFIG.placing.tcp_from_pose(np.array([0.6, 0.45, 0.0]))
+    target = CONFIG.placing.tcp_from_pose(np.array([0.6 + way, 0.45, np.radians(176)]))
     move = plan_move(CONFIG, target, start, 0.03)
     assert rotation_angle(start, target) / move.seconds > 0.1  # rad/s
     assert move.most < 120
@@ -164,19 +163,19 @@ def test_rotation_angle(tool: np.ndarray, by: float) -> None:
 
 
 def test_arrival_requires_position_and_rotation() -> None:
-    target = tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159]))
+    target = CONFIG.placing.tcp_from_pose(np.array([0.63, 0.45, 3.14159]))
     turn = np.radians(0.4)
-    assert at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.6305, 0.45, -3.14159])), target)
-    assert at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + turn])), target)
-    assert not at_target(CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.632, 0.45, 3.14159])), target)
+    assert at_target(CONFIG, CONFIG.placing.tcp_from_pose(np.array([0.6305, 0.45, -3.14159])), target)
+    assert at_target(CONFIG, CONFIG.placing.tcp_from_pose(np.array([0.63, 0.45, 3.14159 + turn])), target)
+    assert not at_target(CONFIG, CONFIG.placing.tcp_from_pose(np.array([0.632, 0.45, 3.14159])), target)
     assert not at_target(
-        CONFIG, tcp_from_pose(CONFIG.placing, np.array([0.63, 0.45, 3.14159 + 2 * turn])), target
+        CONFIG, CONFIG.placing.tcp_from_pose(np.array([0.63, 0.45, 3.14159 + 2 * turn])), target
     )
     assert not at_target(CONFIG, np.full(6, np.nan), target)
 
 
 def test_good_states_have_no_finding() -> None:
-    watch = StateMemory()
+    watch = NO_STATE
     for k in range(5):
         watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0), np.zeros(6))
         assert finding is None
@@ -187,15 +186,15 @@ def test_good_states_have_no_finding() -> None:
 def test_a_state_with_one_value_that_is_not_finite(field: str, where: int, bad: float) -> None:
     state = a_state()
     state[field][where] = bad
-    _, finding = check_state(CONFIG, StateMemory(), state, np.zeros(6))
+    _, finding = check_state(CONFIG, NO_STATE, state, np.zeros(6))
     assert finding is not None
     assert finding.outcome is SessionOutcome.ARM_MALFORMED
 
 
 @given(st.lists(st.floats(-1e300, 1e300), min_size=3, max_size=3))
 def test_states_outside_the_box(place: list[float]) -> None:
-    _, finding = check_state(CONFIG, StateMemory(), a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
-    if in_box(CONFIG, np.array(place)):
+    _, finding = check_state(CONFIG, NO_STATE, a_state(tcp=[*place, *HOME[3:]]), np.zeros(6))
+    if CONFIG.box.contains(np.array(place)):
         assert finding is None
     else:
         assert finding is not None
@@ -205,7 +204,7 @@ def test_states_outside_the_box(place: list[float]) -> None:
 
 @given(st.integers(0, 2**11 - 1))
 def test_the_most_severe_safety_bit_is_reported(bits: int) -> None:
-    _, finding = check_state(CONFIG, StateMemory(), a_state(safety=bits), np.zeros(6))
+    _, finding = check_state(CONFIG, NO_STATE, a_state(safety=bits), np.zeros(6))
     named = [outcome for mask, outcome, _ in SAFETY_BITS if bits & mask]
     assert (finding.outcome if finding else None) is (named[0] if named else None)
     assert bool(finding) == bool(bits & ~0b11)
@@ -217,7 +216,7 @@ def test_the_most_severe_safety_bit_is_reported(bits: int) -> None:
 @given(st.lists(st.booleans(), min_size=1, max_size=12))
 def test_a_contact_requires_two_consecutive_states(loads: list[bool]) -> None:
     rest = np.array([20.0, -40.0, 10.0, 1.0, 1.0, 1.0])
-    watch, before = StateMemory(), False
+    watch, before = NO_STATE, False
     for k, loaded in enumerate(loads):
         force = rest + [0, (CONFIG.force_limit + 1) if loaded else CONFIG.force_limit - 1, 0, 0, 0, 0]
         watch, finding = check_state(CONFIG, watch, a_state(robot=k + 1.0, force=force), rest)
@@ -226,7 +225,7 @@ def test_a_contact_requires_two_consecutive_states(loads: list[bool]) -> None:
 
 
 def test_a_controller_clock_that_stands_still() -> None:
-    watch, _ = check_state(CONFIG, StateMemory(), a_state(robot=2.0), np.zeros(6))
+    watch, _ = check_state(CONFIG, NO_STATE, a_state(robot=2.0), np.zeros(6))
     for robot in (2.0, 1.0):
         _, finding = check_state(CONFIG, watch, a_state(robot=robot), np.zeros(6))
         assert finding is not None
@@ -246,9 +245,9 @@ def test_the_retreat_follows_the_path_back_and_stays_in_the_box(
         return
     back = target[:3] - states[-1]["tcp"][:3]
     assert np.linalg.norm(back) <= CONFIG.backoff + 1e-9
-    assert in_box(CONFIG, target)
-    if in_box(CONFIG, states[-1]["tcp"] - 0.02 * np.array([*way, 0, 0, 0])) and in_box(
-        CONFIG, states[-1]["tcp"]
+    assert CONFIG.box.contains(target)
+    if CONFIG.box.contains(states[-1]["tcp"] - 0.02 * np.array([*way, 0, 0, 0])) and CONFIG.box.contains(
+        states[-1]["tcp"]
     ):
         np.testing.assert_allclose(back, -CONFIG.backoff * way, atol=1e-9)
     np.testing.assert_array_equal(target[3:], HOME[3:])

@@ -16,7 +16,6 @@ from robot.drivers.head.usb_protocol import (
     CommandKind,
     FeedbackMode,
     Request,
-    pack_command,
     to_counts,
 )
 from robot.emulators.head.emulated_device import EmulatedHead
@@ -64,7 +63,7 @@ class HostedHead:
         self.bridge.control(REQUEST_OUT, Request.START, 0, 0, self.now)
 
     def send(self, command: Command) -> None:
-        self.bridge.bulk_out(pack_command(command), self.now)
+        self.bridge.bulk_out(command.pack(), self.now)
 
     def pass_by(self, seconds: float, awake: bool = True, read: bool = True) -> Frames:
         """Advances time by some seconds; returns the frames read."""

@@ -16,7 +16,7 @@ from robot.drivers.head.usb_protocol import (
     to_counts,
     to_radians,
 )
-from robot.drivers.ur10.driver_config import BaseTransformConfig, tcp_from_pose
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import ToolPose
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.emulators.head.whiskers import AHEAD, BLOCK, AlongPath, CarriedByArm
@@ -46,7 +46,7 @@ class Arm:
         return self.state
 
     def put(self, time: float, pose: list[float], lift: float = 0.0) -> None:
-        self.state = ToolPose(time, tcp_from_pose(PLACING, np.array(pose), lift), np.zeros(6), time)
+        self.state = ToolPose(time, PLACING.tcp_from_pose(np.array(pose), lift), np.zeros(6), time)
 
 
 @pytest.mark.parametrize("mode", [FeedbackMode.OPEN, FeedbackMode.RCP])
@@ -143,7 +143,7 @@ def test_no_contact_when_lifted_or_before_the_first_arm_state() -> None:
 def test_poses_between_arm_states_are_extrapolated() -> None:
     arm, home = Arm(), np.array([0.5, 0.4, 3.1])
     place = CarriedByArm(arm, PLACING)
-    tcp = tcp_from_pose(PLACING, home)
+    tcp = PLACING.tcp_from_pose(home)
     arm.state = ToolPose(10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]), 10.0)
     rows = [place.at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
     poses, lifts = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])

@@ -9,8 +9,8 @@ import time
 from typing import Any
 
 from robot.drivers.head.decoder import Decoder
-from robot.drivers.head.device import Bridge, Disconnected, Stalled, open_bridge, read_identity
-from robot.drivers.head.usb_protocol import KEEP_ALIVE, Request, pack_command
+from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, open_bridge
+from robot.drivers.head.usb_protocol import KEEP_ALIVE, Request
 from robot.emulators.head.emulator_config import CONTROL_PORT
 from tests.robot.emulators.head.heads import drive
 
@@ -22,9 +22,9 @@ def main(host: str) -> None:
     seen: dict[str, Any] = {}
     bridge = open_bridge("usb")
     decoder = Decoder(18, 3)
-    seen["whiskers"] = read_identity(bridge).whiskers
+    seen["whiskers"] = HeadIdentity.read(bridge).whiskers
     bridge.request(Request.START)
-    bridge.write(pack_command(drive()))
+    bridge.write(drive().pack())
     seen["frames"] = read(bridge, decoder, 3000)
 
     request_fault(host, do="stall")
@@ -61,7 +61,7 @@ def read(bridge: Bridge, decoder: Decoder, frames: int) -> int:
     end, got = time.monotonic() + 10.0, 0
     while got < frames and time.monotonic() < end:
         got += len(decoder.feed(bridge.read(4096, 0.5)).values)
-        bridge.write(pack_command(KEEP_ALIVE))
+        bridge.write(KEEP_ALIVE.pack())
     return got
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from robot.emulators.ur10.controller import Runtime
+from robot.emulators.ur10.controller import EmulatedController, Runtime
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.server import DashboardSession, ScriptSession, emulated_controller
+from robot.emulators.ur10.server import DashboardSession, ScriptSession
 
 PROGRAM = b"def rtde_control():\n    global reg_offset_int = # int register offset\n0\nend\n"
 HERE = (0.6, 0.0, 0.3, math.pi, 0.0, 0.0)
@@ -18,7 +18,7 @@ class Bench:
     """A controller, its clock, and a client that writes registers as the library does."""
 
     def __init__(self, **settings: object) -> None:
-        self.controller = emulated_controller(UrEmulatorConfig.model_validate(settings))
+        self.controller = EmulatedController(UrEmulatorConfig.model_validate(settings))
         self.host = 0.0
         self.script = ScriptSession(self.controller)
         self.dashboard = DashboardSession(self.controller)

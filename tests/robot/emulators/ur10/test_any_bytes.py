@@ -9,19 +9,19 @@ from hypothesis import strategies as st
 
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import DATA, INPUTS, OUTPUTS, PROTOCOL, START, TEXT
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.server import (
     Claims,
     DashboardSession,
     RtdeSession,
     ScriptSession,
-    emulated_controller,
 )
 
 
 @given(data=st.lists(st.binary(max_size=60), max_size=8))
 def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
-    controller = emulated_controller(UrEmulatorConfig())
+    controller = EmulatedController(UrEmulatorConfig())
     for session in (
         RtdeSession(controller, Claims()),
         ScriptSession(controller),
@@ -35,7 +35,7 @@ def test_any_bytes_leave_the_sessions_working(data: list[bytes]) -> None:
 
 @given(kind=st.sampled_from([PROTOCOL, OUTPUTS, INPUTS, START, DATA, TEXT]), body=st.binary(max_size=40))
 def test_any_package_body_leaves_the_session_working(kind: int, body: bytes) -> None:
-    session = RtdeSession(emulated_controller(UrEmulatorConfig()), Claims())
+    session = RtdeSession(EmulatedController(UrEmulatorConfig()), Claims())
     with contextlib.suppress(ValueError):
         session.receive(rtde_protocol.pack_package(kind, body), 0.0)
     session.state({})

@@ -14,15 +14,12 @@ from robot.emulators.ur10.kinematics import (
     UR10,
     UR10E,
     Geometry,
-    backward,
     compose_poses,
-    forward,
     invert_pose,
     quaternion,
     rotate_by,
     rotation_between,
     rotation_vector,
-    solutions,
 )
 
 ANGLE = st.floats(-3.1, 3.1)
@@ -52,7 +49,7 @@ def frame_of(pose: tuple[float, ...]) -> np.ndarray:
 @ARMS
 @given(joints=JOINTS)
 def test_forward_kinematics_equal_the_product_of_matrices(arm: Geometry, joints: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(frame_of(forward(arm, joints)), chain(arm, joints), atol=1e-9)
+    np.testing.assert_allclose(frame_of(arm.forward(joints)), chain(arm, joints), atol=1e-9)
 
 
 @ARMS
@@ -60,12 +57,12 @@ def test_forward_kinematics_equal_the_product_of_matrices(arm: Geometry, joints:
 def test_every_solution_reaches_the_pose_and_includes_the_joints(
     arm: Geometry, joints: tuple[float, ...]
 ) -> None:
-    pose = forward(arm, joints)
-    found = solutions(arm, pose, joints[5])
+    pose = arm.forward(joints)
+    found = arm.solutions(pose, joints[5])
     assert 2 <= len(found) <= 8
     for solution in found:
         np.testing.assert_allclose(chain(arm, solution), chain(arm, joints), atol=1e-5)
-    nearest = backward(arm, pose, joints)
+    nearest = arm.backward(pose, joints)
     assert nearest is not None
     way = chain(arm, nearest) - chain(arm, joints)
     assert np.abs(way).max() < 1e-5
@@ -79,15 +76,15 @@ def test_the_nearest_joints_stay_within_two_turns(
     arm: Geometry, joints: tuple[float, ...], turns: tuple[int, ...]
 ) -> None:
     near = tuple(q + math.tau * n for q, n in zip(joints, turns, strict=True))
-    found = backward(arm, forward(arm, joints), near)
+    found = arm.backward(arm.forward(joints), near)
     assert found is not None
     assert max(map(abs, found)) <= math.tau
 
 
 @pytest.mark.parametrize("pose", [(3.0, 0, 0.3, 0, 0, 0), (0, 0, 0.3, math.pi, 0, 0), (math.nan,) * 6])
 def test_a_pose_out_of_reach_has_no_solution(pose: tuple[float, ...]) -> None:
-    assert solutions(UR10, pose) == []
-    assert backward(UR10, pose, (0.0,) * 6) is None
+    assert UR10.solutions(pose) == []
+    assert UR10.backward(pose, (0.0,) * 6) is None
 
 
 @given(first=POSE, second=POSE)

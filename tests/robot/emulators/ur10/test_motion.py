@@ -9,10 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from robot.emulators.ur10.emulated_arm import EmulatedArm
+from robot.emulators.ur10.emulated_arm import EmulatedArm, MoveL, Profile, StopL, Unreachable, parse_moves
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.kinematics import rotation_between
-from robot.emulators.ur10.motion import MoveL, Profile, StopL, Unreachable, parse_moves
 
 DOWN = (math.pi, 0.0, 0.0)
 NOWHERE = (3.0, 0.0, 0.3, *DOWN)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 
 from robot.drivers.ur10 import rtde_protocol
+from robot.emulators.ur10.controller import EmulatedController
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.server import Claims, RtdeSession, emulated_controller
+from robot.emulators.ur10.server import Claims, RtdeSession
 from tests.robot.emulators.ur10.controller_bench import HERE, Bench
 
 
@@ -16,11 +17,11 @@ def names(variables: list[str], frequency: float | None = None) -> bytes:
 
 
 def reply(session: RtdeSession, kind: int, body: bytes = b"") -> bytes:
-    (package,) = rtde_protocol.PackageSplitter().feed(
+    ((got, answer),) = rtde_protocol.PackageSplitter().feed(
         session.receive(rtde_protocol.pack_package(kind, body), 0.0)
     )
-    assert package.kind == kind
-    return package.body
+    assert got == kind
+    return answer
 
 
 def test_output_recipes_return_types_and_define_states() -> None:
@@ -36,8 +37,8 @@ def test_output_recipes_return_types_and_define_states() -> None:
     assert reply(session, rtde_protocol.OUTPUTS, names(wanted, 62.5)) == b"\1DOUBLE,VECTOR6D,INT32,INT32"
     assert session.every == 2
     assert reply(session, rtde_protocol.START) == b"\1"
-    (package,) = rtde_protocol.PackageSplitter().feed(session.state({}))
-    recipe, time, *rest = struct.unpack(">Bd6dii", package.body)
+    ((_, state),) = rtde_protocol.PackageSplitter().feed(session.state({}))
+    recipe, time, *rest = struct.unpack(">Bd6dii", state)
     assert recipe == 1
     assert time == bench.controller.time
     assert tuple(rest) == (*HERE, 7, 1)
@@ -45,7 +46,7 @@ def test_output_recipes_return_types_and_define_states() -> None:
 
 def test_an_input_variable_belongs_to_one_client() -> None:
     claims = Claims()
-    controller = emulated_controller(UrEmulatorConfig())
+    controller = EmulatedController(UrEmulatorConfig())
     first, second = RtdeSession(controller, claims), RtdeSession(controller, claims)
     registers = ["input_int_register_0", "input_double_register_3"]
     assert reply(first, rtde_protocol.INPUTS, names(registers)) == b"\1INT32,DOUBLE"
