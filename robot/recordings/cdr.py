@@ -1,15 +1,11 @@
-"""Samples as ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
+"""Samples and live data as ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-A message has four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.cdr`) back to
-back; an unbounded array is preceded by its length (uint32). float64 values keep every bit.
+A message has four bytes (00 01 00 00) and the fields of its schema (`SCHEMAS`) back to back; an unbounded
+array is preceded by its length (uint32). float64 values keep every bit. Every file stores the schemas, whose
+fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
 
-ROS 2 definitions of the messages in a recording; every file stores these texts.
-
-Fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
-
-Live data as messages (see `robot.recordings.cdr`): blocks of frames and of arm states, cuts, events.
-
-Frames are stored channel by channel as differences from frame to frame: small numbers, which compress well.
+Live data are blocks of frames and of arm states, cuts and events. Frames are stored channel by channel as
+differences from frame to frame: small numbers, which compress well.
 """
 
 from __future__ import annotations
@@ -171,7 +167,10 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         values["dead"] = ~_convert_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
     layout = message_layout(name, view_shape, whiskers, samples)
     if name in FLAGS:
-        values["flags"] = _pack_flags(values, FLAGS[name], whiskers)
+        flags, booleans = np.zeros(whiskers, np.uint8), np.dtype(("?", (whiskers,)))
+        for bit, field in enumerate(FLAGS[name]):
+            flags |= _convert_exactly(field, values[field], booleans).astype(np.uint8) << bit
+        values["flags"] = flags
     values["time"] = sample.time
     record = layout.blank.copy()
     for field in layout.fields:
@@ -200,7 +199,11 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     if name == CYCLE:
         time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
         return float(record["time"]), Cycle(time, angle, deflection, odometry)
-    flags = _unpack_flags(record["flags"], FLAGS[name])
+    bits, names = record["flags"], FLAGS[name]
+    if (bits >> len(names)).any():
+        most = 2 ** len(names) - 1
+        raise Malformed(f"whisker flags {int(bits.max())} where {most} is the largest possible")
+    flags = {field: (bits >> bit & 1).astype(bool) for bit, field in enumerate(names)}
     if name == WHISK:
         felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FEATURES)}
         return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
@@ -272,22 +275,6 @@ def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, s
         fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
         fields=tuple(field for field, *_ in fields if field not in fixed),
     )
-
-
-def _pack_flags(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
-    """[W] uint8, the boolean arrays [W] of these names as bits."""
-    flags = np.zeros(whiskers, np.uint8)
-    for bit, name in enumerate(names):
-        flags |= _convert_exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
-    return flags
-
-
-def _unpack_flags(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The inverse of `_pack_flags`."""
-    if (flags >> len(names)).any():
-        most = 2 ** len(names) - 1
-        raise Malformed(f"whisker flags {int(flags.max())} where {most} is the largest possible")
-    return {name: (flags >> bit & 1).astype(bool) for bit, name in enumerate(names)}
 
 
 def _convert_exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:

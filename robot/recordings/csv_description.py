@@ -38,8 +38,6 @@ FEWEST_PIXELS = 4
 """Least number of numbered columns that make a view."""
 COLUMNS = (18, 36, 24, 20, 30, 16, 12, 32, 15, 10, 9, 8, 6)
 """Columns of a view of ranges, the first that divides their number."""
-RANGE_QUANTILE, RANGE_MARGIN = 0.9, 1.25
-"""The largest range of a view is this quantile of all ranges, times the margin."""
 
 
 class CsvDescription(NamedTuple):
@@ -96,13 +94,8 @@ def describe_csv(path: Path) -> CsvDescription:
             table |= views
             parts["views"] = _words({"views": views["views"]})
             max_range = ranges
-        given = {"truth": _truth(file, other)}
-        if label := _named(other, LABELS):
-            given["labels"] = _file(file, other) | {"column": label}
-        if other is not file and {"t1", "t2", "score"} <= set(other.names):
-            given["pairs"] = {"file": str(other.path)}
-        for name, part in given.items():
-            if part is not None and name not in table:
+        for name, part in _truth_and_labels(file, other).items():
+            if name not in table:
                 table[name] = part
                 parts[name] = _words({name: part})
     if "pairs" in table and "labels" in table:
@@ -225,12 +218,18 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
     )
 
 
-def _truth(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
-    poses = _poses(other)
+def _truth_and_labels(file: CsvFile, other: CsvFile) -> dict[str, dict[str, Any]]:
+    """The settings of true poses and of place labels from the other file, as far as it has them."""
+    found, poses = dict[str, dict[str, Any]](), _poses(other)
     if other is file or not TRUE.search(other.path.stem):
         poses = {prefix: columns for prefix, columns in poses.items() if TRUE.search(prefix)}
-    columns = next(iter(poses.values()), None)
-    return None if columns is None else _file(file, other) | columns
+    if columns := next(iter(poses.values()), None):
+        found["truth"] = _file(file, other) | columns
+    if label := _named(other, LABELS):
+        found["labels"] = _file(file, other) | {"column": label}
+    if other is not file and {"t1", "t2", "score"} <= set(other.names):
+        found["pairs"] = {"file": str(other.path)}
+    return found
 
 
 def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]:
@@ -246,7 +245,9 @@ def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]
     views = _file(file, other) | {"prefix": prefix}
     if not len(known) or known.max() <= 1.0:
         return {"rows": 1, "columns": count, "views": views}, np.nan
-    reach = _round(RANGE_MARGIN * float(np.quantile(known, RANGE_QUANTILE)))
+    reach = 1.25 * float(np.quantile(known, 0.9))  # of a view
+    scale, steps = 10.0 ** np.floor(np.log10(reach)), np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    reach = float(f"{scale * steps[np.argmin(np.abs(steps - reach / scale))]:.3g}")  # two digits at most
     return shape | {"views": views | {"max_range": reach}}, reach
 
 
@@ -288,10 +289,3 @@ def _words(settings: dict[str, Any]) -> str:
         words |= {key: f"{key} {words[key]}" for key in ("prefix", "max_range") if key in words}
         lines.append(f"{name}: {', '.join(words.values())}")
     return "; ".join(lines)
-
-
-def _round(value: float) -> float:
-    """To one and a half significant digits: 0.5, 1, 1.5, 2, 3, 4, ..., 10, 15, 20, 30 ..."""
-    scale = 10.0 ** np.floor(np.log10(value))
-    steps = np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
-    return float(f"{scale * steps[np.argmin(np.abs(steps - value / scale))]:.3g}")

@@ -40,10 +40,6 @@ from tactile.base.settings import Settings
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
 RATE = "--set recording.table.rate={:.6g}, the rows per second"
-HOLE = 3
-"""Rows one after another that may be left out of velocities and motions; the next row stands for them."""
-SHARED = 0.2
-"""Share of the steps without time that makes times rounded."""
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
 
 
@@ -88,7 +84,8 @@ def read_csv_recording(
     assert part is not None  # checked by `_absences`
     names = [name for name, _ in column_keys(part, "")]
     stamps = config.time if config.rate is None else ""
-    turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, HOLE)
+    # So many rows of velocities or motions one after another may be left out; the next row stands for them.
+    turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, 3)
     kept, errors = sound_rows(whole, names, "rows", warn, stamps, turn or (), hole=hole)
     base = found[path] = whole.rows(kept)
     if config.rate is None:
@@ -105,7 +102,12 @@ def read_csv_recording(
     recording.place, recording.held = base.place, isinstance(part, columns.VelocityColumns)
     recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
     # What belongs to a row that is left out, is left out too.
-    files = Files(base, found, _whole_clock(time, kept, len(whole.lines)), warn)
+    every, rows = time, np.arange(len(whole.lines))
+    if len(kept) < len(rows):  # the times of rows that are left out lie between those of their neighbours
+        step = float(np.median(np.diff(time) / np.diff(kept))) if len(kept) > 1 else 1.0
+        beyond = np.minimum(rows - kept[0], 0) + np.maximum(rows - kept[-1], 0)
+        every = np.interp(rows, kept, time) + beyond * step
+    files = Files(base, found, every, warn)
     row_of = np.full(len(files.time), -1)
     row_of[kept] = np.arange(len(kept))
 
@@ -168,16 +170,6 @@ def _clock_errors(file: CsvFile, name: str, time: np.ndarray, cure: str) -> list
     found = f"{name} is rounded: {len(time) / len(np.unique(time)):.3g} rows share each time"
     row = int((np.diff(time) == 0).argmax()) + 1
     return [InputError(file.place(row), found, "times that increase", cure.format(rate))]
-
-
-def _whole_clock(time: np.ndarray, kept: np.ndarray, count: int) -> np.ndarray:
-    """Times [count] of all rows, those left out between their neighbours; kept: the rows of the times [N]."""
-    if len(kept) == count:
-        return time
-    rows = np.arange(count)
-    step = float(np.median(np.diff(time) / np.diff(kept))) if len(kept) > 1 else 1.0
-    beyond = np.minimum(rows - kept[0], 0) + np.maximum(rows - kept[-1], 0)
-    return np.interp(rows, kept, time) + beyond * step
 
 
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvConfig) -> list[InputError]:
@@ -268,7 +260,7 @@ def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
     """
     steps = np.diff(time)
     change, same = np.flatnonzero(steps > 0) + 1, steps == 0
-    if len(change) < 2 or (steps < 0).any() or same.mean() < SHARED:
+    if len(change) < 2 or (steps < 0).any() or same.mean() < 0.2:
         return None
     repeated = (np.nan_to_num(np.diff(rows, axis=0)[same]) == 0).all(axis=1)
     if repeated.mean() > 0.5:

@@ -1,12 +1,9 @@
-"""Reads a recording from its first byte to its end, or to the first damaged byte.
+"""Reads a recording in MCAP from its first byte to its end, or to the first damaged byte.
 
-Every message must fit its schema and have the next sequence number, so that a damaged file yields exactly a
-prefix of the written messages.
-
-The records of an MCAP file in the order in which they were written, checked against damage.
-
-MCAP's own reader needs the index at the end of the file, which a killed writer did not write. Lengths are
-bounded by the rest of the file, and chunks must match their checksum.
+MCAP's own reader needs the index at the end of the file, which a killed writer did not write. Here records
+are read in the order in which they were written: lengths are bounded by the rest of the file, chunks must
+match their checksum, and every message must fit its schema and have the next sequence number. So a damaged
+file yields exactly a prefix of the written messages.
 """
 
 from __future__ import annotations
@@ -247,14 +244,11 @@ class McapScanner:
                         truth = record.data
                         continue
                     self._number += 1
-                    if name in READINGS:
-                        sample = self._sample(name, record.data, truth)
-                        self.count += 1
-                        yield RecordingEntry(name, sample.time, record.data, truth, sample)
-                        truth = None
-                    else:
-                        time, content = self._block(name, record.data)
-                        yield RecordingEntry(name, time, record.data, None, content)
+                    time, content = self._decoded(name, record.data, truth)
+                    reading = name in READINGS
+                    self.count += reading
+                    yield RecordingEntry(name, time, record.data, truth if reading else None, content)
+                    truth = None if reading else truth
                 elif isinstance(record, Statistics):
                     self._check_counts(record, names)
         except DAMAGE_ERRORS as error:
@@ -264,19 +258,22 @@ class McapScanner:
         else:
             self.broken = ""
 
-    def _sample(self, name: str, message: bytes, truth: bytes | None) -> Sample:
+    def _decoded(
+        self, name: str, message: bytes, truth: bytes | None
+    ) -> tuple[float, Sample | Frames | np.ndarray | Event]:
+        """The time and the content of a message with this schema; truth: of a reading."""
         assert self.description is not None
-        where = None if truth is None else decode_truth(truth)[1]
-        if name != CUT:
-            time, reading = decode(name, message, self.description.view_shape, self.description.whiskers)
-            return Sample(time, reading, where)
-        cut = decode_cut(message)
-        return Sample(cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut), where)
-
-    def _block(self, name: str, message: bytes) -> tuple[float, Frames | np.ndarray | Event]:
-        assert self.description is not None
+        whiskers = self.description.whiskers
+        if name in READINGS:
+            where = None if truth is None else decode_truth(truth)[1]
+            if name != CUT:
+                time, reading = decode(name, message, self.description.view_shape, whiskers)
+            else:
+                cut = decode_cut(message)
+                time, reading = cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut)
+            return time, Sample(time, reading, where)
         if name == FRAMES:
-            time, frames = decode_frames(message, self.description.whiskers)
+            time, frames = decode_frames(message, whiskers)
             self._frames.add(frames)
             return time, frames
         if name == ARM:

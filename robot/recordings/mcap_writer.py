@@ -1,8 +1,6 @@
-"""Writes MCAP files that stay readable when the process is killed or the disk is full.
+"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full.
 
 Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
-
-Writes samples to a recording.
 """
 
 from __future__ import annotations
@@ -94,7 +92,10 @@ class McapWriter:
         """
         # MCAP's clock has no negative times.
         stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
-        self._writer.add_message(self._channel(name), stamp, message, stamp, self._number % (1 << 32))
+        if name not in self._channels:
+            schema = self._writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
+            self._channels[name] = self._writer.register_channel(TOPICS[name], "cdr", schema)
+        self._writer.add_message(self._channels[name], stamp, message, stamp, self._number % (1 << 32))
         self._pending += len(message)
         if name == TRUTH:
             return
@@ -133,12 +134,6 @@ class McapWriter:
                 raise RecordingWriteError(self.path, error) from error
         finally:
             self._file.close()
-
-    def _channel(self, name: str) -> int:
-        if name not in self._channels:
-            schema = self._writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
-            self._channels[name] = self._writer.register_channel(TOPICS[name], "cdr", schema)
-        return self._channels[name]
 
 
 class WholeChunkFile:

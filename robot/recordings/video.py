@@ -124,41 +124,27 @@ class VisualOdometryConfig(Settings):
     """Largest turn rate, degrees/s: shifts between frames are searched up to this rate."""
 
 
-class Profile(NamedTuple):
-    """Intensities [w] with mean 1 of the columns of a crop, and whether the columns form a ring."""
-
-    values: np.ndarray
-    ring: bool
+Profile = tuple[np.ndarray, bool]
+"""Intensities [w] with mean 1 of the columns of a crop, and whether the columns form a ring."""
 
 
-class Profiles(NamedTuple):
-    """The two profiles of a frame, and the angle of one column, rad."""
-
-    rotation: Profile
-    translation: Profile
-    pixel_angle: float
-
-
-def profiles(config: VisualOdometryConfig, grey: np.ndarray, where: str = "image") -> Profiles:
-    """The profiles of an image [H, W] uint8.
-
-    Raises:
-        InputError: a crop is not a part of the image.
-    """
-    rotation = _profile(config, "rotation", grey, where)
-    translation = _profile(config, "translation", grey, where)
-    return Profiles(rotation, translation, float(np.deg2rad(config.fov_deg)) / grey.shape[1])
-
-
-def motion_between(
-    config: VisualOdometryConfig, before: Profiles, after: Profiles, dt: float
+def _motion_between(
+    config: VisualOdometryConfig,
+    before: tuple[Profile, Profile],
+    after: tuple[Profile, Profile],
+    pixel_angle: float,
+    dt: float,
 ) -> tuple[float, float]:
-    """Distance (VO metres) and turn (rad, counter-clockwise) between two frames that lie `dt` s apart."""
+    """Distance (VO metres) and turn (rad, counter-clockwise) between two frames that lie `dt` s apart.
+
+    Args:
+        before, after: the profiles of each for turns and for distances. pixel_angle: of one column, rad.
+    """
     dt = max(dt, 0.0)  # of stamps that go back, which the reader reports
-    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * dt / after.pixel_angle))
-    shift, _ = _best_shift(before.rotation, after.rotation, reach)
-    _, change = _best_shift(before.translation, after.translation, reach)
-    return min(config.scaling * change, config.max_speed * dt), shift * after.pixel_angle
+    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * dt / pixel_angle))
+    shift, _ = _best_shift(before[0], after[0], reach)
+    _, change = _best_shift(before[1], after[1], reach)
+    return min(config.scaling * change, config.max_speed * dt), shift * pixel_angle
 
 
 def _profile(config: VisualOdometryConfig, name: str, grey: np.ndarray, where: str) -> Profile:
@@ -166,7 +152,7 @@ def _profile(config: VisualOdometryConfig, name: str, grey: np.ndarray, where: s
     sums = part.sum(axis=0, dtype=np.int64)
     total = int(sums.sum())
     values = sums * (len(sums) / total) if total else np.ones(len(sums))
-    return Profile(values, config.fov_deg == 360 and len(sums) == grey.shape[1])
+    return values, config.fov_deg == 360 and len(sums) == grey.shape[1]
 
 
 def _best_shift(before: Profile, after: Profile, reach: int) -> tuple[float, float]:
@@ -174,12 +160,13 @@ def _best_shift(before: Profile, after: Profile, reach: int) -> tuple[float, flo
 
     Things move to the right in the image where the camera turns counter-clockwise.
     """
-    width = len(after.values)
+    (old, _), (new, ring) = before, after
+    width = len(new)
     reach = min(reach, width // 2)
     shifts = np.arange(-reach, reach + 1)
     columns = np.arange(width)[None, :] - shifts[:, None]  # where each column was before
-    inside = (columns >= 0) & (columns < width) | after.ring
-    difference = np.abs(after.values - before.values[columns % width])
+    inside = (columns >= 0) & (columns < width) | ring
+    difference = np.abs(new - old[columns % width])
     errors = np.sum(difference, axis=1, where=inside) / inside.sum(axis=1)
     best = int(np.lexsort((np.abs(shifts), errors))[0])  # of equal errors the smallest shift
     return float(shifts[best]) + _vertex(errors, best), float(errors[best])
@@ -237,7 +224,7 @@ def camera_rows(
     """
     time, pictures, moves = list[float](), list[np.ndarray](), list[tuple[float, float]]()
     size: tuple[int, ...] | None = None
-    before: Profiles | None = None
+    before: tuple[Profile, Profile] | None = None
     for number, frame in enumerate(frames):
         place = f"{where}, frame {number}"
         size = size or frame.grey.shape
@@ -246,10 +233,12 @@ def camera_rows(
             raise InputError(place, found, f"{size[1]} x {size[0]}, as in frame 0")
         pictures.append(image_view(views, frame.grey, place))
         if odometry is not None:
-            after = profiles(odometry, frame.grey, place)
+            turning = _profile(odometry, "rotation", frame.grey, place)
+            after = turning, _profile(odometry, "translation", frame.grey, place)
+            pixel_angle = float(np.deg2rad(odometry.fov_deg)) / size[1]
             step = 0.0, 0.0
             if before is not None:
-                step = motion_between(odometry, before, after, frame.time - time[-1])
+                step = _motion_between(odometry, before, after, pixel_angle, frame.time - time[-1])
             moves.append(step)
             before = after
         time.append(frame.time)
@@ -321,7 +310,11 @@ def video_frames(
         while video.grab():
             time = next(times, None)
             if time is not None and count % config.every == 0:
-                yield Frame(time, _grey(cv2, video, f"{path}, frame {count}"))
+                good, picture = video.retrieve()
+                if not good:
+                    cure = "was the file copied completely?"
+                    raise InputError(f"{path}, frame {count}", "cannot be decoded", "an image", cure)
+                yield Frame(time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)))
             count += 1
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")
@@ -355,14 +348,6 @@ def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: f
         raise InputError(str(path), "no times of its frames", "a frame rate, or a file of stamps", cure)
     rate = config.rate
     return (number / rate for number in itertools.count())
-
-
-def _grey(cv2: ModuleType, video: Any, where: str) -> np.ndarray:
-    """[H, W] uint8: the frame that was last grabbed."""
-    good, picture = video.retrieve()
-    if not good:
-        raise InputError(where, "cannot be decoded", "an image", "was the file copied completely?")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 
 def _opencv() -> ModuleType:

@@ -1,19 +1,11 @@
-"""Runs a protocol: each session through all mappers and methods.
+"""The figures of Fox et al. 2012: worlds, mappers and two filters, run, scored, ranked and drawn.
 
 A set is a session: an arena, a start, the behaviour of the robot and the errors of its odometry, all from one
 seed. All mappers and methods run on the same sets, so their differences are paired.
 
-The result of a reproduction as text: metrics of paths and maps, then equation 6 under all conventions.
-
-Tests of the paper's ranking of its mappers, on the same sets and under all ways to score a map.
-
-The paper ranks its mappers by one number. Two baselines show what that number means: the best constant map,
-which needs no contact, and the same marks drawn along dead reckoning and along the true path. A ranking that
-holds there too is one of the marks, not of the filters.
-
-The protocols of Fox et al. 2012: worlds, mappers and two filters.
-
-Errors of a path with known start, without alignment, and of the offsets between visits of one place.
+The paper ranks its mappers by one number (equation 6). Two baselines show what that number means: the best
+constant map, which needs no contact, and the same marks drawn along dead reckoning and along the true path. A
+ranking that holds there too is one of the marks, not of the filters.
 """
 
 from __future__ import annotations
@@ -81,30 +73,18 @@ FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
 """Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
 
 
-class World(NamedTuple):
-    """An arena and the odometry noise in it.
-
-    Attributes:
-        level: of the odometry noise; the printed filter uses it as the noise of each step.
-        settings: overrides.
-    """
-
-    name: str
-    level: float
-    settings: tuple[str, ...] = ()
-
-
 class Protocol(NamedTuple):
     """A figure of the paper.
 
     Attributes:
-        source: section and figure. stops: numbers of reports after which the result is scored; 0: all.
-            one_arena: whether all sets share an arena. note: printed below the table.
+        source: section and figure. worlds: by name, the level of the odometry noise, which the printed filter
+            uses as the noise of each step, and overrides. stops: numbers of reports after which the result is
+            scored; 0: all. one_arena: whether all sets share an arena. note: printed below the table.
     """
 
     title: str
     source: str
-    worlds: tuple[World, ...]
+    worlds: Mapping[str, tuple[float, tuple[str, ...]]]
     note: str
     mappers: tuple[str, ...] = tuple(MAPPERS)
     methods: tuple[str, ...] = tuple(METHODS)
@@ -112,7 +92,7 @@ class Protocol(NamedTuple):
     one_arena: bool = True
 
 
-_SMALL = (World("1.25 m arena", 0.05),)
+_SMALL: dict[str, tuple[float, tuple[str, ...]]] = {"1.25 m arena": (0.05, ())}
 _LARGE = ("create_simulation.arena.side=2.5", "create_simulation.reports=1500")
 
 PROTOCOLS = {
@@ -132,7 +112,7 @@ PROTOCOLS = {
     "fox-fig6": Protocol(
         "A larger arena at two levels of odometry noise",
         "Fox et al. 2012, III, Fig. 6",
-        (World("2 % noise", 0.02, _LARGE), World("5 % noise", 0.05, _LARGE)),
+        {"2 % noise": (0.02, _LARGE), "5 % noise": (0.05, _LARGE)},
         note="The paper: tracked for 200 steps at 2 %, loops not closed at 5 %. The noise is one scale error "
         "for each straight line or turn; each set has its own arena.",
         mappers=("geometric",),
@@ -142,26 +122,6 @@ PROTOCOLS = {
 }
 
 
-def session_config(world: World, method: str, mapper: str, assignments: Sequence[str] = ()) -> RunConfig:
-    """The configuration of a mapper in a world.
-
-    Raises:
-        InputError: an invalid assignment.
-    """
-    settings = [
-        "backend=grid",
-        f"create_simulation.wheels.level={world.level}",
-        *world.settings,
-        *METHODS[method],
-    ]
-    if method == "as printed":
-        settings.append(f"grid.drift.step={world.level}")
-    settings += [f"touch.reports.walls={MAPPERS[mapper]}", *assignments]
-    return validate(override(parse("create_simulation: {}\n", "the reproduction"), settings), RunConfig)
-
-
-REVISIT_DISTANCE = 0.1
-"""A report this near to an earlier one is a revisit, m: two cells."""
 LEAVE_DISTANCE = 0.5
 """Distance that the robot must have been away in between, m."""
 CLOSED_GAP = 0.1
@@ -195,7 +155,7 @@ def find_revisits(truth: np.ndarray) -> np.ndarray:
         apart = np.hypot(*(truth[:k, :2] - here).T)
         left = np.flatnonzero(apart > LEAVE_DISTANCE)
         before = apart[: left[-1]] if len(left) else apart[:0]
-        if len(before) and before.min() < REVISIT_DISTANCE:
+        if len(before) and before.min() < 0.1:  # m: two cells
             found.append((k, int(before.argmin())))
     return np.array(found, int).reshape(-1, 2)
 
@@ -233,8 +193,8 @@ def render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> 
     done = len({row.number for row in rows})
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
     for world, stop in product(protocol.worlds, range(len(protocol.stops))):
-        these = [row for row in rows if row.key[0] == world.name and row.session.stop == stop]
-        lines += _metric_lines(world.name, these, protocol)
+        these = [row for row in rows if row.key[0] == world and row.session.stop == stop]
+        lines += _metric_lines(world, these, protocol)
     lines += [LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in protocol.methods:
@@ -369,43 +329,31 @@ Rows = Sequence[ResultRow]
 
 
 def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
-    """The figure of a reproduction."""
-    draw, explanation = {
-        "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
-        "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
-        "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
-    }[name]
-    panels, lines = draw(protocol, [row for row in rows if row.key[3] == FILTERED])
-    first_only = name == "fox-fig6" and any(row.number for row in rows)
+    """The figure of a reproduction: method below method, or set below set."""
+    shown = [row for row in rows if row.key[3] == FILTERED]
+    first_only, lines = False, len(protocol.methods)
+    method, mapper = protocol.methods.index, protocol.mappers.index
+    if name == "fox-fig4":  # a mean map for each mapper
+        explanation = "below each mapper: the filter, eq. 6 (mean of the trials' errors)"
+        panels = []
+        for key in product(protocol.methods, protocol.mappers):
+            these = [row for row in shown if row.key[1:3] == key]
+            error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
+            mean = mean_grid([row.session.grid for row in these])
+            panels.append(_panel(key[1], f"{key[0]}, {error:.3f}", these[0])._replace(grid=mean))
+    elif name == "fox-fig5":  # a map with the paths for each mapper and set
+        explanation = "below each: the filter, position error (dead reckoning's), m"
+        shown.sort(key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
+        panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in shown]
+        lines = len(panels) // len(protocol.mappers)
+    else:  # a map of the first set for each world and length
+        explanation = "odometry noise, reports; position error (dead reckoning's), m"
+        first_only = any(row.number for row in rows)
+        first = [row for row in shown if row.number == 0]
+        first.sort(key=lambda row: (method(row.key[1]), row.key[0], row.values["reports"]))
+        panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
     line = f"{protocol.source}  ·  {count_sets(rows, first_only)}  ·  {explanation}"
     return draw_grids(f"{name}: {protocol.title}", line, panels, across=len(panels) // lines)
-
-
-def _means(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A mean map for each mapper, and the number of lines: method below method."""
-    panels = []
-    for method, mapper in product(protocol.methods, protocol.mappers):
-        these = [row for row in rows if row.key[1:3] == (method, mapper)]
-        error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
-        mean = mean_grid([row.session.grid for row in these])
-        panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
-    return panels, len(protocol.methods)
-
-
-def _singles(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A map with the paths for each mapper, and the number of lines: method below method, set below set."""
-    method, mapper = protocol.methods.index, protocol.mappers.index
-    rows = sorted(rows, key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
-    panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in rows]
-    return panels, len(panels) // len(protocol.mappers)
-
-
-def _worlds(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A map of the first set for each world and length, and the number of lines: method below method."""
-    first = [row for row in rows if row.number == 0]
-    first.sort(key=lambda row: (protocol.methods.index(row.key[1]), row.key[0], row.values["reports"]))
-    panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
-    return panels, len(protocol.methods)
 
 
 def _with_paths(name: str, row: ResultRow) -> GridPanel:
@@ -453,16 +401,20 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
         InputError: an invalid assignment.
     """
     jobs = []
-    for number, world in product(range(sets), protocol.worlds):
+    for number, (world, (level, overrides)) in product(range(sets), protocol.worlds.items()):
         own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
         arena = seed if protocol.one_arena else own
         session, where = f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}"
         settings = (session, where, f"session.seed={own}", *assignments)
-        variants = {
-            (method, mapper): session_config(world, method, mapper, settings)
-            for method, mapper in product(protocol.methods, protocol.mappers)
-        }
-        jobs.append(SessionJob(world.name, number, own, seed, protocol.stops, variants))
+        variants = {}
+        for method, mapper in product(protocol.methods, protocol.mappers):
+            given = ["backend=grid", f"create_simulation.wheels.level={level}", *overrides, *METHODS[method]]
+            if method == "as printed":
+                given.append(f"grid.drift.step={level}")
+            given += [f"touch.reports.walls={MAPPERS[mapper]}", *settings]
+            document = parse("create_simulation: {}\n", "the reproduction")
+            variants[method, mapper] = validate(override(document, given), RunConfig)
+        jobs.append(SessionJob(world, number, own, seed, protocol.stops, variants))
     return jobs
 
 

@@ -1,7 +1,5 @@
-"""The protocols: conditions, values printed in Salman & Pearson 2016, and its claims.
-
-Metrics of laps in two directions (Salman & Pearson 2016, IV-B), and of closures across a change.
-"""
+"""The protocols: conditions, values printed in Salman & Pearson 2016, and its claims; metrics of laps in two
+directions (IV-B), and of closures across a change of mazes."""
 
 from __future__ import annotations
 
@@ -271,8 +269,6 @@ PROTOCOLS = {
 }  # fmt: skip
 
 
-BESIDE = 0.02
-"""Steps of the two directions this near in truth count as the same spot, m."""
 DIRECTION_METRICS = (
     "first_anticlockwise_correct", "first_anticlockwise", "last_anticlockwise", "associated_correct",
     "directions_apart", "across",
@@ -296,6 +292,8 @@ def direction_metrics(result: SessionResult, laps: str, change: float) -> dict[s
         the two directions at the same spot, m. across: closures between the parts before and after the
         change.
     """
+    from scipy.spatial import cKDTree
+
     truth = result.truth
     first_after = int(change * len(truth))
     later, earlier = result.closures.reshape(-1, 2).T
@@ -308,12 +306,17 @@ def direction_metrics(result: SessionResult, laps: str, change: float) -> dict[s
     known = ~clockwise & (joined >= 0)
     correct = known & (np.hypot(*(truth - truth[joined])[:, :2].T) < FALSE_CLOSURE_DISTANCE)
     first, last = np.unique(lap[~clockwise])[[0, -1]]
+    # Steps of the two directions within 2 cm in truth are at the same spot.
+    ahead = np.flatnonzero(clockwise)
+    away, row = cKDTree(truth[ahead, :2]).query(truth[~clockwise, :2])
+    beside = away < 0.02
+    step = result.trajectory[~clockwise][beside, :2] - result.trajectory[ahead[row[beside]], :2]
     return metrics | {
         "first_anticlockwise_correct": float(correct[lap == first].mean()),
         "first_anticlockwise": float(known[lap == first].mean()),
         "last_anticlockwise": float(known[lap == last].mean()),
         "associated_correct": float(correct[known].mean()) if known.any() else np.nan,
-        "directions_apart": _directions_apart(result, clockwise),
+        "directions_apart": float(np.median(np.hypot(*step.T))) if len(step) else np.nan,
     }
 
 
@@ -339,13 +342,3 @@ def _associate(result: SessionResult, clockwise: np.ndarray) -> np.ndarray:
         found = [joined[before] for before in (created[step], *earlier.get(step, [])) if 0 <= before < step]
         joined[step] = max(found, default=-1)  # the newest of several
     return joined
-
-
-def _directions_apart(result: SessionResult, clockwise: np.ndarray) -> float:
-    from scipy.spatial import cKDTree
-
-    ahead = np.flatnonzero(clockwise)
-    away, row = cKDTree(result.truth[ahead, :2]).query(result.truth[~clockwise, :2])
-    beside = away < BESIDE
-    step = result.trajectory[~clockwise][beside, :2] - result.trajectory[ahead[row[beside]], :2]
-    return float(np.median(np.hypot(*step.T))) if len(step) else np.nan

@@ -1,4 +1,5 @@
-"""Runs a protocol: all its conditions, methods and controls over the same sets.
+"""The figures of Salman & Pearson 2016: all conditions, methods and controls of a protocol over the same
+sets, its claims tested, its table and its figure.
 
 A set is a maze, a path with its jitter and the errors of the odometry, all from one seed. All conditions and
 methods of a reproduction run on the same sets, so their differences are paired.
@@ -24,7 +25,7 @@ from evaluation.papers.paper_sets import (
     sweep_thresholds,
 )
 from evaluation.papers.salman2016 import paper_figures
-from evaluation.papers.salman2016.paper_figures import DrivenPath, MeasuredQuantity, experience_history
+from evaluation.papers.salman2016.paper_figures import experience_history
 from evaluation.papers.salman2016.protocols import (
     BY_MAZE,
     COMMON,
@@ -90,7 +91,6 @@ LABELS = {
     "across_share": "the same over those in one maze",
     "threshold": "threshold",
 }
-CONTROL_LABELS = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
 
 
 class Verdict(NamedTuple):
@@ -138,7 +138,8 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
     done = 1 + max((row.number for row in rows), default=-1)
     columns = series(protocol, rows)
     methods = [method for method, control in columns if control == "none"]
-    heads = [CONTROL_LABELS[control] + method for method, control in columns]
+    named = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
+    heads = [named[control] + method for method, control in columns]
     width = max(34, *(len(condition.name) + 4 for condition in protocol.conditions))
     wide = max(24, *(len(head) + 2 for head in heads))
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets: median (least-most)"]
@@ -214,11 +215,30 @@ def _short(value: float, digits: int = 3) -> str:
 
 def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: metrics over all sets, or sessions of the first set."""
-    draw_sessions = {"fig2": _drift, "fig3": _history, "fig5": _directions}.get(name)
-    title = f"{name}: {protocol.title}"
-    line = f"{protocol.source}  ·  {count_sets(rows, first_only=draw_sessions is not None)}"
-    if draw_sessions is not None:
-        return draw_sessions(title, line, [row for row in rows if row.session is not None])
+    title, first_only = f"{name}: {protocol.title}", name in ("fig2", "fig3", "fig5")
+    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}"
+    first = [row for row in rows if row.session is not None]
+    if name == "fig2":
+        paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for row in first:
+            laps, result = row.session
+            odometry = compose(result.truth[0], result.odometry)
+            lap = lap_of_step(result.truth, len(laps))
+            paths.setdefault(row.key[0], (result.truth[:, :2], odometry[:, :2], lap))
+        return paper_figures.draw_drift(title, line, paths)
+    if name == "fig3":
+        runs = ((row.key[1], row.session[1]) for row in first)
+        histories = {
+            method: experience_history(run.place, experience_metric_if_defined(run)) for method, run in runs
+        }
+        return paper_figures.draw_experiences(title, line, histories)
+    if name == "fig5":
+        maps = {}
+        for row in sorted(first, key=lambda row: row.key[1]):
+            laps, result = row.session
+            position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
+            maps[f"{row.key[0]}, {row.key[1]}"] = position, clockwise_steps(result.truth, laps)
+        return paper_figures.draw_directions(title, line, maps)
     return (_curves if protocol.swept else _dots)(title, line, protocol, rows)
 
 
@@ -226,18 +246,14 @@ def _dots(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figure
     names = [condition.name for condition in protocol.conditions]
     labels = {"none": "", "shuffled": ", shuffled", "blank": ", no images"}
     shown = [(m, c) for m, c in series(protocol, rows) if c == "none" or m == "ours"]
-    measured = [
-        MeasuredQuantity(
-            LABELS[quantity],
-            {
-                m + labels[c]: np.array([column(rows, (name, m, c), quantity) for name in names])
-                for m, c in shown
-            },
-            np.array([protocol.paper.get((name, quantity), np.nan) for name in names]),
-            quantity in RATIOS,
-        )
-        for quantity in ("arr", "arcr", "em")
-    ]
+    measured = []
+    for quantity in ("arr", "arcr", "em"):
+        values = {
+            m + labels[c]: np.array([column(rows, (name, m, c), quantity) for name in names])
+            for m, c in shown
+        }
+        paper = np.array([protocol.paper.get((name, quantity), np.nan) for name in names])
+        measured.append((LABELS[quantity], values, paper, quantity in RATIOS))
     return paper_figures.draw_measured(title, line, names, measured)
 
 
@@ -252,31 +268,6 @@ def _curves(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figu
             arcr, arr = (np.array([[v[q] for v in values] for values in sets]) for q in ("arcr", "arr"))
             curves.setdefault(noise, {})[name] = (arcr, arr)
     return paper_figures.draw_curves(title, line, curves)
-
-
-def _drift(title: str, line: str, rows: Rows) -> style.Figure:
-    paths: dict[str, DrivenPath] = {}
-    for row in rows:
-        laps, result = row.session
-        odometry = compose(result.truth[0], result.odometry)
-        lap = lap_of_step(result.truth, len(laps))
-        paths.setdefault(row.key[0], DrivenPath(result.truth[:, :2], odometry[:, :2], lap))
-    return paper_figures.draw_drift(title, line, paths)
-
-
-def _history(title: str, line: str, rows: Rows) -> style.Figure:
-    runs = ((row.key[1], row.session[1]) for row in rows)
-    histories = {name: experience_history(run.place, experience_metric_if_defined(run)) for name, run in runs}
-    return paper_figures.draw_experiences(title, line, histories)
-
-
-def _directions(title: str, line: str, rows: Rows) -> style.Figure:
-    maps = {}
-    for row in sorted(rows, key=lambda row: row.key[1]):
-        laps, result = row.session
-        position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
-        maps[f"{row.key[0]}, {row.key[1]}"] = position, clockwise_steps(result.truth, laps)
-    return paper_figures.draw_directions(title, line, maps)
 
 
 class TrialJob(NamedTuple):

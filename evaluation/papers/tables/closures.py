@@ -179,12 +179,8 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
         for k in (0, 2)
     )
     known = np.isfinite(odds)
-    told = (score, accepted.astype(float), odds, ended)
-    return markdown_row(
-        [name, len(sessions), int(known.sum()), int(true[known].sum())]
-        + [_auc(values[known], true[known]) for values in told]
-    )
-
-
-def _auc(values: np.ndarray, happened: np.ndarray) -> str:
-    return f"{auc(values[~happened], values[happened]):.3f}" if happened.any() and not happened.all() else "-"
+    cells, true = [], true[known]
+    for values in (score, accepted.astype(float), odds, ended):
+        both = true.any() and not true.all()
+        cells.append(f"{auc(values[known][~true], values[known][true]):.3f}" if both else "-")
+    return markdown_row([name, len(sessions), int(known.sum()), int(true.sum()), *cells])

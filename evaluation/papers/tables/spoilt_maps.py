@@ -97,40 +97,39 @@ def spoil(
     if recipe.false:
         count, length = (int(random.integers(low, high + 1)) for low, high in (COUNT, LENGTH))
         for _ in range(count):
-            add_false_sequence(graph, log, truth, length, random, ATTEMPTS if recipe.alike else 1)
+            _add_false_sequence(graph, log, truth, length, random, ATTEMPTS if recipe.alike else 1)
     return log
 
 
-def add_false_sequence(
+def _add_false_sequence(
     graph: KeyframeGraph,
     log: ClosureLog,
     truth: np.ndarray,
     length: int,
     random: np.random.Generator,
     choices: int,
-) -> bool:
-    """Accepts a false sequence, the one that looks most alike of at most `choices` pairs of stretches.
-
-    Returns:
-        whether there was one among `ATTEMPTS` random pairs.
-    """
+) -> None:
+    """Accepts the false sequence that looks most alike of at most `choices` pairs of stretches; none if
+    there is none among `ATTEMPTS` random pairs."""
     found: list[tuple[float, int, int]] = []
     first, reckoned = graph.guard + length + 5, graph.dead_reckoned()
     if graph.count - length <= first:
-        return False
+        return
     for _ in range(ATTEMPTS):
         frame = int(random.integers(first, graph.count - length))
         match = int(random.integers(0, frame - graph.guard - length))
         if len(found) < choices and _is_false(graph, reckoned, truth, frame, match, length):
-            found.append((_unlikeness(graph, frame, match, length), frame, match))
+            # Mean misfit of the candidates, about every sixth.
+            steps = range(0, length, max(1, length // 6))
+            misfits = [graph.misfit(frame + k, np.array([match + k]), np.array([False])) for k in steps]
+            found.append((float(np.mean(misfits)), frame, match))
     if not found:
-        return False
+        return
     _, frame, match = min(found)
     evidence = float(random.uniform(*EVIDENCE))
     for k in range(length):
         sequence = log.add(Candidate(frame + k, match + k, 0, 0.9, evidence), k > 0)
     log.judge(sequence, Verdict.ACCEPTED)
-    return True
 
 
 def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robust: bool) -> MapSolution:
@@ -163,10 +162,3 @@ def _is_false(
         if np.hypot(*error[:2]) > AGREEMENT * graph.cell or abs(wrap(error[2])) > AGREEMENT_HEADING:
             return False
     return True
-
-
-def _unlikeness(graph: KeyframeGraph, frame: int, match: int, length: int) -> float:
-    """Mean misfit of the candidates, about every sixth."""
-    ahead = np.array([False])
-    steps = range(0, length, max(1, length // 6))
-    return float(np.mean([graph.misfit(frame + k, np.array([match + k]), ahead) for k in steps]))

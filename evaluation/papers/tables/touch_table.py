@@ -56,7 +56,6 @@ KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
 EXPLORATION = {"path": {"explore": 1500}}
 NOISE = OdometryConfig()
 OPEN_LOOP = {"whisking": {"mode": "open"}}
-HALL = {"mechanics": {"baseline": HALL_BASELINE.model_dump()}}
 
 
 class TouchRow(NamedTuple):
@@ -130,7 +129,10 @@ ROWS = {
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
     "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
     "raw": TouchRow("main from raw samples", MAIN | {"raw": True}),
-    "drift": TouchRow("main from raw samples with drift, colour and creep", MAIN | HALL),
+    "drift": TouchRow(
+        "main from raw samples with drift, colour and creep",
+        MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
+    ),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
@@ -219,20 +221,16 @@ def touch_table(
     for row in rows:
         found = []
         for task, figures in islice(results, counts[row]):
-            log.add(row, task.maze, session_record(figures))
+            record = figures.metrics._asdict() | figures._asdict()
+            del record["metrics"]
+            whisks = record.pop("recovery")  # of which the number of kidnaps and the median are kept
+            recovery = np.median(whisks) if whisks else np.nan
+            log.add(row, task.maze, record | {"kidnaps": len(whisks), "recovery": recovery})
             found.append(figures)
         yield markdown_row([ROWS[row].label, *_cells(found)])
         notes += _notes(row, found)
     yield from ["", *notes] if notes else []
     yield from compare_runs(COMPARED, log, rows)
-
-
-def session_record(figures: SessionFigures) -> dict[str, Any]:
-    """The figures of a session by name; of `recovery` the number of kidnaps and the median."""
-    record = figures.metrics._asdict() | figures._asdict()
-    whisks = record.pop("recovery")
-    del record["metrics"]
-    return record | {"kidnaps": len(whisks), "recovery": np.median(whisks) if whisks else np.nan}
 
 
 def measure_session(task: TouchTask) -> SessionFigures:

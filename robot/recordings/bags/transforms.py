@@ -1,6 +1,5 @@
-"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames.
-
-Poses and velocities in the messages of a topic.
+"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames; the poses and
+velocities in messages of other types, in the plane.
 """
 
 from __future__ import annotations
@@ -8,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from itertools import compress
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -206,13 +206,6 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     return None
 
 
-class _Axes(NamedTuple):
-    x: float
-    y: float
-    z: float
-    w: float = 0.0
-
-
 def poses_between(
     bag: Bag, frames: tuple[str, str], clock: Clock, report: Report, role: str, plane: str
 ) -> Series:
@@ -247,7 +240,13 @@ def poses_between(
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        given = [(_Axes(*shift), _Axes(*turn)) for _, shift, turn, _ in links[lead]]
+        given = [
+            (
+                SimpleNamespace(**dict(zip("xyz", shift, strict=True))),
+                SimpleNamespace(**dict(zip("xyzw", turn, strict=True))),
+            )
+            for _, shift, turn, _ in links[lead]
+        ]
         poses = [pose_in_plane(*pose, where, plane) for pose in given]
         errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
         return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)

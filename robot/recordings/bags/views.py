@@ -1,8 +1,4 @@
-"""Views of a bag from scans, clouds and images.
-
-Grey images from Image and CompressedImage messages.
-
-Ranges of LaserScan and PointCloud2 messages as sectors.
+"""Views of a bag: Image and CompressedImage messages in grey, LaserScan and PointCloud2 messages as sectors.
 
 A beam is *measured* unless its range is NaN, -inf or below `range_min`. Of measured beams, +inf and ranges
 above `range_max` mean that nothing was there. A sector is the mean of min(range, max_range) / max_range over
@@ -27,7 +23,6 @@ from tactile.base.errors import InputError
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGES = (RAW, COMPRESSED)
-LUMA = {"y": 1000, "r": 299, "g": 587, "b": 114}  # per mille (BT.601), as Pillow weighs them
 LARGEST = 1 << 26  # pixels
 
 ENCODINGS: dict[str, tuple[str, str]] = {
@@ -76,15 +71,14 @@ def _raw(message: Any, where: str) -> np.ndarray:
     pixels = np.ndarray((height, width, len(channels)), kind, data.tobytes(), strides=strides)
     if channels == "y":
         grey = (pixels[..., 0] >> 8).astype(np.uint8) if kind.itemsize == 2 else pixels[..., 0].copy()
-        return _without_mosaic(grey) if message.encoding.startswith("bayer") else grey
-    weights = np.array([LUMA.get(name, 0) for name in channels], np.int32)
+        if not message.encoding.startswith("bayer"):
+            return grey
+        # Means of each pixel and its right and lower neighbours, one of each colour of the Bayer filter.
+        near = np.pad(grey.astype(np.uint16), ((0, 1), (0, 1)), "reflect" if min(grey.shape) > 1 else "edge")
+        return ((near[:-1, :-1] + near[1:, :-1] + near[:-1, 1:] + near[1:, 1:] + 2) // 4).astype(np.uint8)
+    luma = {"y": 1000, "r": 299, "g": 587, "b": 114}  # per mille (BT.601), as Pillow weighs them
+    weights = np.array([luma.get(name, 0) for name in channels], np.int32)
     return ((pixels.astype(np.int32) @ weights + 500) // 1000).astype(np.uint8)
-
-
-def _without_mosaic(mosaic: np.ndarray) -> np.ndarray:
-    """[H, W] means of each pixel and its right and lower neighbours, one of each colour of the filter."""
-    near = np.pad(mosaic.astype(np.uint16), ((0, 1), (0, 1)), "reflect" if min(mosaic.shape) > 1 else "edge")
-    return ((near[:-1, :-1] + near[1:, :-1] + near[:-1, 1:] + near[1:, 1:] + 2) // 4).astype(np.uint8)
 
 
 def _decoded(message: Any, where: str) -> np.ndarray:
@@ -114,8 +108,6 @@ def _decoded(message: Any, where: str) -> np.ndarray:
 
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 RING_BEAMS = 360  # of a cloud: the nearest point of each degree
-POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""NumPy types of PointField.datatype."""
 COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
@@ -287,7 +279,17 @@ def cloud_points(message: Any, where: str) -> np.ndarray:
     try:
         if height * width * step > len(data):
             raise ValueError("too few")
-        kinds = [order + POINT_TYPES[fields[name].datatype] for name in "xyz"]
+        types = {
+            1: "i1",
+            2: "u1",
+            3: "i2",
+            4: "u2",
+            5: "i4",
+            6: "u4",
+            7: "f4",
+            8: "f8",
+        }  # PointField.datatype
+        kinds = [order + types[fields[name].datatype] for name in "xyz"]
         offsets = [fields[name].offset for name in "xyz"]
         kind = np.dtype({"names": list("xyz"), "formats": kinds, "offsets": offsets, "itemsize": step})
         rows = np.ndarray((height, width), kind, data.tobytes(), strides=(row, step))
