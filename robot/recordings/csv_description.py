@@ -17,16 +17,16 @@ from robot.recordings.csv_reader import other_plane, rounded_rate
 from tactile.base.errors import InputError
 
 TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "header_stamp", "datetime")
-FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
-LEFT_SPEEDS = ("vy", "v_y", "linear_y")
-TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
+_FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
+_LEFT_SPEEDS = ("vy", "v_y", "linear_y")
+_TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
 DISTANCES = ("distance", "dist", "ds", "forward")
 TURNS = ("turn", "dtheta", "dth", "rotation")
 HEADINGS = ("heading", "theta", "th", "yaw")
 LABELS = ("label", "place", "place_id")
 """Names of columns, in lower case; those with `_` may also be the end of a name, as in rostopic's."""
 PLACE = re.compile(r"(^|_)(p|t|pos|position|pose|translation|location)_?$")
-QUATERNION = re.compile(r"(^|_)(q|quat|orient|rot)")
+_QUATERNION = re.compile(r"(^|_)(q|quat|orient|rot)")
 MOVING = re.compile(r"(^|_)(v|w|a|b|vel|acc|lin|ang|gyro|imu|twist)")
 """Names before x, y, z and w: of positions, of quaternions, and of what is neither."""
 NO_VIEWS = re.compile(r"covariance|intensit", re.IGNORECASE)
@@ -34,14 +34,14 @@ EPOCH = 1e9, 4e9
 """Times of day of 2001 to 2096 in s, which tells the unit of such times."""
 TRUE = re.compile(r"gt|true|truth|ground|mocap|vicon|reference")
 """Names of columns and files with true poses."""
-FEWEST_PIXELS = 4
+_FEWEST_PIXELS = 4
 """Least number of numbered columns that make a view."""
 COLUMNS = (18, 36, 24, 20, 30, 16, 12, 32, 15, 10, 9, 8, 6)
 """Columns of a view of ranges, the first that divides their number."""
 
 
 class CsvDescription(NamedTuple):
-    """A file and its companions.
+    """A file and its _companions.
 
     Attributes:
         rows: number of lines with values. time: [N] s, finite; None without a column of times.
@@ -77,7 +77,7 @@ def describe_csv(path: Path) -> CsvDescription:
     odometry = _odometry(file)
     units = _units(file, time, odometry or {})
     file = replace(file, clock=units.get("time"))
-    files = [file, *companions(file, time)]
+    files = [file, *_companions(file, time)]
     if odometry is None:
         missing.append("odometry: columns x, y, heading, or v, w, or distance, turn")
     else:
@@ -115,7 +115,7 @@ def describe_csv(path: Path) -> CsvDescription:
     )
 
 
-def companions(file: CsvFile, time: str) -> list[CsvFile]:
+def _companions(file: CsvFile, time: str) -> list[CsvFile]:
     """CSV files beside it whose names share its first word, with times that overlap."""
     word = re.split(r"[_\-. ]", file.path.stem)[0]
     own = file.column(time, "time")
@@ -175,7 +175,7 @@ def _units(file: CsvFile, time: str, odometry: dict[str, Any]) -> dict[str, str]
 def _poses(file: CsvFile) -> dict[str, dict[str, Any]]:
     """Columns x, y, and heading or quaternion, by the common prefix of x and y."""
     lower, found = _lower(file), dict[str, dict[str, Any]]()
-    stems = [name[:-1] for name in lower if name.endswith("w") and QUATERNION.search(name[:-1])]
+    stems = [name[:-1] for name in lower if name.endswith("w") and _QUATERNION.search(name[:-1])]
     stems = [stem for stem in stems if all(stem + axis in lower for axis in "xyz")]
     turns = {stem: [lower[stem + axis] for axis in "xyzw"] for stem in stems}
     for name in lower:
@@ -208,9 +208,9 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
         poses.pop("", None)
     if poses:
         return {"pose": next(iter(poses.values()))}
-    forward, turn = _named(file, FORWARD_SPEEDS), _named(file, TURN_RATES)
+    forward, turn = _named(file, _FORWARD_SPEEDS), _named(file, _TURN_RATES)
     if forward is not None and turn is not None:
-        left = _named(file, LEFT_SPEEDS)
+        left = _named(file, _LEFT_SPEEDS)
         return {"velocity": {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
     forward, turn = _named(file, DISTANCES), _named(file, TURNS)
     return (
@@ -236,7 +236,7 @@ def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]
     """The settings of views from this file, and their largest range, NaN without ranges."""
     found = [("range" in stem.lower(), count, stem) for stem, count in _stems(other).items()]
     _, count, prefix = max((entry for entry in found if not NO_VIEWS.search(entry[2])), default=(0, 0, ""))
-    if count < FEWEST_PIXELS:
+    if count < _FEWEST_PIXELS:
         return None, np.nan
     values = other.block(prefix)[0]
     known = values[np.isfinite(values) & (values > 0)]
@@ -268,7 +268,7 @@ def _columns(file: CsvFile) -> tuple[tuple[str, float, float], ...]:
     found, stems = dict[str, np.ndarray](), _stems(file)
     for place, name in enumerate(file.names):
         prefix = name.rstrip("0123456789")
-        if prefix != name and stems[prefix] >= FEWEST_PIXELS:
+        if prefix != name and stems[prefix] >= _FEWEST_PIXELS:
             numbers = list(file.numbered(prefix))
             joined = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}"
             if joined not in found:

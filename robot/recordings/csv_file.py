@@ -22,7 +22,7 @@ MAX_CELLS = 1 << 25
 """Limit of a file's rows x columns."""
 EMPTY, WORD, CUT = 1, 2, 3
 """Why a cell has no number: nothing in it, text in it, or its row has another number of cells."""
-COMMENT = "#%"  # a line that begins so is a comment, or the header
+_COMMENT = "#%"  # a line that begins so is a comment, or the header
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +233,7 @@ def _lines_of(content: bytes, path: Path) -> list[str]:
 def _is_skipped(line: str) -> bool:
     """Whether all cells of a line are empty, or it is a comment."""
     begin = line.lstrip(' ,;\t"\v\f')[:1]
-    return not begin or begin in COMMENT
+    return not begin or begin in _COMMENT
 
 
 def _header(path: Path, lines: list[str]) -> tuple[int, str, tuple[str, ...]]:
@@ -260,7 +260,7 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, tuple[str, ...]]:
 
 def _names(line: str, row: str) -> tuple[str, list[str]]:
     """What separates the names of a header line, above this row, and the names."""
-    line = line.lstrip().lstrip(COMMENT).replace("\xa0", " ").strip(" ")
+    line = line.lstrip().lstrip(_COMMENT).replace("\xa0", " ").strip(" ")
     spaced = 1 < len(line.split()) == len(row.split())
     mark = next((mark for mark in ",;\t" if mark in line), " " if spaced else ",")
     return mark, [name.strip() for name in _split(line, mark)]

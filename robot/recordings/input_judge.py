@@ -40,7 +40,7 @@ from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 
 RATIO = 30.0  # of odometry and truth; correct data are near 1, a wrong unit gives 57 or 1000
-GLITCHES = 2  # number of fastest steps that are ignored, or a hundredth of all if that is more
+_GLITCHES = 2  # number of fastest steps that are ignored, or a hundredth of all if that is more
 JUMP = 10.0
 """Typical steps above which a step is a jump; clean recordings stay below 5.1."""
 LEAST_TURN = 1.0
@@ -156,7 +156,7 @@ class InputJudge:
                 said = "headings agree with the direction of motion in degrees, and not in radians"
                 return [InputError(where, said, "headings in radians", (cures or unit_cure)("angle", "deg"))]
             errors = []
-            for finding in judge_steps(track, self.limits, clock):
+            for finding in _judge_steps(track, self.limits, clock):
                 at = where if finding.row is None else place(finding.row)
                 if finding.refused:
                     errors.append(InputError(at, finding.found, finding.expected, finding.cure))
@@ -175,11 +175,11 @@ def judge_motion(time: np.ndarray, motion: np.ndarray, where: str) -> list[str]:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s). where: names the session.
     """
     track = MotionTrack(time, np.ones(len(time), bool), motion)
-    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in judge_steps(track)]
+    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in _judge_steps(track)]
     return [*map(str, unit_errors(track, where)), *found]
 
 
-class Finding(NamedTuple):
+class _Finding(NamedTuple):
     """A finding. Attributes: refused: whether it is an error. row: its first row, None for all of them."""
 
     refused: bool
@@ -190,9 +190,9 @@ class Finding(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def judge_steps(
+def _judge_steps(
     track: MotionTrack, limits: UnitLimits = DEFAULT_LIMITS, clock: str = ""
-) -> Iterator[Finding]:
+) -> Iterator[_Finding]:
     """Findings in single steps of a track whose units are right, errors first.
 
     Args:
@@ -214,7 +214,7 @@ def judge_steps(
     path, speed = float(steps.length.sum()), steps.typical_length / (steps.interval or 1.0)
     if 0 < path < LEAST_PATH and speed < CRAWL:
         cure = "if these are kilometres, --set recording.odometry.length_scale=1000"
-        yield Finding(False, None, f"the whole path is {path:.3g} m, at {speed:.2g} m/s", "", cure)
+        yield _Finding(False, None, f"the whole path is {path:.3g} m, at {speed:.2g} m/s", "", cure)
 
 
 class _Steps:
@@ -254,7 +254,7 @@ def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     return np.zeros(len(amounts), bool)
 
 
-def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: str) -> Finding:
+def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: str) -> _Finding:
     moved = (steps.length > JUMP * steps.typical_length) | (steps.turn > JUMP * steps.typical_turn)
     wrong = gaps & moved if held else np.zeros(len(gaps), bool)
     first = int((wrong if wrong.any() else gaps).argmax())
@@ -265,13 +265,13 @@ def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: s
         found += f": the velocity that holds over it moves the robot by {steps.length[first]:.4g} m"
         found += f" and {steps.turn[first]:.3g} rad, and nobody knows how it moved"
         cure = f"if the clock jumped or the robot stood, {clock or _largest(steps, wrong)}; {stretch}"
-        return Finding(True, int(rows[first]), found, "no gap in velocities", cure)
+        return _Finding(True, int(rows[first]), found, "no gap in velocities", cure)
     what = "how the robot moved is not known" if held else "poses and motions bridge it, views do not"
     cure = f"if the clock jumped, {clock}" if clock else f"look at it: {what}"
-    return Finding(False, int(rows[first]), f"{found} ({what})" if clock else found, "", cure)
+    return _Finding(False, int(rows[first]), f"{found} ({what})" if clock else found, "", cure)
 
 
-def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits) -> Finding:
+def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits) -> _Finding:
     first = int(jumps.argmax())
     speed = steps.length / np.maximum(steps.duration, 1e-9)
     found = f"the odometry jumps by {steps.length[first]:.4g} m and {steps.turn[first]:.3g} rad in "
@@ -281,7 +281,7 @@ def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits
     cause = "a wild pose" if back else "a reset of the odometry, or a robot that was carried"
     cure = f"{cause}: {_largest(steps, jumps)}; or choose a stretch with recording.from and recording.to"
     refused = bool((speed[jumps] > limits.speed).any())
-    return Finding(refused, int(rows[first]), found, "steps that this robot can make", cure)
+    return _Finding(refused, int(rows[first]), found, "steps that this robot can make", cure)
 
 
 def _largest(steps: _Steps, wrong: np.ndarray) -> str:
@@ -296,20 +296,20 @@ def _largest(steps: _Steps, wrong: np.ndarray) -> str:
     return f"{' '.join(words)} repeats the step before instead" if words else "drop these rows"
 
 
-def _two_publishers(poses: np.ndarray) -> Finding | None:
+def _two_publishers(poses: np.ndarray) -> _Finding | None:
     """Positions that jump between two paths: each leads back to where the robot was two messages before."""
     once = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     twice = np.hypot(*(poses[2:, :2] - poses[:-2, :2]).T)
     moved = (once[:-1] > 0) & (once[1:] > 0)
     # Two publishers: a tenth of the steps leads back to within a quarter of its length.
     back = moved & (twice < 0.25 * np.minimum(once[:-1], once[1:]))
-    if not back.sum() > max(0.1 * len(poses), GLITCHES):
+    if not back.sum() > max(0.1 * len(poses), _GLITCHES):
         return None
     path, alone = float(once.sum()), float(np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum())
     found = f"{int(back.sum())} of {len(poses)} poses lead back to where the robot was before: the path is "
     found += f"{path:.4g} m, that of every second message {alone:.4g} m, so two nodes publish here"
     cure = "--set recording.topics.odometry.every=2, or record each node under a topic of its own"
-    return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
+    return _Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
 
 
 def _are_degrees(poses: np.ndarray) -> bool:
@@ -324,7 +324,7 @@ def _are_degrees(poses: np.ndarray) -> bool:
     return bool(agree[0] < 0.5 and agree[1] > 0.9)
 
 
-def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
+def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> _Finding | None:
     """Coordinates so far from the origin that numbers lie apart by much of a step."""
     places = poses[:, :2]
     single = places.astype(np.float32)
@@ -336,7 +336,7 @@ def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
     cure = "write them in double precision or from a near origin; of a bag, take velocities: "
     cure += "--set recording.topics.odometry.use=twist"
-    return Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
+    return _Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
 
 
 def typical_motion(track: MotionTrack) -> TypicalMotion:
@@ -499,7 +499,7 @@ def heading_errors(
 def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
     """The rate above which half of the total amount [N] falls."""
     rate = amount / duration
-    ignored = max(GLITCHES, int(0.01 * len(rate)))
+    ignored = max(_GLITCHES, int(0.01 * len(rate)))
     order = np.argsort(rate)[: max(len(rate) - ignored, 0)]
     done = np.cumsum(amount[order])
     return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
@@ -513,7 +513,7 @@ def _compare_with_truth(
     if track.truth is None:
         return nothing
     rows = np.flatnonzero(np.isfinite(track.truth).all(axis=1))
-    if len(rows) <= GLITCHES + 1:
+    if len(rows) <= _GLITCHES + 1:
         return nothing
     motion, truth = np.where(good[:, None], track.motion, 0.0), track.truth[rows]
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
@@ -528,7 +528,7 @@ def _compare_with_truth(
         if (step := abs(point - last)) >= 0.05:
             steps.append(step)
             last = point
-    totals = [float(np.sort(each)[:-GLITCHES].sum()) for each in (driven, np.array(steps), *turned)]
+    totals = [float(np.sort(each)[:-_GLITCHES].sum()) for each in (driven, np.array(steps), *turned)]
     return speed, (totals[0], totals[1]), (totals[2], totals[3])
 
 

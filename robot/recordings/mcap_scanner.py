@@ -45,10 +45,10 @@ from robot.sources.source import Sample, SourceInfo
 from tactile.base.files import MOST_BYTES
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
-DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+_DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
-class Unclosed(EndOfFile):
+class _Unclosed(EndOfFile):
     """The file ends after a whole record, as that of a killed writer does, and not with its closing one."""
 
 
@@ -74,8 +74,8 @@ class _BoundedFile:
         return content
 
 
-def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """All records in order, those in chunks included; raises one of `DAMAGE_ERRORS`."""
+def _read_records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """All records in order, those in chunks included; raises one of `_DAMAGE_ERRORS`."""
     bounded, left = _BoundedFile(file), -1  # bytes after the last whole record
     reader = StreamReader(cast(Any, bounded), emit_chunks=True, validate_crcs=True)
     try:
@@ -86,11 +86,11 @@ def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
             elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
                 yield record
     except EndOfFile as error:
-        raise Unclosed if left == 0 else error from None
+        raise _Unclosed if left == 0 else error from None
 
 
 def open_chunk(chunk: Chunk) -> list[McapRecord]:
-    """The records in a chunk; raises as `read_records`."""
+    """The records in a chunk; raises as `_read_records`."""
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
     size = len(chunk.data)
@@ -167,7 +167,7 @@ def is_foreign(path: Path) -> bool:
                     return False
                 if isinstance(record, (Chunk, Message)):
                     return True
-    except (OSError, *DAMAGE_ERRORS):
+    except (OSError, *_DAMAGE_ERRORS):
         return not library.startswith(OURS)
     return True
 
@@ -223,7 +223,7 @@ class McapScanner:
         names: dict[int, str] = {}  # schema of each channel; '': not a ratslam topic
         truth: bytes | None = None
         try:
-            for record in read_records(file):
+            for record in _read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = RecordingDescription.from_metadata(record.metadata)
                     self._frames = FrameWindow(empty_frames(self.description.whiskers))
@@ -251,10 +251,10 @@ class McapScanner:
                     truth = None if reading else truth
                 elif isinstance(record, Statistics):
                     self._check_counts(record, names)
-        except DAMAGE_ERRORS as error:
+        except _DAMAGE_ERRORS as error:
             text = str(error) or type(error).__name__
             self.broken = "it ends too early" if isinstance(error, EndOfFile) else text
-            self.broken = UNCLOSED if isinstance(error, Unclosed) and truth is None else self.broken
+            self.broken = UNCLOSED if isinstance(error, _Unclosed) and truth is None else self.broken
         else:
             self.broken = ""
 

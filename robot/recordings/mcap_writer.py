@@ -20,7 +20,7 @@ from robot.sources.source import Sample, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file
 
-CHUNK_BYTES = 1 << 16
+_CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
 
 
@@ -39,7 +39,7 @@ class McapWriter:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
         info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
-        chunk_s: a chunk is written when it has `CHUNK_BYTES`, or when the time of its last message differs
+        chunk_s: a chunk is written when it has `_CHUNK_BYTES`, or when the time of its last message differs
             from that of the previous chunk by this many seconds.
 
     Attributes:
@@ -101,7 +101,7 @@ class McapWriter:
             return
         self._number += 1
         self.count += name in READINGS
-        if self._pending >= CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
+        if self._pending >= _CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
             self.flush()
             self._flushed = time
 

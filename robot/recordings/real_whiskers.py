@@ -50,7 +50,7 @@ def read_columns(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, str]:
     return _parse(path, rows, columns, first_line=2), digest_of([content])
 
 
-def read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
+def _read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
     """The numbers [N, count] of a file without a header, and sha256 (hex) of the file.
 
     Raises:
@@ -290,7 +290,7 @@ def read_stage_calibration(path: Path) -> StageCalibration:
     return StageCalibration(recording.position[~free], base, above[~free])
 
 
-def open_stage(config: StageConfig) -> Source:
+def _open_stage(config: StageConfig) -> Source:
     """The source of a file; its motion and its true positions are the stage's x and y.
 
     Raises:
@@ -313,11 +313,11 @@ def open_stage(config: StageConfig) -> Source:
     )
 
 
-STAGE = SourceEntry(StageConfig, lambda config, warn: open_stage(config))
+STAGE = SourceEntry(StageConfig, lambda config, warn: _open_stage(config))
 
 
-OBJECTS_WHISKERS, ROOTS = 8, 16
-"""Whiskers that feel the objects, and the displacements of the root that each gives."""
+OBJECTS_WHISKERS = 8
+"""Whiskers that feel the objects; each gives 16 displacements of its root."""
 
 
 class ObjectRecord(NamedTuple):
@@ -345,14 +345,14 @@ def read_object(path: Path) -> ObjectRecord:
     16 successive ones are taken to.
 
     Raises:
-        InputError: as `read_rows`, or a row is not of 128 whole numbers.
+        InputError: as `_read_rows`, or a row is not of 128 whole numbers.
     """
-    table, digest = read_rows(path, OBJECTS_WHISKERS * ROOTS)
+    table, digest = _read_rows(path, OBJECTS_WHISKERS * 16)
     if (broken := np.argwhere(table != np.round(table))).size:
         row, column = broken[0].tolist()
         found = f"{table[row, column]:g} in column {column + 1}"
         raise InputError(f"{path}:{row + 1}", found, "whole numbers of pixels")
-    return ObjectRecord(table.reshape(-1, OBJECTS_WHISKERS, ROOTS), digest)
+    return ObjectRecord(table.reshape(-1, OBJECTS_WHISKERS, 16), digest)
 
 
 def open_object(config: ObjectConfig) -> InMemorySource:
@@ -369,7 +369,7 @@ def open_object(config: ObjectConfig) -> InMemorySource:
 OBJECTS = SourceEntry(ObjectConfig, lambda config, warn: open_object(config))
 
 
-FINGERS, TAXELS = 3, 22
+_FINGERS, _TAXELS = 3, 22
 
 
 class TaxelContact(NamedTuple):
@@ -395,7 +395,8 @@ class TaxelConfig(Settings):
 
 
 def read_contacts(path: Path) -> list[TaxelContact]:
-    """All contacts of a file.
+    """All contacts of a file with one cell array: objects x (position of the hand, fingertips 1 to 3) x
+    trials, or the same cut into single contacts (x contacts). A cell of a fingertip is samples x 22 pressures.
 
     Raises:
         InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is
@@ -415,9 +416,9 @@ def _contacts(path: Path, content: bytes) -> list[TaxelContact]:
         there = [name for name in arrays if not name.startswith("__")]
         raise missing_error(str(path), "array", known[0], there)
     cells = arrays[name]
-    if cells.dtype != object or cells.ndim not in (3, 4) or cells.shape[1] != 1 + FINGERS or not cells.size:
+    if cells.dtype != object or cells.ndim not in (3, 4) or cells.shape[1] != 1 + _FINGERS or not cells.size:
         found = f"{name} of {cells.dtype}, {' x '.join(map(str, cells.shape))}"
-        expected = f"a cell array objects x {1 + FINGERS} x trials (x contacts)"
+        expected = f"a cell array objects x {1 + _FINGERS} x trials (x contacts)"
         raise InputError(str(path), found, expected)
     cells = cells.reshape(*cells.shape[:3], -1)
     numbers = np.ndindex(cells.shape[0], *cells.shape[2:])
@@ -433,9 +434,9 @@ def _pressure(where: str, fingers: np.ndarray, number: tuple[int, int, int]) -> 
     where = f"{where}, object {thing}, trial {trial}, contact {contact}"
     shapes = {finger.shape for finger in fingers}
     samples, *columns = fingers[0].shape
-    if len(shapes) > 1 or columns != [TAXELS] or not samples:
+    if len(shapes) > 1 or columns != [_TAXELS] or not samples:
         found = f"fingertips of {', '.join(' x '.join(map(str, finger.shape)) for finger in fingers)}"
-        raise InputError(where, found, f"the same number of samples x {TAXELS} for each")
+        raise InputError(where, found, f"the same number of samples x {_TAXELS} for each")
     pressure = np.stack(list(fingers), axis=1).astype(float)
     if not np.isfinite(pressure).all():
         raise InputError(where, f"{np.sum(~np.isfinite(pressure))} values that are not finite", "pressures")
@@ -456,7 +457,7 @@ def open_contacts(config: TaxelConfig) -> InMemorySource:
         raise InputError("source.settings.object", str(config.object), f"1 to {last}")
     views = np.concatenate(chosen)[..., None]
     digest = digest_of([content, str(config.object).encode()])
-    time, alive = np.arange(len(views), dtype=float), np.ones(FINGERS * TAXELS, bool)
+    time, alive = np.arange(len(views), dtype=float), np.ones(_FINGERS * _TAXELS, bool)
     return _source(f"{config.file.stem}, object {config.object}", digest, time, views, alive=alive)
 
 

@@ -1,18 +1,12 @@
-"""Video files: frames as grey images with a time each.
+"""A camera as a recording: frames of video files, their views, and visual odometry where there is no other.
 
-Views from images: a crop of the grey image, reduced by block means to a few values in 0..1.
+A view is a crop of the grey image, reduced by block means to a few values in 0..1: the first step of a view
+template (Ball et al. 2013, section 3). The second, normalisation, is done by `templates` of a run.
 
-The first step of a view template (Ball et al. 2013, section 3). The second, normalisation of the values, is
-done by `templates` of a run for every kind of view.
-
-Odometry from a camera alone, by the change of two intensity profiles.
-
-A profile is the mean of each column of a crop, divided by the profile's mean, so that exposure cancels out.
-The shift between consecutive profiles is the turn; what differs after the best shift is the distance
-(Milford & Wyeth 2008). Nothing fixes the scale of distances: they are in VO metres, `scaling` of them for a
-difference of 1.
-
-Frames of a camera to rows of a recording: views, and visual odometry where there is no other.
+Visual odometry (Milford & Wyeth 2008) compares two intensity profiles: the mean of each column of a crop,
+divided by the profile's mean, so that exposure cancels out. The shift between consecutive profiles is the
+turn; what differs after the best shift is the distance. Nothing fixes the scale of distances: they are in VO
+metres, `scaling` of them for a difference of 1.
 """
 
 from __future__ import annotations
@@ -61,7 +55,7 @@ class ImageViewConfig(Settings):
     """C, columns of a view."""
 
 
-def cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
+def _cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
     """The part of an image [H, W] as a view [h, w] of the same memory.
 
     Args:
@@ -87,7 +81,7 @@ def image_view(config: ImageViewConfig, grey: np.ndarray, where: str = "image") 
     Raises:
         InputError: the crop is not a part of the image, or has fewer pixels than the view along one axis.
     """
-    part = cropped(config.crop, grey, where, "image.crop")
+    part = _cropped(config.crop, grey, where, "image.crop")
     height, width = part.shape
     if height < config.rows or width < config.columns:
         found = f"the crop has {width} x {height} pixels"
@@ -148,7 +142,7 @@ def _motion_between(
 
 
 def _profile(config: VisualOdometryConfig, name: str, grey: np.ndarray, where: str) -> Profile:
-    part = cropped(getattr(config, name), grey, where, f"visual_odometry.{name}")
+    part = _cropped(getattr(config, name), grey, where, f"visual_odometry.{name}")
     sums = part.sum(axis=0, dtype=np.int64)
     total = int(sums.sum())
     values = sums * (len(sums) / total) if total else np.ones(len(sums))

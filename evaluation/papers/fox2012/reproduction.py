@@ -51,7 +51,7 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
 MAPPERS = {"blob": "none", "geometric": "geometric", "template": "template", "fused": "fused"}
-"""`touch.reports.walls` of the paper's three mappers (II-E to II-G), and ours."""
+"""`touch.reports.walls` of the paper's three mappers (II-E to II-G), and a fourth that fuses them."""
 PAPERS = ("blob", "geometric", "template")  # the paper's mappers from worst to best as printed (III)
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
@@ -124,7 +124,7 @@ PROTOCOLS = {
 
 LEAVE_DISTANCE = 0.5
 """Distance that the robot must have been away in between, m."""
-CLOSED_GAP = 0.1
+_CLOSED_GAP = 0.1
 """A revisit is closed if the path gives the offset of the two visits to this error, m."""
 
 
@@ -134,7 +134,7 @@ def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dic
     Returns:
         online_error, final_error: mean position errors, m. online_heading_error_deg: mean, degrees. revisits:
         number of reports at an earlier place. revisits_closed: share of these whose offset from the earlier
-        visit the path gives to `CLOSED_GAP`. revisit_gap: mean error of that offset, m.
+        visit the path gives to `_CLOSED_GAP`. revisit_gap: mean error of that offset, m.
     """
     later, earlier = find_revisits(truth).T
     gap = np.hypot(*((path[later] - path[earlier]) - (truth[later] - truth[earlier]))[:, :2].T)
@@ -143,7 +143,7 @@ def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dic
         "final_error": position_error(path, truth),
         "online_heading_error_deg": float(np.degrees(np.abs(wrap(online[:, 2] - truth[:, 2])).mean())),
         "revisits": len(gap),
-        "revisits_closed": float((gap < CLOSED_GAP).mean()) if len(gap) else None,
+        "revisits_closed": float((gap < _CLOSED_GAP).mean()) if len(gap) else None,
         "revisit_gap": float(gap.mean()) if len(gap) else None,
     }
 
@@ -162,13 +162,13 @@ def find_revisits(truth: np.ndarray) -> np.ndarray:
 
 KEY = ("world", "method", "mapper", "along")
 """Names of a result; the map is drawn `along` the scored path: `FILTERED`, `RECKONED` or `TRUE`."""
-MAP_METRICS = (
+_MAP_METRICS = (
     "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
     "map_chamfer_walls",
 )  # fmt: skip
 FIELDS = (
     "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
-    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *MAP_METRICS,
+    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *_MAP_METRICS,
 )  # fmt: skip
 """Columns of metrics in NAME.csv."""
 
@@ -176,26 +176,26 @@ HEAD = (
     f"{'':<30}{'online':>7}{'final':>7}{'heading':>9}{'/ dead r.':>11}{'better in':>11}{'gap':>7}"
     f"{'closed':>8}{'eq. 6':>8}{'Brier sk.':>11}{'AUC':>7}{'Chamfer':>15}"
 )
-LEGEND = (
+_LEGEND = (
     "online, final: mean position error of the online and the final poses, m, with known start, not aligned; "
     "heading: online,\ndegrees; / dead r.: online error over dead reckoning's, and in how many sets it is "
     "smaller; gap, closed: error of the final path\nbetween the visits of a place, m, and share of the "
-    f"revisits with less than {CLOSED_GAP:g} m (- without revisits); eq. 6: all cells, unknown\n"
+    f"revisits with less than {_CLOSED_GAP:g} m (- without revisits); eq. 6: all cells, unknown\n"
     "outside, raw; Brier skill, wall AUC and Chamfer (map to walls, walls to map, m): over the cells that "
     "whiskers can sense. Means over sets."
 )
 
-PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
+_PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
 
 
-def render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
+def _render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
     """All metrics of a reproduction, then the tests of the paper's order of mappers."""
     done = len({row.number for row in rows})
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
     for world, stop in product(protocol.worlds, range(len(protocol.stops))):
         these = [row for row in rows if row.key[0] == world and row.session.stop == stop]
         lines += _metric_lines(world, these, protocol)
-    lines += [LEGEND, ""]
+    lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in protocol.methods:
             scores = [
@@ -215,9 +215,9 @@ def _metric_lines(world: str, rows: Sequence[ResultRow], protocol: Protocol) -> 
     counts = [row.values["reports"] for row in rows]
     spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
     lines = [f"{world}, {spread} reports", HEAD]
-    for method, along, mapper in product(protocol.methods, PREFIXES, protocol.mappers):
+    for method, along, mapper in product(protocol.methods, _PREFIXES, protocol.mappers):
         these = [row for row in rows if row.key[1:] == (method, mapper, along)]
-        lines += [_line(PREFIXES[along].format(method) + mapper, these)] if these else []
+        lines += [_line(_PREFIXES[along].format(method) + mapper, these)] if these else []
     return [*lines, ""]
 
 
@@ -257,7 +257,7 @@ class Measure(NamedTuple):
     trivial: float | Convention
 
 
-class Ranking(NamedTuple):
+class _Ranking(NamedTuple):
     """The test of the paper's ranking under one measure.
 
     Attributes:
@@ -286,7 +286,7 @@ MEASURES = (
 
 def rank_mappers(
     rows: Sequence[ResultRow], method: str, measure: Measure, along: str = FILTERED
-) -> Ranking | None:
+) -> _Ranking | None:
     """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
     score = measure.sign * np.array([column(rows, (method, name, along), measure.key) for name in PAPERS])
     score = score[:, np.isfinite(score).all(axis=0)]
@@ -299,7 +299,7 @@ def rank_mappers(
     trivial = measure.trivial
     if isinstance(trivial, Convention):
         trivial = float(np.mean([row.session.score.under(trivial).best for row in rows]))
-    return Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
+    return _Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
 
 
 def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
@@ -328,7 +328,7 @@ def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
 Rows = Sequence[ResultRow]
 
 
-def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
+def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: method below method, or set below set."""
     shown = [row for row in rows if row.key[3] == FILTERED]
     first_only, lines = False, len(protocol.methods)
@@ -366,7 +366,7 @@ def _panel(name: str, line: str, row: ResultRow) -> GridPanel:
     return GridPanel(name, line, row.session.grid, wall_segments(row.session.arena))
 
 
-class SessionJob(NamedTuple):
+class _SessionJob(NamedTuple):
     """A session to simulate and filter.
 
     Attributes:
@@ -382,7 +382,7 @@ class SessionJob(NamedTuple):
     variants: Mapping[tuple[str, str], RunConfig]
 
 
-class MapResult(NamedTuple):
+class _MapResult(NamedTuple):
     """The map and the paths [T, 3] of a row, in the frame of the arena; `stop` is the index of its stop."""
 
     stop: int
@@ -394,7 +394,7 @@ class MapResult(NamedTuple):
     online: np.ndarray
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[SessionJob]:
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[_SessionJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:
@@ -414,11 +414,11 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
             given += [f"touch.reports.walls={MAPPERS[mapper]}", *settings]
             document = parse("create_simulation: {}\n", "the reproduction")
             variants[method, mapper] = validate(override(document, given), RunConfig)
-        jobs.append(SessionJob(world, number, own, seed, protocol.stops, variants))
+        jobs.append(_SessionJob(world, number, own, seed, protocol.stops, variants))
     return jobs
 
 
-def run_job(job: SessionJob) -> list[ResultRow]:
+def run_job(job: _SessionJob) -> list[ResultRow]:
     """The results of all variants on a session, and of their marks along paths without a filter.
 
     Raises:
@@ -444,7 +444,7 @@ def run_job(job: SessionJob) -> list[ResultRow]:
 
 
 def _score(
-    job: SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
+    job: _SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
 ) -> ResultRow:
     count = len(one.path)
     truth, odometry = session.truth[:count], session.odometry[:count]
@@ -454,11 +454,11 @@ def _score(
         "odometry_error": position_error(odometry, truth),
         **path_metrics(one.online, one.path, truth),
         **{error.convention.column: error.error for error in score.errors},
-        **{name: score.quantities[name].value for name in MAP_METRICS},
+        **{name: score.quantities[name].value for name in _MAP_METRICS},
     }
-    result = MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
+    result = _MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
     return ResultRow((job.world, *key), job.number, job.seed, values, result)
 
 
 _run = partial(run_with_progress, run_job)
-PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, draw_reproduction, render_results)
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, _draw_reproduction, _render_results)

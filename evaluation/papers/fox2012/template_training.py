@@ -29,7 +29,7 @@ DURATIONS = (0.5, 1.0, 2.0)
 """Durations of the tested drives after first contact, s; in arenas mostly 1 to 2 s."""
 ESTIMATORS = ("winner", "between", "fused")
 """Eq. 5; the minimum of a parabola through the best template and its neighbours; of the sliding tip."""
-LARGE_ERROR_DEG = 10.0
+_LARGE_ERROR_DEG = 10.0
 """Errors above this are marked, degrees: the step between templates."""
 
 
@@ -88,7 +88,7 @@ def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
     ]
     for angle, known, error in drives:
         cells = [
-            "-" if np.isnan(one) else f"{'! ' if one > LARGE_ERROR_DEG else ''}{one:.1f}"
+            "-" if np.isnan(one) else f"{'! ' if one > _LARGE_ERROR_DEG else ''}{one:.1f}"
             for one in error.flat
         ]
         lines.append(f"{angle:>6.0f}{' ' if known else '~'} {''.join(f'{cell:>16}' for cell in cells)}")
@@ -99,7 +99,7 @@ def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
             means = [f"{column.mean():.1f}" if len(column) else "-" for column in there]
             lines.append(f"{name:<9}".ljust(8) + "".join(f"{mean:>16}" for mean in means))
     lines.append(
-        f"~ between two trained angles; ! off by more than {LARGE_ERROR_DEG:g}; - no wall was found. "
+        f"~ between two trained angles; ! off by more than {_LARGE_ERROR_DEG:g}; - no wall was found. "
         "Winner: eq. 5 of Fox et al. 2012; between: the\nminimum of a parabola through it and its "
         "neighbours; fused: from the sliding tip of the first whisker (`touch.reports.walls`)."
     )

@@ -11,7 +11,7 @@ from evaluation.metrics.exm import ExperienceMetric, creation_rows
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
 
-SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
+_SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
 _DOTS = (0, (2, 2))
@@ -117,7 +117,7 @@ def draw_measured(
         count = len(series)
         for k, (name, values) in enumerate(series.items()):
             at = np.arange(len(conditions)) + (k - (count - 1) / 2) * 0.8 / max(count, 1)
-            color = SERIES_COLORS[k % len(SERIES_COLORS)]
+            color = _SERIES_COLORS[k % len(_SERIES_COLORS)]
             where = np.repeat(at, values.shape[1])
             axes.plot(where, values.reshape(-1), "o", ms=4, mew=0, alpha=0.6, color=color, label=name)
             some = np.isfinite(values).any(axis=1)
@@ -169,7 +169,7 @@ def draw_curves(
     """
     figure, panels = _panels(title, line, curves, 3.6)
     for axes, conditions in zip(panels, curves.values(), strict=True):
-        for color, (name, (arcr, arr)) in zip(SERIES_COLORS[1:], conditions.items(), strict=False):
+        for color, (name, (arcr, arr)) in zip(_SERIES_COLORS[1:], conditions.items(), strict=False):
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))

@@ -31,9 +31,9 @@ FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
 """Of a closure's steps: true distance, m, and error of the claimed heading difference, rad."""
 HARM_FACTOR, HARM_MARGIN = 1.05, 0.3
 """Of odometry's ATE, and m."""
-SUFFIX = "_odom_gt.csv"
+_SUFFIX = "_odom_gt.csv"
 """End of the file names of buildings, in the folder `buildings` of the real recordings."""
-PERTURBATIONS = {
+_PERTURBATIONS = {
     "miscalibrated": miscalibrate,
     "ids lost": lose_labels,
     "ids wrong": mistake_labels,
@@ -48,12 +48,12 @@ COLUMNS = (
 
 Section = Literal["buildings", "ids", "create"]
 CREATE = "configs/create_lab.yaml"
-FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
+_FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
 """Of cell size and sector width in the rows of the Create."""
 
 
 class BuildingsRow(NamedTuple):
-    """A row: a recording, its section of the table, what its copies are (a key of `PERTURBATIONS`; "": there
+    """A row: a recording, its section of the table, what its copies are (a key of `_PERTURBATIONS`; "": there
     are none), and factors on cell size and sector width."""
 
     recording: Recording
@@ -102,11 +102,11 @@ def buildings_rows() -> dict[str, BuildingsRow]:
     """All rows by name; those of the buildings are the files found in the folder of the real recordings, or
     one row, `buildings`, for a file that is missing."""
     folder = (real_recordings() or Path()).absolute() / "buildings"
-    found = {file.name.removesuffix(SUFFIX): file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+    found = {file.name.removesuffix(_SUFFIX): file for file in sorted(folder.glob(f"*{_SUFFIX}"))}
     hall = "configs/tuc_lecture_hall.yaml"
     recordings = {
         name: Recording(name, "configs/building.yaml", (f"recording.file={file}",), real=True)
-        for name, file in (found or {"buildings": folder / f"NAME{SUFFIX}"}).items()
+        for name, file in (found or {"buildings": folder / f"NAME{_SUFFIX}"}).items()
     }
     recordings["intel"] = Recording(
         "intel (`configs/intel_laser.yaml`)", "configs/intel_laser.yaml", real=True
@@ -116,7 +116,7 @@ def buildings_rows() -> dict[str, BuildingsRow]:
     for fault in ("lost", "wrong", "new"):
         recording = Recording(f"lecture hall, copies with a third of the ids {fault}", hall, real=True)
         rows[f"ids {fault}"] = BuildingsRow(recording, "ids", f"ids {fault}")
-    for (cell, cells), (sector, sectors) in product(FACTORS.items(), FACTORS.items()):
+    for (cell, cells), (sector, sectors) in product(_FACTORS.items(), _FACTORS.items()):
         recording = Recording(f"Create, depth, cell x {cell}, sector x {sector}", CREATE, real=True)
         rows[f"create {cell} {sector}"] = BuildingsRow(recording, "create", "", cells, sectors)
     return rows
@@ -197,47 +197,48 @@ def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
         InputError: the recording cannot be used, or has no truth.
     """
     config, copies, seed = task
-    run = run_recording(config, PERTURBATIONS[copies] if seed else None, seed)
+    run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
     claims = closure_claims(run)
+    false, sequences, odds = judge_claims(claims)
     return RunFigures(
         odometry=run.ate(run.odometry),
         final=run.ate(run.final),
         live=run.ate(run.online),
-        closures=is_false(claims.distance, claims.turn)[claims.accepted],
-        sequences=judge_sequences(claims),
-        odds=sequence_odds(claims),
+        closures=false[claims.accepted],
+        sequences=sequences,
+        odds=odds,
     )
 
 
-def is_false(distance: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Whether closures are false, [n] bool, from `ClosureClaims.distance` and `ClosureClaims.turn`."""
-    return (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+def judge_claims(claims: ClosureClaims) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether closures and closure sequences are false, and the odds of sequences.
 
-
-def judge_sequences(claims: ClosureClaims) -> np.ndarray:
-    """[R, 2] bool, of each closure sequence, whether it is accepted and whether it is false."""
+    Returns:
+        [n] bool, of each claim, whether it is false. [R, 2] bool, of each sequence, whether it is accepted
+        and whether it is false: by the medians of its claims. [R] log odds that each sequence is true; NaN
+        where the truth or they themselves are unknown.
+    """
     members = [claims.sequence == number for number in np.unique(claims.sequence)]
-    distance, turn = (
+    middles = [
         np.array([np.median(values[rows]) for rows in members]) for values in (claims.distance, claims.turn)
+    ]
+    single, whole = (
+        (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+        for distance, turn in ((claims.distance, claims.turn), middles)
     )
     accepted = np.array([claims.accepted[rows].any() for rows in members], bool)
-    return np.column_stack([accepted, is_false(distance, turn)])
+    known = np.array([np.isfinite(claims.distance[rows]).all() for rows in members], bool)
+    odds = np.array([claims.log_odds[rows][0] for rows in members], float)
+    return single, np.column_stack([accepted, whole]), np.where(known, odds, np.nan)
 
 
-def sequence_odds(claims: ClosureClaims) -> np.ndarray:
-    """[R] log odds that each closure sequence is true; NaN where the truth or they themselves are unknown."""
-    _, first = np.unique(claims.sequence, return_index=True)
-    known = [np.isfinite(claims.distance[claims.sequence == k]).all() for k in claims.sequence[first]]
-    return np.where(known, claims.log_odds[first], np.nan)
-
-
-def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+def _is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     """Whether ATEs, m, exceed those of odometry by more than the margins."""
     return error > HARM_FACTOR * odometry + HARM_MARGIN
 
 
 COMPARED = Compared(
-    "final ATE", "final", "live", "odometry", worse=is_worse, failed=is_worse,
+    "final ATE", "final", "live", "odometry", worse=_is_worse, failed=_is_worse,
     counts={
         "false / closures": ("false_closures", "closures"),
         "false / sequences": ("false_sequences", "sequences"),
@@ -256,7 +257,7 @@ def _cells(runs: Sequence[RunFigures]) -> list[str]:
         _spread(final[1:]),
         _spread(live[1:]),
         f"{ratio:.2f}",
-        f"{is_worse(final, odometry).sum()}, {is_worse(live, odometry).sum()} of {len(runs)}",
+        f"{_is_worse(final, odometry).sum()}, {_is_worse(live, odometry).sum()} of {len(runs)}",
         _closures(runs[:1]),
         _closures(runs),
         _sequences(runs),
@@ -273,8 +274,8 @@ def _total(runs: Sequence[RunFigures]) -> str:
     share = f" ({closures.mean():.1%})" if len(closures) else ""
     return (
         f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
-        f"{_sequences(runs)}; worse than odometry: final {is_worse(final, odometry).mean():.1%}, live "
-        f"{is_worse(live, odometry).mean():.1%}; expected calibration error of the odds of {known.sum()} "
+        f"{_sequences(runs)}; worse than odometry: final {_is_worse(final, odometry).mean():.1%}, live "
+        f"{_is_worse(live, odometry).mean():.1%}; expected calibration error of the odds of {known.sum()} "
         f"sequences {error:.3f}."
     )
 

@@ -175,7 +175,7 @@ def _some(keys: Iterable[Key]) -> str:
     return ", ".join(names if len(names) < 3 else (names[0], "...", names[-1])) or "no session"
 
 
-class Pairs(NamedTuple):
+class _Pairs(NamedTuple):
     """n sessions that were measured twice.
 
     Attributes:
@@ -204,11 +204,11 @@ class Pairs(NamedTuple):
         return [key for key, there in zip(self.keys, has, strict=True) if there], old, new
 
 
-def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> Pairs:
+def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> _Pairs:
     """The sessions of these rows that are in both runs, in the order of that now."""
     old, new = ({key: one for key, one in run.items() if key[0] in rows} for run in (old, new))
     keys = [key for key in new if key in old]
-    return Pairs(
+    return _Pairs(
         keys, [old[key].figures for key in keys], [new[key].figures for key in keys],
         len(old) - len(keys), len(new) - len(keys),
     )  # fmt: skip
@@ -319,7 +319,7 @@ ALL = "all rows"
 """Name of the line over several rows."""
 
 
-def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, Pairs]]:
+def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, _Pairs]]:
     """The pairs of each row, then of all rows if there are several."""
     assert log.earlier is not None
     for row in rows:
@@ -344,13 +344,13 @@ def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
     yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."
 
 
-def _failures(what: Compared, pairs: Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
+def _failures(what: Compared, pairs: _Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
     """The sessions [m], and whether they fail, [m] bool before and now."""
     keys, old, new = pairs.named(what.error, what.odometry)
     return keys, what.failed(*old), what.failed(*new)
 
 
-def _compared_cells(what: Compared, pairs: Pairs) -> dict[str, str]:
+def _compared_cells(what: Compared, pairs: _Pairs) -> dict[str, str]:
     """The cells of a line of `compare_runs` by the title of their column; figures are before, now."""
     over = [paired_ratios(odometry, error) for error, odometry in pairs.known(what.error, what.odometry)]
     medians, counts = dict[str, str](), dict[str, str]()
@@ -377,7 +377,7 @@ def _compared_cells(what: Compared, pairs: Pairs) -> dict[str, str]:
     }
 
 
-def _ratio(pairs: Pairs, name: str) -> str:
+def _ratio(pairs: _Pairs, name: str) -> str:
     ratio = paired_ratios(*pairs.known(name))
     return _spread(ratio) + _of(len(ratio), pairs) * bool(len(ratio))
 
@@ -390,7 +390,7 @@ def _spread(ratio: np.ndarray) -> str:
     return f"{np.median(ratio):.3f} " + (f"[{low:.3f}-{high:.3f}]" if low == low else "[-]")
 
 
-def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: Pairs, *names: str) -> str:
+def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: _Pairs, *names: str) -> str:
     old, new = pairs.known(*names)
     return f"{happens(*old).sum()}, {happens(*new).sum()}{_of(old.shape[1], pairs)}"
 
@@ -405,6 +405,6 @@ def _median(values: np.ndarray) -> str:
     return f"{np.median(values):.3f}" if len(values) else "-"
 
 
-def _of(count: int, pairs: Pairs) -> str:
+def _of(count: int, pairs: _Pairs) -> str:
     """How many pairs a cell is of, where that is not all."""
     return f" of {count}" if count < len(pairs.keys) else ""

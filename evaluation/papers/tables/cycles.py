@@ -69,7 +69,7 @@ PARTS = {
 counts."""
 
 
-class Cycle(NamedTuple):
+class _Cycle(NamedTuple):
     """A compiled session and its observations."""
 
     name: str
@@ -141,7 +141,7 @@ def profile_table(sessions: Sequence[str] | None = None, folder: Path = Path()) 
 
 def _open_cycles(
     sessions: Sequence[str] | None, precisions: Sequence[Precision], folder: Path
-) -> list[Cycle]:
+) -> list[_Cycle]:
     """The compiled sessions of a table."""
     prepare_precision("float64")
     cycles = []
@@ -152,13 +152,13 @@ def _open_cycles(
         with open_observations(config) as (config, source):
             log = load_into_memory(source)
         observations = [observation_of(sample) for sample in log]
-        cycles.append(Cycle(name, backend, precision, build_session(config, log), observations))
+        cycles.append(_Cycle(name, backend, precision, build_session(config, log), observations))
     for cycle in cycles:
         cycle.time()  # compiles
     return cycles
 
 
-def _profile(cycle: Cycle) -> dict[str, float]:
+def _profile(cycle: _Cycle) -> dict[str, float]:
     """Time of a step by part in a profiled replay, us."""
     profiler = cProfile.Profile()
     cycle.session.restart()

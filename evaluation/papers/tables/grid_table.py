@@ -30,7 +30,7 @@ from robot.world.walls import segment_distance
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import MotionKind, Observation
 
-WORLDS: dict[str, dict[str, Any]] = {
+_WORLDS: dict[str, dict[str, Any]] = {
     "A": {"arena": {"side": 1.25}, "reports": 900},
     "B": {"arena": {"side": 2.5}, "reports": 1500},
     "rotated": {"arena": {"side": 1.25, "rotated": True}, "reports": 900},
@@ -129,7 +129,7 @@ def grid_table(
 def task_config(world: str, row: str, arena: int) -> RunConfig:
     """The configuration of a session of a row in the arena with this seed."""
     noise = row.replace(",", " ").split()[0]
-    create_simulation = WORLDS[world] | {"wheels": {"noise": noise}, "seed": arena}
+    create_simulation = _WORLDS[world] | {"wheels": {"noise": noise}, "seed": arena}
     given = {"create_simulation": create_simulation, "backend": "grid", "session": {"precision": "float32"}}
     return RunConfig.model_validate(given | ROWS[row])
 
@@ -142,7 +142,7 @@ def measure_session(task: tuple[str, str, int]) -> GridFigures:
     source: Any = open_source(config)
     config = complete(config, source)
     # The map has one size for all arenas of a world, so that the filter compiles once.
-    grid = config.grid.model_copy(update={"side": 2 * WORLDS[world]["arena"]["side"]})
+    grid = config.grid.model_copy(update={"side": 2 * _WORLDS[world]["arena"]["side"]})
     samples = list(read_observations(open_touch_source(source, config.touch)))
     truth = np.array([sample.truth for sample, _ in samples])
     observations = [observation for _, observation in samples]

@@ -1,6 +1,6 @@
 """The table of map health: whether a map's own doubt tells bad maps from good ones.
 
-Each session is finished once and its map spoilt in many ways (`trials.spoilt_maps`). A map is bad if its
+Each session is finished once and its map spoilt in many ways (`spoilt_maps`). A map is bad if its
 error exceeds `HARM_FACTOR` times odometry's (recordings: and 0.3 m): whisker sessions by the Energy Metric,
 recordings by ATE, both of keyframes. Even sessions fit the regression, odd ones test it; the weights below
 the table, of all sessions, become those of `ratslam.mapping.map_solution`. Only maps with closures count.
@@ -92,7 +92,7 @@ def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> 
     """
     rows = [*TOUCH, *(REAL if real_recordings() else ())]
     tasks = [(row, number, folder) for row in rows for number in range(sessions)]
-    found = list(run_tasks(judge_session, tasks, workers=workers))
+    found = list(run_tasks(_judge_session, tasks, workers=workers))
     weights, final = (fit_weights(_together(maps)) for maps in (found[0::2], found))
     constants = np.array([INTERCEPT, *WEIGHTS])
     yield markdown_header(COLUMNS)
@@ -105,7 +105,7 @@ def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> 
     yield f"\nIntercept and weights fitted on all sessions: {', '.join(f'{w:.2f}' for w in final)}."
 
 
-def judge_session(task: tuple[str, int, Path]) -> JudgedMaps:
+def _judge_session(task: tuple[str, int, Path]) -> JudgedMaps:
     """Runs a session, of a row and a number, and judges its spoilt maps."""
     number = task[1]
     config, touch = task_config(*task)

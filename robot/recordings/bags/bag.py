@@ -74,7 +74,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
 MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
 REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
-CONVERT = (
+_CONVERT = (
     "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
     "`mcap convert` or `rosbags-convert`"
 )
@@ -281,7 +281,7 @@ class Bag:
         ]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
         if coded:
-            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
+            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", _CONVERT)
         known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
         if self._first and any(each.digest not in known for each in connections):
             raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
@@ -339,7 +339,7 @@ def container_fault(path: Path) -> tuple[str, str] | None:
         whole = file.read() == MCAP
     if profile and (profile != "ros2" or codes - {"cdr", "ros2msg", "ros2idl", "omgidl", ""}):
         found = f"an MCAP file of profile {profile} with {', '.join(sorted(codes))}, not of ROS 2"
-        return f"cannot be read as a bag: {found}", CONVERT
+        return f"cannot be read as a bag: {found}", _CONVERT
     if whole or not profile:
         return None
     return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"

@@ -40,7 +40,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
 
 
-def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Series:
+def _read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Series:
     """Touch [M, R, C, 1] in 0..1.
 
     Raises:
@@ -144,7 +144,7 @@ def read_bag(
     """
     report = judge.say
     with Bag(path, report, judge.stretch) as bag:
-        config = with_preset(bag, config)
+        config = _with_preset(bag, config)
         if config.views is not None and config.touch is not None:
             raise InputError("recording.topics", "both views and touch", "one of them")
         if config.odometry is None and (visual_odometry is None or config.views is None):
@@ -188,7 +188,7 @@ def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
     return judge.errors(track, place, where, odometry.clock, cures)
 
 
-def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
+def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     """The topics, with those of OpenRatSLAM where only their root is given.
 
     Raises:
@@ -233,7 +233,7 @@ def _read_steps(
     if config.views is not None:
         body = config.body or odometry.body
         return odometry, read_range_views(bag, config.views, body, clock, report)
-    return odometry, None if config.touch is None else read_touch(bag, config.touch, clock, report)
+    return odometry, None if config.touch is None else _read_touch(bag, config.touch, clock, report)
 
 
 def _sample_views(odometry: BagOdometry, views: Series, report: Report) -> tuple[BagOdometry, Series]:

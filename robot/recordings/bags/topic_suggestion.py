@@ -25,7 +25,6 @@ TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|idea
 WHEELS = re.compile(r"/?(|.+[/_.-])(odom|odom_combined)")
 """Frames whose link to the robot in /tf is odometry, and the prefix of the robot."""
 LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
-SECTORS = 18  # of a view by default
 
 
 def suggested_topics(bag: BagDescription) -> dict[str, Any]:
@@ -91,7 +90,7 @@ def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
         if topic is not None:
             shape = topic.shape
             options: dict[str, Any] = {}
-            if isinstance(shape, ScanShape) and shape.beams < SECTORS:
+            if isinstance(shape, ScanShape) and shape.beams < 18:  # sectors of a view by default
                 options = {"rows": 1, "columns": shape.beams}
             if isinstance(shape, ScanShape) and shape.wider:
                 options["span"] = [round(angle, 4) for angle in shape.extent.span]

@@ -114,7 +114,7 @@ Link = list[tuple[int, tuple[float, ...], tuple[float, ...], int]]
 """The transforms from a frame to a child frame: stamp in ns, (x, y, z) in m, quaternion (x, y, z, w), number
 of the message; one is enough for a fixed link."""
 Links = dict[tuple[str, str], Link]
-Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
+_Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
 
 
 class Mount(NamedTuple):
@@ -161,7 +161,7 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
     return links
 
 
-def chain_between(links: Links, parent: str, child: str) -> Chain | None:
+def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
     neighbours: dict[str, list[tuple[str, tuple[str, str], bool]]] = {}
     for upper, lower in links:
@@ -197,7 +197,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     links: Links = {}
     for name in (STATIC, MOVING):
         links = read_links(bag, name, clock) | links
-        chains = (chain_between(links, each, sensor) for each in bodies)
+        chains = (_chain_between(links, each, sensor) for each in bodies)
         if (chain := next(filter(None, chains), None)) is not None:
             whole = np.eye(4)
             for frames, down in chain:
@@ -222,7 +222,7 @@ def poses_between(
         if frame not in there:
             raise missing_error(f"{bag.path}, {MOVING}", "frame", frame, there)
     where = f"{bag.path}, {MOVING} {parent} to {child}"
-    chain = chain_between(links, parent, child)
+    chain = _chain_between(links, parent, child)
     if chain is None:
         raise InputError(where, "frames that are not connected", f"a chain of links in {MOVING} or {STATIC}")
     moving = [pair for pair, _ in chain if len(links[pair]) > 1]

@@ -25,7 +25,7 @@ RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGES = (RAW, COMPRESSED)
 LARGEST = 1 << 26  # pixels
 
-ENCODINGS: dict[str, tuple[str, str]] = {
+_ENCODINGS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("mono8", "8UC1"), ("u1", "y")),
     **dict.fromkeys(("mono16", "16UC1"), ("u2", "y")),
     **dict.fromkeys(("rgb8",), ("u1", "rgb")),
@@ -42,7 +42,7 @@ ENCODINGS: dict[str, tuple[str, str]] = {
     },
 }
 """Encodings of raw images: NumPy type and channels."""
-NO_DEPTH = "name a topic of grey or colour images with recording.topics.views"
+_NO_DEPTH = "name a topic of grey or colour images with recording.topics.views"
 
 
 def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
@@ -56,10 +56,10 @@ def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
 
 def _raw(message: Any, where: str) -> np.ndarray:
     if message.encoding in ("32FC1", "64FC1"):
-        raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", NO_DEPTH)
-    if message.encoding not in ENCODINGS:
-        raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(ENCODINGS)}")
-    number, channels = ENCODINGS[message.encoding]
+        raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", _NO_DEPTH)
+    if message.encoding not in _ENCODINGS:
+        raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(_ENCODINGS)}")
+    number, channels = _ENCODINGS[message.encoding]
     kind = np.dtype((">" if message.is_bigendian else "<") + number)
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
@@ -87,7 +87,7 @@ def _decoded(message: Any, where: str) -> np.ndarray:
     except ImportError:
         raise InputError("pillow", "not installed", "", "pip install 'ratslam[ros]'") from None
     if "compressedDepth" in message.format:
-        raise InputError(where, f"distances ({message.format})", "a grey or colour image", NO_DEPTH)
+        raise InputError(where, f"distances ({message.format})", "a grey or colour image", _NO_DEPTH)
     data = bytes(message.data)
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
@@ -107,8 +107,8 @@ def _decoded(message: Any, where: str) -> np.ndarray:
 
 
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
-RING_BEAMS = 360  # of a cloud: the nearest point of each degree
-COVERED = 0.5
+_RING_BEAMS = 360  # of a cloud: the nearest point of each degree
+_COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
 
@@ -166,7 +166,7 @@ def extent_of(message: Any, where: str) -> Extent:
 
 def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     """What scans cover together, in the order of the first; None if that is no more than the first covers, or
-    if most scans cover less than `COVERED` of it."""
+    if most scans cover less than `_COVERED` of it."""
     first = extents[0]
     if first.ring:
         return None
@@ -174,7 +174,7 @@ def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     middle, half = _wrapped(middle - first.middle), np.abs(width) / 2
     low, high = float((middle - half).min()), float((middle + half).max())
     whole = 2 * np.pi if any(extent.ring for extent in extents) else min(high - low, 2 * np.pi)
-    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < COVERED * whole:
+    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < _COVERED * whole:
         return None
     return Extent(first.middle + (low + high) / 2, float(np.copysign(whole, first.width)), float(step.max()))
 
@@ -258,10 +258,10 @@ def cloud_view(
     points = points @ mount.rotation.T + mount.position
     points = points[(heights[0] <= points[:, 2]) & (points[:, 2] <= heights[1])]
     turn = (np.arctan2(points[:, 1], points[:, 0]) + np.pi) / (2 * np.pi)
-    beams = np.full(RING_BEAMS, np.inf)
-    degree = np.minimum((turn % 1.0 * RING_BEAMS).astype(int), RING_BEAMS - 1)
+    beams = np.full(_RING_BEAMS, np.inf)
+    degree = np.minimum((turn % 1.0 * _RING_BEAMS).astype(int), _RING_BEAMS - 1)
     np.minimum.at(beams, degree, np.hypot(points[:, 0], points[:, 1]))
-    return _fan_view(beams, np.ones(RING_BEAMS, bool), pixels, max_range)
+    return _fan_view(beams, np.ones(_RING_BEAMS, bool), pixels, max_range)
 
 
 def cloud_points(message: Any, where: str) -> np.ndarray:
@@ -347,7 +347,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         raise InputError(where, f"messages of type {topic.kind}", expected)
     reader = _RangeReader(bag, topic, config, body, clock)
     read = list(read_usable(bag, topic, clock, reader.view))
-    rows = [row for row in read if row[2] is not None and row[2].covered >= COVERED]
+    rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
     empty = sum(view is None for *_, view in read)
     for count, fault in (
         (empty, "have no measured range"),

@@ -132,11 +132,12 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_sequences_by_their_m
         turn=np.radians([0.0, 0.0, 0.0, 31.0, 31.0, 0.0]),
         log_odds=np.array([1.0, 1.0, 1.0, -2.0, -2.0, -2.0]),
     )
-    assert buildings.is_false(claims.distance, claims.turn).tolist() == [0, 0, 1, 1, 1, 0]
-    assert buildings.judge_sequences(claims).tolist() == [[True, False], [False, True]]
-    assert buildings.sequence_odds(claims).tolist() == [1.0, -2.0]
+    false, sequences, odds = buildings.judge_claims(claims)
+    assert false.tolist() == [0, 0, 1, 1, 1, 0]
+    assert sequences.tolist() == [[True, False], [False, True]]
+    assert odds.tolist() == [1.0, -2.0]
     unknown = claims._replace(distance=np.array([0.0, np.nan, 2.1, 0.0, 0.0, 0.0]))
-    np.testing.assert_equal(buildings.sequence_odds(unknown), [np.nan, -2.0])
+    np.testing.assert_equal(buildings.judge_claims(unknown)[2], [np.nan, -2.0])
 
 
 def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(monkeypatch):
