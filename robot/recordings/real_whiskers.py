@@ -396,7 +396,7 @@ class TaxelConfig(Settings):
 
 def read_contacts(path: Path) -> list[TaxelContact]:
     """All contacts of a file with one cell array: objects x (position of the hand, fingertips 1 to 3) x
-    trials, or the same cut into single contacts (x contacts). A cell of a fingertip is samples x 22 pressures.
+    trials, or the same cut into single contacts (x contacts). A cell of a fingertip: samples x 22 pressures.
 
     Raises:
         InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is

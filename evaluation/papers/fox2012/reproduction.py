@@ -194,7 +194,15 @@ def _render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) ->
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
     for world, stop in product(protocol.worlds, range(len(protocol.stops))):
         these = [row for row in rows if row.key[0] == world and row.session.stop == stop]
-        lines += _metric_lines(world, these, protocol)
+        if not these:
+            continue
+        counts = [row.values["reports"] for row in these]
+        spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+        lines += [f"{world}, {spread} reports", HEAD]
+        for method, along, mapper in product(protocol.methods, _PREFIXES, protocol.mappers):
+            scored = [row for row in these if row.key[1:] == (method, mapper, along)]
+            lines += [_line(_PREFIXES[along].format(method) + mapper, scored)] if scored else []
+        lines.append("")
     lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in protocol.methods:
@@ -207,18 +215,6 @@ def _render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) ->
             lines += [f"{method.capitalize()}:", render_grid_scores(scores), ""]
             lines += [*render_rankings(method, rows), ""]
     return "\n".join([*lines, protocol.note])
-
-
-def _metric_lines(world: str, rows: Sequence[ResultRow], protocol: Protocol) -> list[str]:
-    if not rows:
-        return []
-    counts = [row.values["reports"] for row in rows]
-    spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-    lines = [f"{world}, {spread} reports", HEAD]
-    for method, along, mapper in product(protocol.methods, _PREFIXES, protocol.mappers):
-        these = [row for row in rows if row.key[1:] == (method, mapper, along)]
-        lines += [_line(_PREFIXES[along].format(method) + mapper, these)] if these else []
-    return [*lines, ""]
 
 
 def _line(name: str, rows: Sequence[ResultRow]) -> str:

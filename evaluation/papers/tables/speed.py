@@ -236,7 +236,12 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
             used = [recordings[k % len(recordings)] for k in range(several)]
             run = SessionBatch(backend, at_once=gpu)
             us = _median(partial(run.replay, used), several * steps, rounds)
-            gap = _belief_gap(run.replay(used), used)
+            states = run.replay(used)
+            gap = max(  # largest difference of a belief from that of the single run
+                float(np.abs(np.asarray(found[k], float) - own).max(initial=0.0))
+                for k, recording in enumerate(used)
+                for found, own in zip(states.belief, recording.state.belief, strict=True)
+            )
             what = f"{several} sessions of {steps} steps, largest difference of a belief {gap:.0e}"
             yield markdown_row([what, name, f"{us:.1f}"])
     with jax.default_device(core):
@@ -281,15 +286,6 @@ def _set_call(sets: int, every: int, block: int) -> Callable[[], Any]:
     spread = np.linspace(0.9, 1.1, sets, dtype=single)
     given = batch.Network(spread, 2 * spread, np.full(sets, 2e-5, single), spread)
     return lambda: batch.networks(config, given, course, block)
-
-
-def _belief_gap(states: Any, recordings: list[Recording]) -> float:
-    """The largest difference of a belief from that of the single run."""
-    return max(
-        float(np.abs(np.asarray(found[k], float) - own).max(initial=0.0))
-        for k, recording in enumerate(recordings)
-        for found, own in zip(states.belief, recording.state.belief, strict=True)
-    )
 
 
 def _median(call: Callable[[], Any], steps: int, rounds: int) -> float:

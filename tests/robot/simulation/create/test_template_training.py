@@ -86,7 +86,7 @@ def test_the_report_marks_large_errors_and_missing_walls() -> None:
     far, unknown = error.copy(), error.copy()
     far[0, 0], unknown[:, 2] = 12.3, np.nan
     lines = render_drives(
-        [HeldOutDrive(20.0, True, far), HeldOutDrive(25.0, False, unknown), HeldOutDrive(30.0, True, error)],
+        [(20.0, True, far), (25.0, False, unknown), (30.0, True, error)],
         4,
     ).splitlines()
     assert lines[2].split()[:3] == ["20", "!", "12.3"]
