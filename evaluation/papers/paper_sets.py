@@ -1,8 +1,8 @@
-"""What the reproductions of both papers share: sets of sessions, rows of NAME.csv, tests over sets.
+"""What the reproductions of both papers share: sets of sessions, rows of NAME.csv, sweeps of thresholds.
 
-The classic method at many matching thresholds over one session, in one compiled batch.
-
-The kernel decides which experience is current, so the Experience Metric needs no map.
+`reproduce` runs the sessions of a figure, writes each row as soon as it is measured, and draws and prints the
+figure. `sweep_thresholds` runs the classic method at many matching thresholds over one session in one
+compiled batch: the kernel decides which experience is current, so the Experience Metric needs no map.
 """
 
 from __future__ import annotations
@@ -100,7 +100,22 @@ def reproduce(
     require_new_file(directory / f"{name}.png", parents=True)
     jobs = paper.plan(protocol, sets, seed, assignments)
     batches = paper.run(name, jobs, workers)
-    rows, interrupted = write_rows(directory / f"{name}.csv", paper.key, paper.fields, batches)
+    rows, interrupted, table = list[ResultRow](), False, directory / f"{name}.csv"
+    require_new_file(table, parents=True)
+    table.parent.mkdir(parents=True, exist_ok=True)
+    with table.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*paper.key, "set", "seed", *paper.fields])
+        try:
+            for batch in batches:
+                for row in batch:
+                    values = (row.values.get(field) for field in paper.fields)
+                    cells = ("" if value is None or value != value else repr(value) for value in values)
+                    writer.writerow([*row.key, row.number, row.seed, *cells])
+                rows += batch
+                file.flush()
+        except KeyboardInterrupt:
+            interrupted = True
     if rows and not interrupted:
         paper.draw(name, protocol, rows).savefig(directory / f"{name}.png")
     return paper.render(protocol, rows, sets), interrupted
@@ -112,33 +127,6 @@ def run_with_progress(
     """The results of tasks, in order, with a progress bar."""
     found = run_tasks(function, tasks, workers=workers)
     return iter(tqdm(found, title, len(tasks), unit="session", file=sys.stderr, mininterval=0.5))
-
-
-def write_rows(
-    path: Path, key: Sequence[str], fields: Sequence[str], batches: Iterable[Sequence[ResultRow]]
-) -> tuple[list[ResultRow], bool]:
-    """Writes rows to a new file, batch by batch; returns them, and whether the user interrupted.
-
-    Raises:
-        InputError: the file exists.
-    """
-    require_new_file(path, parents=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows: list[ResultRow] = []
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([*key, "set", "seed", *fields])
-        try:
-            for batch in batches:
-                for row in batch:
-                    values = (row.values.get(field) for field in fields)
-                    cells = ("" if value is None or value != value else repr(value) for value in values)
-                    writer.writerow([*row.key, row.number, row.seed, *cells])
-                rows += batch
-                file.flush()
-        except KeyboardInterrupt:
-            return rows, True
-    return rows, False
 
 
 def column(rows: Sequence[ResultRow], key: tuple[str, ...], field: str) -> np.ndarray:

@@ -1,18 +1,11 @@
-"""A whisker session through one backend, held in memory.
+"""Sessions of experiments, held in memory, each from its source to what a table measures of it.
 
-A process runs many sessions of one kind with one compiled kernel: a session object is reset to its start for
-each of them.
+Whisker sessions and recordings (or perturbed copies of them) through a backend; sessions of the simulated
+Create and their result by a grid filter, in the frame of the arena. A process runs many sessions of one kind
+with one compiled kernel: a session object is reset to its start for each of them.
 
-A recording with truth, or a perturbed copy of it, through one backend, held in memory.
-
-A session of the simulated Create and its result by a grid filter, in the frame of the arena.
-
-Sessions in one arena start at different places. A process runs many sessions with few compiled filters.
-
-Control conditions: the views of a source replaced, its odometry and truth unchanged.
-
-A method that closes loops on shuffled or blank views does so by odometry alone; ideal views give the upper
-bound of the rest of the method.
+Controls replace the views of a source and leave its odometry and truth. A method that closes loops on
+shuffled or blank views does so by odometry alone; ideal views give the upper bound of the rest of the method.
 """
 
 from __future__ import annotations
@@ -55,7 +48,6 @@ from tactile.base.se2 import compose, integrate, wrap
 from tactile.base.settings import Settings
 from tactile.base.types import Observation, stack
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
-from tactile.wall_estimation.strain_templates import StrainTemplates
 from tactile.whisker_geometry import PlanarWhiskers
 
 
@@ -246,10 +238,6 @@ def _closure_rows(session: Session) -> list[dict[str, str]]:
         return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
-MAP_SCALE = 2.0  # side of a drawn map over the side of the arena (Fox et al. 2012, II-D)
-MAP_MARGIN = 0.4  # margin of the filter's map, which is centred on the start, beyond the arena, m
-
-
 class ArenaSession(NamedTuple):
     """A session of T reports.
 
@@ -306,7 +294,7 @@ def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list
     if reports.templates is None and reports.walls in ("template", "fused"):
         made = session.source.config
         robot = CreateSimulationConfig(whiskers=made.whiskers, behaviour=made.behaviour, seed=seed)
-        templates = _templates(robot)
+        templates = _trained_templates(robot)
     source = TouchSource(session.source, lambda: ReportFrontend(reports, templates), "touch.reports.mounts")
     return [observation_of(sample) for sample in source]
 
@@ -318,7 +306,8 @@ def run_filter(
     touch = report_config_of(session.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
-        grid = grid.model_copy(update={"side": 2 * (session.arena.side + MAP_MARGIN)})
+        # The filter's map is centred on the start, with a margin of 0.4 m beyond the arena.
+        grid = grid.model_copy(update={"side": 2 * (session.arena.side + 0.4)})
     slam = session_at_start(grid, touch.mounts, touch.length, config.session.precision, config.session.seed)
     start, marks = session.arena.start, collect_marks(reports)
     online: list[np.ndarray] = []
@@ -334,12 +323,12 @@ def run_filter(
 def draw_map(
     config: GridConfig, feelers: PlanarWhiskers, arena: Arena, path: np.ndarray, marks: ContactLog
 ) -> OccupancyGrid:
-    """The map drawn along a path [T, 3], in the frame of the arena; `MAP_SCALE` gives its side.
+    """The map drawn along a path [T, 3], in the frame of the arena, with twice its side (Fox et al., II-D).
 
     Args:
         marks: of at least T reports.
     """
-    side = round(MAP_SCALE * arena.side / config.cell)
+    side = round(2.0 * arena.side / config.cell)
     middle = (arena.outer.min(axis=0) + arena.outer.max(axis=0)) / 2
     first = ContactLog(*(rows[: len(path)] for rows in marks))
     probability = draw_occupancy(config, feelers, side, path - np.array([*middle, 0.0]), first)
@@ -357,13 +346,13 @@ def session_at_start(
     grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision, seed: int
 ) -> Session:
     """A session at its start; a recently compiled one is used again."""
-    session = _compiled_of_arena_trial(grid, mounts, length, precision)
+    session = _compiled_filter(grid, mounts, length, precision)
     session.restart(seed)
     return session
 
 
 @lru_cache(maxsize=4)
-def _compiled_of_arena_trial(
+def _compiled_filter(
     grid: GridConfig, mounts: tuple[WhiskerMount, ...], length: float, precision: Precision
 ) -> Session:
     assert grid.side is not None
@@ -373,20 +362,12 @@ def _compiled_of_arena_trial(
     return Session(backend, precision=precision)
 
 
-@lru_cache(maxsize=1)
-def _templates(config: CreateSimulationConfig) -> StrainTemplates:
-    """Templates of a robot, trained once for all sessions as in the paper."""
-    return train_strain_templates(config)
+_trained_templates = lru_cache(maxsize=1)(train_strain_templates)
+"""Templates of a robot, trained once for all sessions as in the paper."""
 
 
 Control = Literal["none", "shuffled", "blank", "ideal"]
 """`none`: unchanged; `shuffled`: random order; `blank`: all zero; `ideal`: a distinct view for each spot."""
-SPOT = 0.06
-"""Side length of a spot with an ideal view, m."""
-SECTORS = 8
-"""Heading sectors of a spot, each with its own ideal view."""
-LIT = 0.5
-"""Share of non-zero pixels of an ideal view."""
 
 
 def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemorySource:
@@ -404,11 +385,11 @@ def apply_control(log: InMemorySource, control: Control, seed: int) -> InMemoryS
 
 
 def _ideal_views(log: InMemorySource, seed: int) -> np.ndarray:
-    """Random views, one for each pair of spot and heading sector."""
+    """Random views with half of the pixels lit, one for each spot of 6 cm and each of its 8 headings."""
     assert log.truth is not None
-    spot = np.round(log.truth[:, :2] / SPOT)
-    sector = np.round(log.truth[:, 2] / (2 * np.pi / SECTORS)) % SECTORS
+    spot = np.round(log.truth[:, :2] / 0.06)
+    sector = np.round(log.truth[:, 2] / (2 * np.pi / 8)) % 8
     kinds, row = np.unique(np.column_stack([spot, sector]), axis=0, return_inverse=True)
     random = stream(seed, "control.ideal")
     shape = (len(kinds), *log.view_shape)
-    return (random.random(shape) * (random.random(shape) < LIT))[row.reshape(-1)]
+    return (random.random(shape) * (random.random(shape) < 0.5))[row.reshape(-1)]

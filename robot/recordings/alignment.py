@@ -15,8 +15,6 @@ from robot.sources.source import PlanarWhiskersInfo, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.files import MOST_PIXELS
 
-RANGE_UNIT_FACTOR = 20.0  # times max_range: a larger median range has another unit
-
 
 @dataclass(eq=False)
 class RecordingRows:
@@ -125,7 +123,7 @@ def range_errors(
         lowest: [M] smallest range of each view, m. typical: median of all. key: setting of `max_range`.
     """
     errors = first_error(lowest < 0, place, lambda row: f"{what} is {lowest[row]}", "ranges of 0 m or more")
-    if typical > RANGE_UNIT_FACTOR * max_range:
+    if typical > 20 * max_range:  # half of them would be out of range by far: another unit
         unit = "--set recording.table.views.unit=mm" if key.startswith("table") else "divide by 1000"
         cure = f"{unit} if they are millimetres, else raise {key}"
         errors.append(InputError(where, f"half of the ranges are over {typical:.4g} m", "metres", cure))

@@ -1,15 +1,11 @@
-"""Samples as ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
+"""Samples and live data as ROS 2 messages in little-endian CDR, which any ROS 2 or MCAP tool can read.
 
-A message has four bytes (00 01 00 00) and the fields of its schema (`robot.recordings.cdr`) back to
-back; an unbounded array is preceded by its length (uint32). float64 values keep every bit.
+A message has four bytes (00 01 00 00) and the fields of its schema (`SCHEMAS`) back to back; an unbounded
+array is preceded by its length (uint32). float64 values keep every bit. Every file stores the schemas, whose
+fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
 
-ROS 2 definitions of the messages in a recording; every file stores these texts.
-
-Fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
-
-Live data as messages (see `robot.recordings.cdr`): blocks of frames and of arm states, cuts, events.
-
-Frames are stored channel by channel as differences from frame to frame: small numbers, which compress well.
+Live data are blocks of frames and of arm states, cuts and events. Frames are stored channel by channel as
+differences from frame to frame: small numbers, which compress well.
 """
 
 from __future__ import annotations
@@ -122,14 +118,13 @@ SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}
 
 CDR = b"\x00\x01\x00\x00"
 MAX_NUMBERS = 100_000_000  # in one message; a larger number is a damaged length
-FEATURES = ("touched", "highest", "reach")
+_FEATURES = ("touched", "highest", "reach")
 """Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """Meaning of the bits of `flags`, from the lowest."""
-SCHEMA_OF_READING = {Observation: OBSERVATION, Cycle: CYCLE, Whisk: WHISK, Report: REPORT}
-SAMPLES_AT = {CYCLE: 44, REPORT: 56}
+_SAMPLES_AT = {CYCLE: 44, REPORT: 56}
 """Byte position of the number of samples in a message."""
-TYPES = {"float64": "<f8", "int32": "<i4", "uint32": "<u4", "uint8": "u1", "bool": "?"}
+_TYPES = {"float64": "<f8", "int32": "<i4", "uint32": "<u4", "uint8": "u1", "bool": "?"}
 """NumPy types of the types in `SCHEMAS`."""
 
 
@@ -137,7 +132,7 @@ class Malformed(ValueError):
     """A message that does not fit its schema."""
 
 
-class Layout(NamedTuple):
+class _Layout(NamedTuple):
     """Byte layout of a message.
 
     Attributes:
@@ -159,19 +154,23 @@ def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> t
         InputError: a field has another shape, or values that its type cannot hold exactly.
     """
     reading = sample.reading
-    name, samples = SCHEMA_OF_READING[type(reading)], 0
+    names = {Observation: OBSERVATION, Cycle: CYCLE, Whisk: WHISK, Report: REPORT}
+    name, samples = names[type(reading)], 0
     values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
     if isinstance(reading, Cycle | Report):
         samples, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
     elif isinstance(reading, Whisk):
         numbers = np.dtype(("<f8", (whiskers,)))
-        columns = [_convert_exactly(field, values[field], numbers) for field in FEATURES]
+        columns = [_convert_exactly(field, values[field], numbers) for field in _FEATURES]
         values["felt"] = np.stack(columns, axis=1)
     else:
         values["dead"] = ~_convert_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
-    layout = message_layout(name, view_shape, whiskers, samples)
+    layout = _message_layout(name, view_shape, whiskers, samples)
     if name in FLAGS:
-        values["flags"] = _pack_flags(values, FLAGS[name], whiskers)
+        flags, booleans = np.zeros(whiskers, np.uint8), np.dtype(("?", (whiskers,)))
+        for bit, field in enumerate(FLAGS[name]):
+            flags |= _convert_exactly(field, values[field], booleans).astype(np.uint8) << bit
+        values["flags"] = flags
     values["time"] = sample.time
     record = layout.blank.copy()
     for field in layout.fields:
@@ -186,11 +185,11 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         Malformed: the message does not fit this schema, view shape and number of whiskers.
     """
     samples = 0
-    if name in SAMPLES_AT:
-        samples = int.from_bytes(message[SAMPLES_AT[name] :][:4], "little")
+    if name in _SAMPLES_AT:
+        samples = int.from_bytes(message[_SAMPLES_AT[name] :][:4], "little")
         if samples * (1 + 3 * whiskers) > MAX_NUMBERS:
             raise Malformed(f"a message of {samples} samples")
-    layout = message_layout(name, view_shape, whiskers, samples)
+    layout = _message_layout(name, view_shape, whiskers, samples)
     if len(message) != layout.dtype.itemsize:
         raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were expected")
     if any(message[start:stop] != content for start, stop, content in layout.fixed):
@@ -200,9 +199,13 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
     if name == CYCLE:
         time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
         return float(record["time"]), Cycle(time, angle, deflection, odometry)
-    flags = _unpack_flags(record["flags"], FLAGS[name])
+    bits, names = record["flags"], FLAGS[name]
+    if (bits >> len(names)).any():
+        most = 2 ** len(names) - 1
+        raise Malformed(f"whisker flags {int(bits.max())} where {most} is the largest possible")
+    flags = {field: (bits >> bit & 1).astype(bool) for bit, field in enumerate(names)}
     if name == WHISK:
-        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(FEATURES)}
+        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(_FEATURES)}
         return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
     if name == REPORT:
         time, strain = record["sample_time"].copy(), record["strain"].copy()
@@ -237,13 +240,13 @@ def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
 
 
 @lru_cache(maxsize=512)
-def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, samples: int) -> Layout:
+def _message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, samples: int) -> _Layout:
     """The packed form of the schema of a reading for these sizes."""
     shapes = {
         "view": view_shape,
         "point": (whiskers, 2),
         "flags": (whiskers,),
-        "felt": (whiskers, len(FEATURES)),
+        "felt": (whiskers, len(_FEATURES)),
         "sample_time": (samples,),
         "angle": (samples, whiskers),
         "deflection": (samples, whiskers, 2),
@@ -257,7 +260,7 @@ def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, s
         if size == "]":
             fixed[f"{field}_length"] = int(np.prod(shapes[field]))
             fields.append((f"{field}_length", "<u4", ()))
-        fields.append((field, TYPES[base], (int(size[:-1]),) if size[:-1] else shapes.get(field, ())))
+        fields.append((field, _TYPES[base], (int(size[:-1]),) if size[:-1] else shapes.get(field, ())))
     sizes = {"view_shape": view_shape, "whiskers": whiskers, "samples": samples, "axes": 2}
     dtype = np.dtype(fields)
     fixed |= {field: size for field, size in sizes.items() if field in (dtype.names or ())}
@@ -266,28 +269,12 @@ def message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, s
         blank[field] = value
     content = blank.tobytes()
     places = [(dtype.fields[field][1], dtype[field].itemsize) for field in fixed]  # type: ignore[index]
-    return Layout(
+    return _Layout(
         dtype=dtype,
         blank=blank,
         fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
         fields=tuple(field for field, *_ in fields if field not in fixed),
     )
-
-
-def _pack_flags(values: dict[str, Any], names: tuple[str, ...], whiskers: int) -> np.ndarray:
-    """[W] uint8, the boolean arrays [W] of these names as bits."""
-    flags = np.zeros(whiskers, np.uint8)
-    for bit, name in enumerate(names):
-        flags |= _convert_exactly(name, values[name], np.dtype(("?", (whiskers,)))).astype(np.uint8) << bit
-    return flags
-
-
-def _unpack_flags(flags: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The inverse of `_pack_flags`."""
-    if (flags >> len(names)).any():
-        most = 2 ** len(names) - 1
-        raise Malformed(f"whisker flags {int(flags.max())} where {most} is the largest possible")
-    return {name: (flags >> bit & 1).astype(bool) for bit, name in enumerate(names)}
 
 
 def _convert_exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""Settings that assign columns of CSV files.
-
-Units in the header of a CSV file: `t [ms]`, `x (mm)`, `heading_deg`, `vx [mm/s]`.
-"""
+"""Settings that assign columns of CSV files, and units in their headers: `t [ms]`, `heading_deg`."""
 
 from __future__ import annotations
 
@@ -14,9 +11,9 @@ from pydantic import Field, PositiveFloat
 from tactile.base.settings import Settings, Side
 from tactile.whisker_geometry import Degrees
 
-TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min"]
-LengthUnit = Literal["m", "mm", "cm", "km"]
-AngleUnit = Literal["rad", "deg"]
+_TimeUnit = Literal["s", "ms", "us", "ns", "ks", "min"]
+_LengthUnit = Literal["m", "mm", "cm", "km"]
+_AngleUnit = Literal["rad", "deg"]
 PER_UNIT: dict[str, dict[str, float]] = {
     "time": {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "ks": 1e-3},
     "length": {"m": 1, "mm": 1e3, "cm": 1e2, "km": 1e-3},
@@ -31,16 +28,16 @@ WORDS = {
     **{"m/s": "mps", "deg/s": "dps", "": "- 1"},
 }
 """Other spellings of each unit, its name first."""
-ALIASES = {word: unit for unit, words in WORDS.items() for word in words.split()}
-BRACKETS = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+_ALIASES = {word: unit for unit, words in WORDS.items() for word in words.split()}
+_BRACKETS = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
 
 
-def plain_unit(text: str) -> str:
+def _plain_unit(text: str) -> str:
     """A unit in one spelling: `deg/s` for `°/sec`, `m/s` for `m s^-1`; unknown ones remain."""
     text = text.strip().lower().replace("µ", "u").replace("μ", "u").replace("°", "deg")
     text = re.sub(r"[\s*·.]+([a-z]+)\^?-1$|[\s_]*(?:/|_per_| per |_)\s*([a-z]+)$", r"/\1\2", text)
-    text = "/".join(ALIASES.get(word.strip(), word.strip()) for word in text.split("/"))
-    return ALIASES.get(text, text)
+    text = "/".join(_ALIASES.get(word.strip(), word.strip()) for word in text.split("/"))
+    return _ALIASES.get(text, text)
 
 
 def per_unit(unit: str, quantity: str) -> float | None:
@@ -60,16 +57,16 @@ def split_unit(name: str) -> tuple[str, str]:
     def is_unit(unit: str) -> bool:
         return any(per_unit(unit, kind + rate) is not None for kind in PER_UNIT for rate in ("", "/time"))
 
-    if found := BRACKETS.fullmatch(name):
+    if found := _BRACKETS.fullmatch(name):
         before, square, round_ = found.groups()
         if square is not None and square.isdecimal():
             return before + square, ""
-        unit = plain_unit(square or round_ or "")
+        unit = _plain_unit(square or round_ or "")
         if square is not None or is_unit(unit):
             return split_unit(before)[0] if before.endswith("]") else before, unit
     words = name.split("_")
     for count in (3, 2, 1):
-        unit = plain_unit("_".join(words[-count:]))
+        unit = _plain_unit("_".join(words[-count:]))
         if len(words) > count and is_unit(unit) and unit not in ("min", ""):  # `laser_min` has none
             return "_".join(words[:-count]), unit
     return name, ""
@@ -81,11 +78,11 @@ Quaternion = Annotated[list[str], Field(min_length=4, max_length=4)]
 class TableUnits(Settings):
     """Units of columns; null: that of the header (`t [ms]`, `x_mm`), else s, m, rad."""
 
-    time: TimeUnit | None = None
+    time: _TimeUnit | None = None
     """Of times. Speeds and turn rates are per second whatever it is, unless the header says otherwise."""
-    length: LengthUnit | None = None
+    length: _LengthUnit | None = None
     """Of positions, distances, and speeds (per second)."""
-    angle: AngleUnit | None = None
+    angle: _AngleUnit | None = None
     """Of headings, turns, and turn rates (per second)."""
 
 
@@ -140,7 +137,7 @@ class ViewColumns(Settings):
     of consecutive beams, so their number must be a multiple of the pixels. Null: pixel values in 0..1."""
     tolerance: float | None = Field(default=None, ge=0)
     """Largest time between a view and its nearest odometry row, s; null: the median step."""
-    unit: LengthUnit | None = None
+    unit: _LengthUnit | None = None
     """Unit of the ranges; null: that of the header, else m."""
 
 

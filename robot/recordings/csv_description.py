@@ -17,16 +17,16 @@ from robot.recordings.csv_reader import other_plane, rounded_rate
 from tactile.base.errors import InputError
 
 TIMES = ("t", "time", "timestamp", "stamp", "secs", "seconds", "sec", "header_stamp", "datetime")
-FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
-LEFT_SPEEDS = ("vy", "v_y", "linear_y")
-TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
+_FORWARD_SPEEDS = ("vx", "v", "v_x", "speed", "linear_x", "linear", "forward_speed")
+_LEFT_SPEEDS = ("vy", "v_y", "linear_y")
+_TURN_RATES = ("w", "wz", "w_z", "omega", "yaw_rate", "turn_rate", "angular_z", "angular", "gyro_z", "gyro")
 DISTANCES = ("distance", "dist", "ds", "forward")
 TURNS = ("turn", "dtheta", "dth", "rotation")
 HEADINGS = ("heading", "theta", "th", "yaw")
 LABELS = ("label", "place", "place_id")
 """Names of columns, in lower case; those with `_` may also be the end of a name, as in rostopic's."""
 PLACE = re.compile(r"(^|_)(p|t|pos|position|pose|translation|location)_?$")
-QUATERNION = re.compile(r"(^|_)(q|quat|orient|rot)")
+_QUATERNION = re.compile(r"(^|_)(q|quat|orient|rot)")
 MOVING = re.compile(r"(^|_)(v|w|a|b|vel|acc|lin|ang|gyro|imu|twist)")
 """Names before x, y, z and w: of positions, of quaternions, and of what is neither."""
 NO_VIEWS = re.compile(r"covariance|intensit", re.IGNORECASE)
@@ -34,16 +34,14 @@ EPOCH = 1e9, 4e9
 """Times of day of 2001 to 2096 in s, which tells the unit of such times."""
 TRUE = re.compile(r"gt|true|truth|ground|mocap|vicon|reference")
 """Names of columns and files with true poses."""
-FEWEST_PIXELS = 4
+_FEWEST_PIXELS = 4
 """Least number of numbered columns that make a view."""
 COLUMNS = (18, 36, 24, 20, 30, 16, 12, 32, 15, 10, 9, 8, 6)
 """Columns of a view of ranges, the first that divides their number."""
-RANGE_QUANTILE, RANGE_MARGIN = 0.9, 1.25
-"""The largest range of a view is this quantile of all ranges, times the margin."""
 
 
 class CsvDescription(NamedTuple):
-    """A file and its companions.
+    """A file and its _companions.
 
     Attributes:
         rows: number of lines with values. time: [N] s, finite; None without a column of times.
@@ -79,7 +77,7 @@ def describe_csv(path: Path) -> CsvDescription:
     odometry = _odometry(file)
     units = _units(file, time, odometry or {})
     file = replace(file, clock=units.get("time"))
-    files = [file, *companions(file, time)]
+    files = [file, *_companions(file, time)]
     if odometry is None:
         missing.append("odometry: columns x, y, heading, or v, w, or distance, turn")
     else:
@@ -96,13 +94,8 @@ def describe_csv(path: Path) -> CsvDescription:
             table |= views
             parts["views"] = _words({"views": views["views"]})
             max_range = ranges
-        given = {"truth": _truth(file, other)}
-        if label := _named(other, LABELS):
-            given["labels"] = _file(file, other) | {"column": label}
-        if other is not file and {"t1", "t2", "score"} <= set(other.names):
-            given["pairs"] = {"file": str(other.path)}
-        for name, part in given.items():
-            if part is not None and name not in table:
+        for name, part in _truth_and_labels(file, other).items():
+            if name not in table:
                 table[name] = part
                 parts[name] = _words({name: part})
     if "pairs" in table and "labels" in table:
@@ -122,7 +115,7 @@ def describe_csv(path: Path) -> CsvDescription:
     )
 
 
-def companions(file: CsvFile, time: str) -> list[CsvFile]:
+def _companions(file: CsvFile, time: str) -> list[CsvFile]:
     """CSV files beside it whose names share its first word, with times that overlap."""
     word = re.split(r"[_\-. ]", file.path.stem)[0]
     own = file.column(time, "time")
@@ -182,7 +175,7 @@ def _units(file: CsvFile, time: str, odometry: dict[str, Any]) -> dict[str, str]
 def _poses(file: CsvFile) -> dict[str, dict[str, Any]]:
     """Columns x, y, and heading or quaternion, by the common prefix of x and y."""
     lower, found = _lower(file), dict[str, dict[str, Any]]()
-    stems = [name[:-1] for name in lower if name.endswith("w") and QUATERNION.search(name[:-1])]
+    stems = [name[:-1] for name in lower if name.endswith("w") and _QUATERNION.search(name[:-1])]
     stems = [stem for stem in stems if all(stem + axis in lower for axis in "xyz")]
     turns = {stem: [lower[stem + axis] for axis in "xyzw"] for stem in stems}
     for name in lower:
@@ -215,9 +208,9 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
         poses.pop("", None)
     if poses:
         return {"pose": next(iter(poses.values()))}
-    forward, turn = _named(file, FORWARD_SPEEDS), _named(file, TURN_RATES)
+    forward, turn = _named(file, _FORWARD_SPEEDS), _named(file, _TURN_RATES)
     if forward is not None and turn is not None:
-        left = _named(file, LEFT_SPEEDS)
+        left = _named(file, _LEFT_SPEEDS)
         return {"velocity": {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
     forward, turn = _named(file, DISTANCES), _named(file, TURNS)
     return (
@@ -225,19 +218,25 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
     )
 
 
-def _truth(file: CsvFile, other: CsvFile) -> dict[str, Any] | None:
-    poses = _poses(other)
+def _truth_and_labels(file: CsvFile, other: CsvFile) -> dict[str, dict[str, Any]]:
+    """The settings of true poses and of place labels from the other file, as far as it has them."""
+    found, poses = dict[str, dict[str, Any]](), _poses(other)
     if other is file or not TRUE.search(other.path.stem):
         poses = {prefix: columns for prefix, columns in poses.items() if TRUE.search(prefix)}
-    columns = next(iter(poses.values()), None)
-    return None if columns is None else _file(file, other) | columns
+    if columns := next(iter(poses.values()), None):
+        found["truth"] = _file(file, other) | columns
+    if label := _named(other, LABELS):
+        found["labels"] = _file(file, other) | {"column": label}
+    if other is not file and {"t1", "t2", "score"} <= set(other.names):
+        found["pairs"] = {"file": str(other.path)}
+    return found
 
 
 def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]:
     """The settings of views from this file, and their largest range, NaN without ranges."""
     found = [("range" in stem.lower(), count, stem) for stem, count in _stems(other).items()]
     _, count, prefix = max((entry for entry in found if not NO_VIEWS.search(entry[2])), default=(0, 0, ""))
-    if count < FEWEST_PIXELS:
+    if count < _FEWEST_PIXELS:
         return None, np.nan
     values = other.block(prefix)[0]
     known = values[np.isfinite(values) & (values > 0)]
@@ -246,7 +245,9 @@ def _views(file: CsvFile, other: CsvFile) -> tuple[dict[str, Any] | None, float]
     views = _file(file, other) | {"prefix": prefix}
     if not len(known) or known.max() <= 1.0:
         return {"rows": 1, "columns": count, "views": views}, np.nan
-    reach = _round(RANGE_MARGIN * float(np.quantile(known, RANGE_QUANTILE)))
+    reach = 1.25 * float(np.quantile(known, 0.9))  # of a view
+    scale, steps = 10.0 ** np.floor(np.log10(reach)), np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    reach = float(f"{scale * steps[np.argmin(np.abs(steps - reach / scale))]:.3g}")  # two digits at most
     return shape | {"views": views | {"max_range": reach}}, reach
 
 
@@ -267,7 +268,7 @@ def _columns(file: CsvFile) -> tuple[tuple[str, float, float], ...]:
     found, stems = dict[str, np.ndarray](), _stems(file)
     for place, name in enumerate(file.names):
         prefix = name.rstrip("0123456789")
-        if prefix != name and stems[prefix] >= FEWEST_PIXELS:
+        if prefix != name and stems[prefix] >= _FEWEST_PIXELS:
             numbers = list(file.numbered(prefix))
             joined = f"{prefix}{numbers[0]} .. {prefix}{numbers[-1]}"
             if joined not in found:
@@ -288,10 +289,3 @@ def _words(settings: dict[str, Any]) -> str:
         words |= {key: f"{key} {words[key]}" for key in ("prefix", "max_range") if key in words}
         lines.append(f"{name}: {', '.join(words.values())}")
     return "; ".join(lines)
-
-
-def _round(value: float) -> float:
-    """To one and a half significant digits: 0.5, 1, 1.5, 2, 3, 4, ..., 10, 15, 20, 30 ..."""
-    scale = 10.0 ** np.floor(np.log10(value))
-    steps = np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
-    return float(f"{scale * steps[np.argmin(np.abs(steps - value / scale))]:.3g}")

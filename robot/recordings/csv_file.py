@@ -18,13 +18,11 @@ from robot.recordings.sanity_checks import count_others, utc_seconds
 from robot.sources.input_files import missing_error, read_bytes, require_file
 from tactile.base.errors import InputError
 
-MAX_BYTES, MAX_LINES, MAX_COLUMNS, MAX_CELLS = 1 << 28, 1 << 22, 1 << 12, 1 << 25
-MAX_LINE, MAX_NAME = 1 << 20, 200
-"""Limits of a file: bytes, lines, columns, rows x columns; characters of a line and of a column's name."""
+MAX_CELLS = 1 << 25
+"""Limit of a file's rows x columns."""
 EMPTY, WORD, CUT = 1, 2, 3
 """Why a cell has no number: nothing in it, text in it, or its row has another number of cells."""
-COMMENT = "#%"  # a line that begins so is a comment, or the header
-QUATERNION_TOLERANCE = 0.05  # of the length 1; three decimals leave 0.002
+_COMMENT = "#%"  # a line that begins so is a comment, or the header
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +108,7 @@ class CsvFile:
         bad = np.any(kinds, axis=(0, 2)) if places else np.zeros(len(values), bool)
         turn = self.values[:, [self.at(name) for name in quaternion]]
         away = np.abs(np.linalg.norm(turn, axis=1) - 1)
-        crooked = bool(quaternion) & ~bad & ~(away <= QUATERNION_TOLERANCE)
+        crooked = bool(quaternion) & ~bad & ~(away <= 0.05)  # three decimals leave 0.002
         errors, drop = [], "correct or drop the row"
         for hit in kinds:
             if hit.any():
@@ -185,7 +183,7 @@ def read_csv(path: Path, clock: str | None = None) -> CsvFile:
         InputError: the file, its header or rows are missing, it is not text, or it exceeds a limit.
     """
     require_file(path)
-    _limit(str(path), path.stat().st_size, MAX_BYTES, "bytes")
+    _limit(str(path), path.stat().st_size, 1 << 28, "bytes")
     content = read_bytes(path)
     lines = _lines_of(content, path)
     line, separator, full = _header(path, lines)
@@ -225,17 +223,17 @@ def _lines_of(content: bytes, path: Path) -> list[str]:
         raise InputError(str(path), found, "a CSV file in UTF-8", "save it as CSV in UTF-8") from error
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
-    _limit(str(path), text.count("\n"), MAX_LINES, "lines")
+    _limit(str(path), text.count("\n"), 1 << 22, "lines")
     lines = text.split("\n")
     longest = max(range(len(lines)), key=lambda number: len(lines[number]))
-    _limit(f"{path}:{longest + 1}", len(lines[longest]), MAX_LINE, "characters in a line")
+    _limit(f"{path}:{longest + 1}", len(lines[longest]), 1 << 20, "characters in a line")
     return lines
 
 
 def _is_skipped(line: str) -> bool:
     """Whether all cells of a line are empty, or it is a comment."""
     begin = line.lstrip(' ,;\t"\v\f')[:1]
-    return not begin or begin in COMMENT
+    return not begin or begin in _COMMENT
 
 
 def _header(path: Path, lines: list[str]) -> tuple[int, str, tuple[str, ...]]:
@@ -248,20 +246,21 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, tuple[str, ...]]:
         above = [k for k in reversed(range(number)) if lines[k].strip()]
         number = next((k for k in above if not rows or _name_columns(lines[k], below)), number)
     where, (separator, full) = f"{path}:{number + 1}", _names(lines[number], below)
-    _limit(where, len(full), MAX_COLUMNS, "columns")
+    _limit(where, len(full), 1 << 12, "columns")
     if any(map(_is_number, full)):
         found = f"the first line is {lines[number][:60]!r}"
         raise InputError(where, found, "a header row that names the columns")
-    strange = next((name for name in full if not name.isprintable() or len(name) > MAX_NAME), None)
+    longest = 200
+    strange = next((name for name in full if not name.isprintable() or len(name) > longest), None)
     if strange is not None:
         found = f"the header names a column {strange[:40]!r}, {len(strange)} characters"
-        raise InputError(where, found, f"text without control characters, at most {MAX_NAME} a name")
+        raise InputError(where, found, f"text without control characters, at most {longest} a name")
     return number + 1, separator, tuple(full)
 
 
 def _names(line: str, row: str) -> tuple[str, list[str]]:
     """What separates the names of a header line, above this row, and the names."""
-    line = line.lstrip().lstrip(COMMENT).replace("\xa0", " ").strip(" ")
+    line = line.lstrip().lstrip(_COMMENT).replace("\xa0", " ").strip(" ")
     spaced = 1 < len(line.split()) == len(row.split())
     mark = next((mark for mark in ",;\t" if mark in line), " " if spaced else ",")
     return mark, [name.strip() for name in _split(line, mark)]

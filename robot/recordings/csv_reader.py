@@ -40,14 +40,10 @@ from tactile.base.settings import Settings
 ODOMETRY = ("pose", "velocity", "motion")
 """Parts of the table of which one is given."""
 RATE = "--set recording.table.rate={:.6g}, the rows per second"
-HOLE = 3
-"""Rows one after another that may be left out of velocities and motions; the next row stands for them."""
-SHARED = 0.2
-"""Share of the steps without time that makes times rounded."""
 AlignedRows = tuple[np.ndarray, np.ndarray, list[InputError]]  # odometry rows [M], values [M, ...], errors
 
 
-class Files(NamedTuple):
+class _Files(NamedTuple):
     """The files of a recording.
 
     Attributes:
@@ -88,8 +84,9 @@ def read_csv_recording(
     assert part is not None  # checked by `_absences`
     names = [name for name, _ in column_keys(part, "")]
     stamps = config.time if config.rate is None else ""
-    turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, HOLE)
-    kept, errors = sound_rows(whole, names, "rows", warn, stamps, turn or (), hole=hole)
+    # So many rows of velocities or motions one after another may be left out; the next row stands for them.
+    turn, hole = (part.quaternion, np.inf) if isinstance(part, columns.PoseColumns) else (None, 3)
+    kept, errors = _sound_rows(whole, names, "rows", warn, stamps, turn or (), hole=hole)
     base = found[path] = whole.rows(kept)
     if config.rate is None:
         time = base.column(config.time, "time", config.units.time)
@@ -105,7 +102,12 @@ def read_csv_recording(
     recording.place, recording.held = base.place, isinstance(part, columns.VelocityColumns)
     recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
     # What belongs to a row that is left out, is left out too.
-    files = Files(base, found, _whole_clock(time, kept, len(whole.lines)), warn)
+    every, rows = time, np.arange(len(whole.lines))
+    if len(kept) < len(rows):  # the times of rows that are left out lie between those of their neighbours
+        step = float(np.median(np.diff(time) / np.diff(kept))) if len(kept) > 1 else 1.0
+        beyond = np.minimum(rows - kept[0], 0) + np.maximum(rows - kept[-1], 0)
+        every = np.interp(rows, kept, time) + beyond * step
+    files = _Files(base, found, every, warn)
     row_of = np.full(len(files.time), -1)
     row_of[kept] = np.arange(len(kept))
 
@@ -170,16 +172,6 @@ def _clock_errors(file: CsvFile, name: str, time: np.ndarray, cure: str) -> list
     return [InputError(file.place(row), found, "times that increase", cure.format(rate))]
 
 
-def _whole_clock(time: np.ndarray, kept: np.ndarray, count: int) -> np.ndarray:
-    """Times [count] of all rows, those left out between their neighbours; kept: the rows of the times [N]."""
-    if len(kept) == count:
-        return time
-    rows = np.arange(count)
-    step = float(np.median(np.diff(time) / np.diff(kept))) if len(kept) > 1 else 1.0
-    beyond = np.minimum(rows - kept[0], 0) + np.maximum(rows - kept[-1], 0)
-    return np.interp(rows, kept, time) + beyond * step
-
-
 def _absences(base: CsvFile, files: Mapping[Path, CsvFile], config: columns.CsvConfig) -> list[InputError]:
     """Errors for missing columns and for settings that contradict each other."""
     errors = base.absences([(config.time, "table.time")] if config.rate is None else [])
@@ -216,7 +208,7 @@ def _motion(
     assert part is not None
     with np.errstate(all="ignore"):  # faulty values are already reported
         if isinstance(part, columns.PoseColumns):
-            poses, errors = read_poses(base, part, units, time, limits, "table.pose")
+            poses, errors = _read_poses(base, part, units, time, limits, "table.pose")
             return from_poses(time, poses), poses, errors
         rate, per = ("/time", "/s") if isinstance(part, columns.VelocityColumns) else ("", "")
         length, angle = (unit and unit + per for unit in (units.length, units.angle))
@@ -229,7 +221,7 @@ def _motion(
         return (from_velocities if rate else from_motions)(time, forward, left, turn), None, []
 
 
-def sound_rows(
+def _sound_rows(
     file: CsvFile,
     names: Sequence[str],
     what: str,
@@ -268,7 +260,7 @@ def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
     """
     steps = np.diff(time)
     change, same = np.flatnonzero(steps > 0) + 1, steps == 0
-    if len(change) < 2 or (steps < 0).any() or same.mean() < SHARED:
+    if len(change) < 2 or (steps < 0).any() or same.mean() < 0.2:
         return None
     repeated = (np.nan_to_num(np.diff(rows, axis=0)[same]) == 0).all(axis=1)
     if repeated.mean() > 0.5:
@@ -276,7 +268,7 @@ def rounded_rate(time: np.ndarray, rows: np.ndarray) -> float | None:
     return float((change[-1] - change[0]) / (time[change[-1]] - time[change[0]]))
 
 
-def _views(files: Files, part: columns.ViewColumns, shape: tuple[int, int, int]) -> AlignedRows:
+def _views(files: _Files, part: columns.ViewColumns, shape: tuple[int, int, int]) -> AlignedRows:
     """Views [M, R, C, 1]: pixels as given, or the mean range of equal groups of consecutive beams."""
     file = files.of(part.file)
     there = np.flatnonzero(~(file.block(part.prefix)[1] == EMPTY).all(axis=1))
@@ -289,7 +281,7 @@ def _views(files: Files, part: columns.ViewColumns, shape: tuple[int, int, int])
         return there, file.values, [error]
     seen = file.rows(there)
     clock = "" if file is files.base else part.time
-    good, errors = sound_rows(seen, beams, "views", files.warn, clock, far=part.max_range is not None)
+    good, errors = _sound_rows(seen, beams, "views", files.warn, clock, far=part.max_range is not None)
     if errors:
         return there, file.values, errors
     there, seen = there[good], seen.rows(good)
@@ -306,10 +298,10 @@ def _views(files: Files, part: columns.ViewColumns, shape: tuple[int, int, int])
     return rows, values.reshape(-1, *shape), errors + faults
 
 
-def _contacts(files: Files, part: columns.ContactColumns) -> AlignedRows:
+def _contacts(files: _Files, part: columns.ContactColumns) -> AlignedRows:
     """Contacts [M, W] bool, in the order of the sensors in the settings."""
     file, names = files.of(part.file), tuple(part.directions)
-    there, errors = sound_rows(file, names, "contacts", files.warn)
+    there, errors = _sound_rows(file, names, "contacts", files.warn)
     values = np.column_stack([file.column(name)[there] for name in names])
     bad = ~np.isin(values, (0, 1)) & np.isfinite(values)
     if bad.any():
@@ -320,7 +312,7 @@ def _contacts(files: Files, part: columns.ContactColumns) -> AlignedRows:
     return rows, values == 1, errors + faults
 
 
-def _labels(files: Files, labels: columns.LabelColumns) -> AlignedRows:
+def _labels(files: _Files, labels: columns.LabelColumns) -> AlignedRows:
     """Place labels [M] int32 as given."""
     file = files.of(labels.file)
     ids, fault = file.column(labels.column), file.fault[:, file.at(labels.column)]
@@ -333,7 +325,7 @@ def _labels(files: Files, labels: columns.LabelColumns) -> AlignedRows:
     return rows, ids if errors else ids.astype(np.int32), errors
 
 
-def _pairs(files: Files, part: columns.PairColumns) -> AlignedRows:
+def _pairs(files: _Files, part: columns.PairColumns) -> AlignedRows:
     """Place labels [V] int32 derived from pairs."""
     file = files.of(part.file)
     later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
@@ -396,13 +388,13 @@ def align_truth(
     """
     names = [name for name, _ in column_keys(part, "")[same_rows:]]
     clock = "" if same_rows else part.time
-    good, errors = sound_rows(file, names, "true poses", warn, clock, part.quaternion or ())
+    good, errors = _sound_rows(file, names, "true poses", warn, clock, part.quaternion or ())
     unknown = np.full((len(time), 3), np.nan)
     if errors:
         return unknown, errors
     file = file.rows(good)
     moments = time[good] if same_rows else file.column(part.time, "time", part.units.time)
-    truth, errors = read_poses(file, part, part.units, moments, limits, "table.truth")
+    truth, errors = _read_poses(file, part, part.units, moments, limits, "table.truth")
     if same_rows:
         unknown[good] = truth
         return unknown, errors
@@ -425,7 +417,7 @@ def column_keys(part: Settings, key: str) -> list[tuple[str, str]]:
     return [(name, f"{key}.{field}") for field, name in named.items()]
 
 
-def read_poses(
+def _read_poses(
     file: CsvFile,
     part: columns.PoseColumns,
     units: columns.TableUnits,
@@ -475,7 +467,7 @@ def other_plane(file: CsvFile, x: str, y: str) -> tuple[str, str] | None:
 
 
 def _match_rows(
-    files: Files,
+    files: _Files,
     file: CsvFile,
     there: np.ndarray,
     part: columns.ViewColumns | columns.ContactColumns | columns.LabelColumns,

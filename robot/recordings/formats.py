@@ -1,8 +1,6 @@
-"""Recording formats: one entry per format in `FORMATS`."""
+"""Recording formats: which reader opens a file, by its suffix."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.input_judge import InputJudge
@@ -15,54 +13,9 @@ from robot.sources.source import SOURCES, Source, SourceEntry, Warn
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
 
-
-def _open_mcap(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.mcap_reader import Recording
-    from robot.recordings.mcap_scanner import is_foreign
-
-    if is_foreign(config.file):
-        return _open_bag(config, judge)
-    return Recording(config.file, judge)
-
-
-def _open_bag(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.bags.bag_reader import read_bag
-
-    return read_bag(
-        config.file,
-        config.topics or TopicsConfig(),
-        judge,
-        image=config.image,
-        visual_odometry=config.visual_odometry,
-    )
-
-
-def _open_npz(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.npz_trace import read_trace
-
-    return read_trace(config.file, judge)
-
-
-def _open_csv(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.csv_reader import read_csv_recording
-
-    return read_csv_recording(config.file, config.table, judge)
-
-
-def _open_video(config: RecordingConfig, judge: InputJudge) -> Source:
-    from robot.recordings.video_recording import read_video
-
-    return read_video(config, judge)
-
-
-FORMATS: dict[str, Callable[[RecordingConfig, InputJudge], Source]] = {
-    ".mcap": _open_mcap,
-    ".npz": _open_npz,
-    ".csv": _open_csv,
-    ".bag": _open_bag,
-    ".db3": _open_bag,
-    **dict.fromkeys(VIDEO_SUFFIXES, _open_video),
-}
+BAGS = (".bag", ".db3")
+FORMATS = (".mcap", ".npz", ".csv", *BAGS, *VIDEO_SUFFIXES)
+"""Suffixes of the files that are read without a plug-in."""
 
 
 def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
@@ -81,20 +34,40 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
 
 
 def _open(config: RecordingConfig, judge: InputJudge) -> Source:
-    """The recording as it is."""
-    suffix = config.file.suffix.lower()
-    if config.topics is not None or (config.file / "metadata.yaml").is_file():
-        return _open_bag(config, judge)
-    if suffix in FORMATS:
-        return FORMATS[suffix](config, judge)
+    """The recording as it is. Readers are imported when they are needed: some are slow to load."""
+    file, suffix = config.file, config.file.suffix.lower()
+    if suffix == ".mcap":
+        from robot.recordings.mcap_scanner import is_foreign
+    whole = config.topics is not None or (file / "metadata.yaml").is_file()
+    if whole or suffix in BAGS or (suffix == ".mcap" and is_foreign(file)):
+        from robot.recordings.bags.bag_reader import read_bag
+
+        topics, motion = config.topics or TopicsConfig(), config.visual_odometry
+        return read_bag(file, topics, judge, image=config.image, visual_odometry=motion)
+    if suffix == ".mcap":
+        from robot.recordings.mcap_reader import Recording
+
+        return Recording(file, judge)
+    if suffix == ".npz":
+        from robot.recordings.npz_trace import read_trace
+
+        return read_trace(file, judge)
+    if suffix == ".csv":
+        from robot.recordings.csv_reader import read_csv_recording
+
+        return read_csv_recording(file, config.table, judge)
+    if suffix in VIDEO_SUFFIXES:
+        from robot.recordings.video_recording import read_video
+
+        return read_video(config, judge)
     registered, broken = _registered_formats()
     if suffix not in registered:
-        require_file(config.file)
-        found = f"no reader for {config.file.suffix!r} files" if suffix else "a file without a suffix"
+        require_file(file)
+        found = f"no reader for {file.suffix!r} files" if suffix else "a file without a suffix"
         cure = "; ".join(error.found for error in broken)
-        raise InputError(str(config.file), found, f"one of {', '.join([*FORMATS, *registered])}", cure)
+        raise InputError(str(file), found, f"one of {', '.join([*FORMATS, *registered])}", cure)
     entry = registered[suffix]
-    settings = read_settings(entry.config_class, {"file": str(config.file)}, "recording")
+    settings = read_settings(entry.config_class, {"file": str(file)}, "recording")
     return entry.open(settings, judge.warn)
 
 

@@ -39,17 +39,10 @@ from robot.sources.source import Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 
-GLITCHES, GLITCH_SHARE = 2, 0.01  # number of fastest steps that are ignored, or share of all if that is more
-PAUSE = 1000.0  # median steps: a longer step is an error of the clock and is ignored
 RATIO = 30.0  # of odometry and truth; correct data are near 1, a wrong unit gives 57 or 1000
-LEAST, MOST = 0.3, 5.0  # m or rad: smaller and larger total below which the ratio is not judged
-RULER = 0.05  # m: smallest step in measuring the true path, so that noise does not add up
-STRETCHES = 50  # net turning is compared over this many, so that noise does not add up
+_GLITCHES = 2  # number of fastest steps that are ignored, or a hundredth of all if that is more
 JUMP = 10.0
 """Typical steps above which a step is a jump; clean recordings stay below 5.1."""
-JUMPS, LONGEST = 0.05, 4
-"""Largest share of the steps that can be jumps (always four), most of them one after another: more are how
-this robot moves."""
 LEAST_TURN = 1.0
 """Smallest turn that is a jump, rad: a robot that hardly turns may turn sharply a few times."""
 GAP, LONG_GAP, LEAST_GAP = 10.0, 100.0, 1.0
@@ -60,17 +53,6 @@ holds."""
 FAST, START, CRAWL, LEAST_PATH = 3.0, 15.0, 1e-3, 0.1
 """Speed, m/s, from which starts are judged, and the fastest of any robot, m/s²; speed and whole path of one
 that hardly moves, m/s and m."""
-RARE = {"cm": 0.5, "km": 1.0, "ns": 0.2, "us": 0.2, "ks": 0.3, "min": 0.5}
-"""Decades by which a unit is less likely than one of equal fit."""
-RETURNS, RETURNING = 0.25, 0.1
-"""Share of a step within which the next one leads back, and share of the steps of two publishers that do."""
-ENOUGH, ALIKE = 20, (0.5, 0.9)
-"""Steps that tell the unit of headings; mean agreement with the motion in a wrong and a right unit."""
-COARSE = 0.1
-"""Share of the typical step above which the spacing of numbers spoils it."""
-
-USUAL = np.array([0.1, 0.4, 0.5])
-"""Interval (s), speed (m/s) and turn rate (rad/s) of a usual robot, for the choice among units."""
 
 
 class UnitLimits(Settings):
@@ -174,7 +156,7 @@ class InputJudge:
                 said = "headings agree with the direction of motion in degrees, and not in radians"
                 return [InputError(where, said, "headings in radians", (cures or unit_cure)("angle", "deg"))]
             errors = []
-            for finding in judge_steps(track, self.limits, clock):
+            for finding in _judge_steps(track, self.limits, clock):
                 at = where if finding.row is None else place(finding.row)
                 if finding.refused:
                     errors.append(InputError(at, finding.found, finding.expected, finding.cure))
@@ -193,11 +175,11 @@ def judge_motion(time: np.ndarray, motion: np.ndarray, where: str) -> list[str]:
         time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s). where: names the session.
     """
     track = MotionTrack(time, np.ones(len(time), bool), motion)
-    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in judge_steps(track)]
+    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in _judge_steps(track)]
     return [*map(str, unit_errors(track, where)), *found]
 
 
-class Finding(NamedTuple):
+class _Finding(NamedTuple):
     """A finding. Attributes: refused: whether it is an error. row: its first row, None for all of them."""
 
     refused: bool
@@ -208,9 +190,9 @@ class Finding(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def judge_steps(
+def _judge_steps(
     track: MotionTrack, limits: UnitLimits = DEFAULT_LIMITS, clock: str = ""
-) -> Iterator[Finding]:
+) -> Iterator[_Finding]:
     """Findings in single steps of a track whose units are right, errors first.
 
     Args:
@@ -232,7 +214,7 @@ def judge_steps(
     path, speed = float(steps.length.sum()), steps.typical_length / (steps.interval or 1.0)
     if 0 < path < LEAST_PATH and speed < CRAWL:
         cure = "if these are kilometres, --set recording.odometry.length_scale=1000"
-        yield Finding(False, None, f"the whole path is {path:.3g} m, at {speed:.2g} m/s", "", cure)
+        yield _Finding(False, None, f"the whole path is {path:.3g} m, at {speed:.2g} m/s", "", cure)
 
 
 class _Steps:
@@ -259,18 +241,20 @@ def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     """[N] bool, amounts over `JUMP` times the typical one of all smaller ones; none if they are many."""
     order = np.argsort(amounts)
     ordered = amounts[order]
-    first = len(ordered) - max(4, int(JUMPS * len(ordered)))
+    # At most a twentieth of the steps, at least four, can be jumps, and four of them one after another: more
+    # are how this robot moves.
+    first = len(ordered) - max(4, int(0.05 * len(ordered)))
     done = np.cumsum(ordered)
     for place in range(max(first, 1), len(ordered)):
         typical = ordered[np.searchsorted(done, done[place - 1] / 2)]
         if typical > 0 and ordered[place] > max(JUMP * typical, least):
             found = np.asarray(amounts >= ordered[place])
             runs = np.diff(np.flatnonzero(np.diff(found, prepend=False, append=False)))[::2]
-            return found if runs.max() <= LONGEST else np.zeros(len(amounts), bool)
+            return found if runs.max() <= 4 else np.zeros(len(amounts), bool)
     return np.zeros(len(amounts), bool)
 
 
-def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: str) -> Finding:
+def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: str) -> _Finding:
     moved = (steps.length > JUMP * steps.typical_length) | (steps.turn > JUMP * steps.typical_turn)
     wrong = gaps & moved if held else np.zeros(len(gaps), bool)
     first = int((wrong if wrong.any() else gaps).argmax())
@@ -281,13 +265,13 @@ def _gap(steps: _Steps, gaps: np.ndarray, rows: np.ndarray, held: bool, clock: s
         found += f": the velocity that holds over it moves the robot by {steps.length[first]:.4g} m"
         found += f" and {steps.turn[first]:.3g} rad, and nobody knows how it moved"
         cure = f"if the clock jumped or the robot stood, {clock or _largest(steps, wrong)}; {stretch}"
-        return Finding(True, int(rows[first]), found, "no gap in velocities", cure)
+        return _Finding(True, int(rows[first]), found, "no gap in velocities", cure)
     what = "how the robot moved is not known" if held else "poses and motions bridge it, views do not"
     cure = f"if the clock jumped, {clock}" if clock else f"look at it: {what}"
-    return Finding(False, int(rows[first]), f"{found} ({what})" if clock else found, "", cure)
+    return _Finding(False, int(rows[first]), f"{found} ({what})" if clock else found, "", cure)
 
 
-def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits) -> Finding:
+def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits) -> _Finding:
     first = int(jumps.argmax())
     speed = steps.length / np.maximum(steps.duration, 1e-9)
     found = f"the odometry jumps by {steps.length[first]:.4g} m and {steps.turn[first]:.3g} rad in "
@@ -297,7 +281,7 @@ def _jump(steps: _Steps, jumps: np.ndarray, rows: np.ndarray, limits: UnitLimits
     cause = "a wild pose" if back else "a reset of the odometry, or a robot that was carried"
     cure = f"{cause}: {_largest(steps, jumps)}; or choose a stretch with recording.from and recording.to"
     refused = bool((speed[jumps] > limits.speed).any())
-    return Finding(refused, int(rows[first]), found, "steps that this robot can make", cure)
+    return _Finding(refused, int(rows[first]), found, "steps that this robot can make", cure)
 
 
 def _largest(steps: _Steps, wrong: np.ndarray) -> str:
@@ -312,19 +296,20 @@ def _largest(steps: _Steps, wrong: np.ndarray) -> str:
     return f"{' '.join(words)} repeats the step before instead" if words else "drop these rows"
 
 
-def _two_publishers(poses: np.ndarray) -> Finding | None:
+def _two_publishers(poses: np.ndarray) -> _Finding | None:
     """Positions that jump between two paths: each leads back to where the robot was two messages before."""
     once = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     twice = np.hypot(*(poses[2:, :2] - poses[:-2, :2]).T)
     moved = (once[:-1] > 0) & (once[1:] > 0)
-    back = moved & (twice < RETURNS * np.minimum(once[:-1], once[1:]))
-    if not back.sum() > max(RETURNING * len(poses), GLITCHES):
+    # Two publishers: a tenth of the steps leads back to within a quarter of its length.
+    back = moved & (twice < 0.25 * np.minimum(once[:-1], once[1:]))
+    if not back.sum() > max(0.1 * len(poses), _GLITCHES):
         return None
     path, alone = float(once.sum()), float(np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum())
     found = f"{int(back.sum())} of {len(poses)} poses lead back to where the robot was before: the path is "
     found += f"{path:.4g} m, that of every second message {alone:.4g} m, so two nodes publish here"
     cure = "--set recording.topics.odometry.every=2, or record each node under a topic of its own"
-    return Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
+    return _Finding(True, int(back.argmax()) + 1, found, "one publisher", cure)
 
 
 def _are_degrees(poses: np.ndarray) -> bool:
@@ -332,26 +317,26 @@ def _are_degrees(poses: np.ndarray) -> bool:
     step = np.diff(poses[:, :2], axis=0)
     length, heading = np.hypot(*step.T), poses[:-1, 2]
     moved = length > np.median(length[length > 0]) / 2 if (length > 0).any() else length > 0
-    if moved.sum() <= ENOUGH or np.ptp(heading) <= 2 * np.pi:
+    if moved.sum() <= 20 or np.ptp(heading) <= 2 * np.pi:
         return False
     along = 2j * np.arctan2(step[moved, 1], step[moved, 0])
     agree = [abs(np.exp(2j * angle[moved] - along).mean()) for angle in (heading, np.radians(heading))]
-    return bool(agree[0] < ALIKE[0] and agree[1] > ALIKE[1])
+    return bool(agree[0] < 0.5 and agree[1] > 0.9)
 
 
-def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> Finding | None:
+def _coarse_numbers(poses: np.ndarray, steps: _Steps) -> _Finding | None:
     """Coordinates so far from the origin that numbers lie apart by much of a step."""
     places = poses[:, :2]
     single = places.astype(np.float32)
     far = float(np.median(np.abs(places).max(axis=1)))
     spacing = float(np.spacing(np.float32(far)) if (single == places).all() else np.spacing(far))
-    if not spacing > COARSE * steps.typical_length > 0:
+    if not spacing > 0.1 * steps.typical_length > 0:  # else it spoils the step
         return None
     found = f"coordinates of {far:.4g} m come in steps of {spacing:.2g} m, and the robot moves by "
     found += f"{steps.typical_length:.2g} m: precision was lost far from the origin"
     cure = "write them in double precision or from a near origin; of a bag, take velocities: "
     cure += "--set recording.topics.odometry.use=twist"
-    return Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
+    return _Finding(False, int((np.abs(places).max(axis=1) >= far).argmax()), found, "", cure)
 
 
 def typical_motion(track: MotionTrack) -> TypicalMotion:
@@ -359,7 +344,8 @@ def typical_motion(track: MotionTrack) -> TypicalMotion:
     steps = np.diff(track.time[track.moved & np.isfinite(track.time)])
     interval = float(np.median(steps)) if len(steps) else 0.0
     dt = track.motion[:, 3]
-    good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= PAUSE * interval)
+    # A step of 1000 median ones is an error of the clock and is ignored.
+    good = np.isfinite(track.motion).all(axis=1) & (dt > 0) & (dt <= 1000.0 * interval)
     length, turn = np.hypot(track.motion[good, 0], track.motion[good, 1]), np.abs(track.motion[good, 2])
     true_speed, path, turning = _compare_with_truth(track, good)
     share = np.maximum(dt[good] / (interval or 1.0), 1.0)
@@ -447,6 +433,9 @@ def _faults(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, s
 def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[str, str]:
     """The fewest units, of time, length and angle, with which nothing is absurd; of as many, those that make
     the robot most like a usual one. {} if there are none."""
+    usual = np.array([0.1, 0.4, 0.5])  # interval (s), speed (m/s) and turn rate (rad/s) of a usual robot
+    # Decades by which a unit is less likely than one of equal fit.
+    rare = {"cm": 0.5, "km": 1.0, "ns": 0.2, "us": 0.2, "ks": 0.3, "min": 0.5}
     best: tuple[float, dict[str, str]] = (np.inf, {})
     there = {"time": 1.0, "length": robot.speed, "angle": robot.turn}
     for chosen in product(*(list(PER_UNIT[key])[: None if most > 0 else 1] for key, most in there.items())):
@@ -463,8 +452,8 @@ def _explanation(robot: TypicalMotion, held: bool, limits: UnitLimits) -> dict[s
         if _faults(changed, held, limits):
             continue
         values = np.array([changed.interval, changed.speed, changed.turn_rate])
-        unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / USUAL))[values > 0].sum())
-        unlike += sum(RARE.get(unit, 0.0) for unit in chosen)
+        unlike = float(np.abs(np.log10(np.maximum(values, 1e-12) / usual))[values > 0].sum())
+        unlike += sum(rare.get(unit, 0.0) for unit in chosen)
         units = {key: unit for key, unit in named.items() if PER_UNIT[key][unit] != 1}
         best = min(best, (100 * len(units) + unlike, units), key=lambda each: each[0])
     return best[1]
@@ -510,7 +499,7 @@ def heading_errors(
 def _typical(amount: np.ndarray, duration: np.ndarray) -> float:
     """The rate above which half of the total amount [N] falls."""
     rate = amount / duration
-    ignored = max(GLITCHES, int(GLITCH_SHARE * len(rate)))
+    ignored = max(_GLITCHES, int(0.01 * len(rate)))
     order = np.argsort(rate)[: max(len(rate) - ignored, 0)]
     done = np.cumsum(amount[order])
     return float(rate[order][np.searchsorted(done, done[-1] / 2)]) if len(done) and done[-1] > 0 else 0.0
@@ -524,35 +513,29 @@ def _compare_with_truth(
     if track.truth is None:
         return nothing
     rows = np.flatnonzero(np.isfinite(track.truth).all(axis=1))
-    if len(rows) <= GLITCHES + 1:
+    if len(rows) <= _GLITCHES + 1:
         return nothing
     motion, truth = np.where(good[:, None], track.motion, 0.0), track.truth[rows]
     driven = np.diff(np.cumsum(np.hypot(motion[:, 0], motion[:, 1]))[rows])
     length, dt = np.hypot(*np.diff(truth[:, :2], axis=0).T), np.diff(track.time[rows])
     speed = _typical(length[dt > 0], dt[dt > 0])
     turns = np.cumsum(motion[:, 2])[rows], np.unwrap(truth[:, 2])
-    ends = np.unique(np.linspace(0, len(rows) - 1, STRETCHES + 1).astype(int))
+    ends = np.unique(np.linspace(0, len(rows) - 1, 51).astype(int))
     turned = (np.abs(np.diff(angle[ends])) for angle in turns)
-    totals = [
-        float(np.sort(each)[:-GLITCHES].sum()) for each in (driven, _ruler_steps(truth[:, :2]), *turned)
-    ]
+    # Steps of at least 5 cm along the true path, so that noise does not add up; turning over 50 stretches.
+    steps, last = [0.0], complex(*truth[0, :2])
+    for point in (truth[:, 0] + 1j * truth[:, 1]).tolist():
+        if (step := abs(point - last)) >= 0.05:
+            steps.append(step)
+            last = point
+    totals = [float(np.sort(each)[:-_GLITCHES].sum()) for each in (driven, np.array(steps), *turned)]
     return speed, (totals[0], totals[1]), (totals[2], totals[3])
 
 
-def _ruler_steps(points: np.ndarray) -> np.ndarray:
-    """Lengths of steps of at least `RULER` along the points [N, 2]."""
-    steps, last = [0.0], complex(*points[0])
-    for point in (points[:, 0] + 1j * points[:, 1]).tolist():
-        if (step := abs(point - last)) >= RULER:
-            steps.append(step)
-            last = point
-    return np.array(steps)
-
-
 def _differ_by_unit(a: float, b: float) -> bool:
-    """Whether two totals differ by more than `RATIO`, as with a wrong unit; never for NaN."""
+    """Whether two totals, m or rad, differ by more than `RATIO`, as with a wrong unit; never for NaN."""
     least, most = min(a, b), max(a, b)
-    return least > LEAST and most > MOST and most > RATIO * least
+    return least > 0.3 and most > 5.0 and most > RATIO * least
 
 
 def _else(name: str, limits: UnitLimits) -> str:

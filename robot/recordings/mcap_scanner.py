@@ -1,12 +1,9 @@
-"""Reads a recording from its first byte to its end, or to the first damaged byte.
+"""Reads a recording in MCAP from its first byte to its end, or to the first damaged byte.
 
-Every message must fit its schema and have the next sequence number, so that a damaged file yields exactly a
-prefix of the written messages.
-
-The records of an MCAP file in the order in which they were written, checked against damage.
-
-MCAP's own reader needs the index at the end of the file, which a killed writer did not write. Lengths are
-bounded by the rest of the file, and chunks must match their checksum.
+MCAP's own reader needs the index at the end of the file, which a killed writer did not write. Here records
+are read in the order in which they were written: lengths are bounded by the rest of the file, chunks must
+match their checksum, and every message must fit its schema and have the next sequence number. So a damaged
+file yields exactly a prefix of the written messages.
 """
 
 from __future__ import annotations
@@ -48,10 +45,10 @@ from robot.sources.source import Sample, SourceInfo
 from tactile.base.files import MOST_BYTES
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
-DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+_DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 
-class Unclosed(EndOfFile):
+class _Unclosed(EndOfFile):
     """The file ends after a whole record, as that of a killed writer does, and not with its closing one."""
 
 
@@ -77,8 +74,8 @@ class _BoundedFile:
         return content
 
 
-def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """All records in order, those in chunks included; raises one of `DAMAGE_ERRORS`."""
+def _read_records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """All records in order, those in chunks included; raises one of `_DAMAGE_ERRORS`."""
     bounded, left = _BoundedFile(file), -1  # bytes after the last whole record
     reader = StreamReader(cast(Any, bounded), emit_chunks=True, validate_crcs=True)
     try:
@@ -89,11 +86,11 @@ def read_records(file: IO[bytes]) -> Iterator[McapRecord]:
             elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
                 yield record
     except EndOfFile as error:
-        raise Unclosed if left == 0 else error from None
+        raise _Unclosed if left == 0 else error from None
 
 
 def open_chunk(chunk: Chunk) -> list[McapRecord]:
-    """The records in a chunk; raises as `read_records`."""
+    """The records in a chunk; raises as `_read_records`."""
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
     size = len(chunk.data)
@@ -170,7 +167,7 @@ def is_foreign(path: Path) -> bool:
                     return False
                 if isinstance(record, (Chunk, Message)):
                     return True
-    except (OSError, *DAMAGE_ERRORS):
+    except (OSError, *_DAMAGE_ERRORS):
         return not library.startswith(OURS)
     return True
 
@@ -226,7 +223,7 @@ class McapScanner:
         names: dict[int, str] = {}  # schema of each channel; '': not a ratslam topic
         truth: bytes | None = None
         try:
-            for record in read_records(file):
+            for record in _read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = RecordingDescription.from_metadata(record.metadata)
                     self._frames = FrameWindow(empty_frames(self.description.whiskers))
@@ -247,36 +244,36 @@ class McapScanner:
                         truth = record.data
                         continue
                     self._number += 1
-                    if name in READINGS:
-                        sample = self._sample(name, record.data, truth)
-                        self.count += 1
-                        yield RecordingEntry(name, sample.time, record.data, truth, sample)
-                        truth = None
-                    else:
-                        time, content = self._block(name, record.data)
-                        yield RecordingEntry(name, time, record.data, None, content)
+                    time, content = self._decoded(name, record.data, truth)
+                    reading = name in READINGS
+                    self.count += reading
+                    yield RecordingEntry(name, time, record.data, truth if reading else None, content)
+                    truth = None if reading else truth
                 elif isinstance(record, Statistics):
                     self._check_counts(record, names)
-        except DAMAGE_ERRORS as error:
+        except _DAMAGE_ERRORS as error:
             text = str(error) or type(error).__name__
             self.broken = "it ends too early" if isinstance(error, EndOfFile) else text
-            self.broken = UNCLOSED if isinstance(error, Unclosed) and truth is None else self.broken
+            self.broken = UNCLOSED if isinstance(error, _Unclosed) and truth is None else self.broken
         else:
             self.broken = ""
 
-    def _sample(self, name: str, message: bytes, truth: bytes | None) -> Sample:
+    def _decoded(
+        self, name: str, message: bytes, truth: bytes | None
+    ) -> tuple[float, Sample | Frames | np.ndarray | Event]:
+        """The time and the content of a message with this schema; truth: of a reading."""
         assert self.description is not None
-        where = None if truth is None else decode_truth(truth)[1]
-        if name != CUT:
-            time, reading = decode(name, message, self.description.view_shape, self.description.whiskers)
-            return Sample(time, reading, where)
-        cut = decode_cut(message)
-        return Sample(cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut), where)
-
-    def _block(self, name: str, message: bytes) -> tuple[float, Frames | np.ndarray | Event]:
-        assert self.description is not None
+        whiskers = self.description.whiskers
+        if name in READINGS:
+            where = None if truth is None else decode_truth(truth)[1]
+            if name != CUT:
+                time, reading = decode(name, message, self.description.view_shape, whiskers)
+            else:
+                cut = decode_cut(message)
+                time, reading = cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut)
+            return time, Sample(time, reading, where)
         if name == FRAMES:
-            time, frames = decode_frames(message, self.description.whiskers)
+            time, frames = decode_frames(message, whiskers)
             self._frames.add(frames)
             return time, frames
         if name == ARM:

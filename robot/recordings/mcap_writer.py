@@ -1,8 +1,6 @@
-"""Writes MCAP files that stay readable when the process is killed or the disk is full.
+"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full.
 
 Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
-
-Writes samples to a recording.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from robot.sources.source import Sample, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file
 
-CHUNK_BYTES = 1 << 16
+_CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
 
 
@@ -41,7 +39,7 @@ class McapWriter:
         path: must not exist yet.
         view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
         info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
-        chunk_s: a chunk is written when it has `CHUNK_BYTES`, or when the time of its last message differs
+        chunk_s: a chunk is written when it has `_CHUNK_BYTES`, or when the time of its last message differs
             from that of the previous chunk by this many seconds.
 
     Attributes:
@@ -94,13 +92,16 @@ class McapWriter:
         """
         # MCAP's clock has no negative times.
         stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
-        self._writer.add_message(self._channel(name), stamp, message, stamp, self._number % (1 << 32))
+        if name not in self._channels:
+            schema = self._writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
+            self._channels[name] = self._writer.register_channel(TOPICS[name], "cdr", schema)
+        self._writer.add_message(self._channels[name], stamp, message, stamp, self._number % (1 << 32))
         self._pending += len(message)
         if name == TRUTH:
             return
         self._number += 1
         self.count += name in READINGS
-        if self._pending >= CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
+        if self._pending >= _CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
             self.flush()
             self._flushed = time
 
@@ -133,12 +134,6 @@ class McapWriter:
                 raise RecordingWriteError(self.path, error) from error
         finally:
             self._file.close()
-
-    def _channel(self, name: str) -> int:
-        if name not in self._channels:
-            schema = self._writer.register_schema(name, "ros2msg", SCHEMAS[name].encode())
-            self._channels[name] = self._writer.register_channel(TOPICS[name], "cdr", schema)
-        return self._channels[name]
 
 
 class WholeChunkFile:

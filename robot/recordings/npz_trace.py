@@ -28,8 +28,6 @@ from tactile.base.errors import InputError
 from tactile.base.files import NPZ_SPOILT, check_size, read_arrays, reason
 
 VIEW, ODOMETRY = 1, 2
-FASTEST = 1e6
-"""m/s or rad/s that no wheel, and no damage of a few bits, should reach."""
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")
 NEEDED = (*COLUMNS, "in_view", "params_json")
 
@@ -74,6 +72,7 @@ def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
         label[seen] = view[seen, 0].astype(np.int32)
     else:
         picture[seen] = view[seen].reshape(-1, *shape)
+    cell = params.get("pc_cell_x_size")
     return InMemorySource(
         name=path.stem,
         digest=judge.stretch.digest(digest_of([content])),
@@ -84,7 +83,11 @@ def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
         seen=np.zeros_like(seen) if given_ids else seen,
         label=label,
         truth=truth,
-        info=_info(params, bool(given_ids and seen.any())),
+        info=SourceInfo(
+            labels_only=bool(given_ids and seen.any()),
+            cell_size=float(cell) if isinstance(cell, int | float) and 0 < cell < np.inf else None,
+            provenance={"parameters": params},
+        ),
     )
 
 
@@ -112,11 +115,19 @@ def _value_errors(
     errors = first_error(bad, place, lambda row: f"in_flags is {flags[row]}", wanted)
     errors += nonfinite_errors(track.time, "in_t", place)
     errors += clock_errors(track.time, "in_t", place, track.moved)
-    for name in ("in_v", "in_w"):
-        errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved, FASTEST)
+    for name in ("in_v", "in_w"):  # 1e6 m/s or rad/s no wheel and no damage of a few bits should reach
+        errors += nonfinite_errors(arrays[name].astype(np.float64), name, place, track.moved, 1e6)
     errors += nonfinite_errors(view, "in_view", place, seen)
     if given_ids:
-        errors += _id_errors(view, seen, place)
+        # Place ids are integers; relative angles of matches are not supported.
+        ids, relative = np.nan_to_num(view).T
+        bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
+        errors += first_error(
+            bad, place, lambda row: f"in_view's place id is {ids[row]}", "an integer from 0"
+        )
+        found = lambda row: f"in_view's relative angle is {relative[row]} rad"  # noqa: E731
+        turned, cure = seen & (relative != 0), "relative angles are not supported"
+        errors += first_error(turned, place, found, "0", cure)
     else:
         low, high = (np.where(seen, most, np.nan) for most in (view.min(axis=1), view.max(axis=1)))
         errors += view_errors(low, high, "in_view", place)
@@ -174,15 +185,6 @@ def _params(path: Path, text: np.ndarray) -> Parameters:
     return {key: _number(value) for key, value in params.items()}
 
 
-def _info(params: Parameters, labels_only: bool) -> SourceInfo:
-    cell = params.get("pc_cell_x_size")
-    return SourceInfo(
-        labels_only=labels_only,
-        cell_size=float(cell) if isinstance(cell, int | float) and 0 < cell < np.inf else None,
-        provenance={"parameters": params},
-    )
-
-
 def _number(value: object) -> float | int | str:
     for kind in (int, float):
         try:
@@ -211,13 +213,3 @@ def _view_shape(path: Path, params: dict, width: int) -> tuple[tuple[int, int, i
         expected = f"{rows * columns} ({size_text}), or 2 (id, relative_rad)"
         raise InputError(str(path), f"in_view has {width} columns", expected)
     return (rows, columns, 1), width != rows * columns
-
-
-def _id_errors(view: np.ndarray, seen: np.ndarray, place: RowName) -> list[InputError]:
-    """Errors of place labels, which are integers; relative angles of matches are not supported."""
-    ids, relative = np.nan_to_num(view).T
-    bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
-    errors = first_error(bad, place, lambda row: f"in_view's place id is {ids[row]}", "an integer from 0")
-    found = lambda row: f"in_view's relative angle is {relative[row]} rad"  # noqa: E731
-    turned, cure = seen & (relative != 0), "relative angles are not supported"
-    return errors + first_error(turned, place, found, "0", cure)

@@ -1,31 +1,13 @@
-"""An arm that reaches through clutter with two arrays of magnetic whiskers.
+"""Published recordings of real whiskers and touch sensors, each as a source of its own (`source.plugin`).
 
-From the recordings of "Navigation and 3D Surface Reconstruction from Passive Whisker Sensing" (arXiv
-2406.06038). The CSV file has a row per reading: `row`, the pose of the end effector (position in m,
-quaternion in the order in which it was stored), and x, y, z (counts) of 8 whiskers on the left and 6 on the
-right. It has no time: the authors' tracker assumes 200 readings per second.
+| plug-in | recording | file |
+|---|---|---|
+| `whisker_reach` | arm reaching through clutter, 14 magnetic whiskers (arXiv 2406.06038) | CSV, counts |
+| `whisker_stage` | one such whisker on an XYZ stage (Stanford, Lin et al. 2024) | CSV, counts |
+| `whisker_objects` | objects, 8 actuated whiskers (doi 10.1038/s41467-025-67672-x) | CSV, camera pixels |
+| `taxel_contacts` | objects, three fingertips of 22 pressures (github.com/mathewzilla/TXZY) | MATLAB |
 
-CSV files of numbers only, each cell of each row filled.
-
-Recordings of one magnetic whisker on an XYZ stage (Stanford, Lin et al. 2024, arXiv 2406.06038).
-
-A CSV file has the columns index, px, py, pz (stage, mm), sx, sy, sz (counts of a Hall sensor), and no time.
-In a calibration the stage brings a contact to known points of the whisker: rays that start at its base. In a
-sweep an object stands on the stage: its place changes with the stage's position, the whisker stands still.
-
-Objects felt by eight actuated whiskers.
-
-From the recordings of "Vibrissae-inspired vision-based magnetic-actuated whisker"
-(doi 10.1038/s41467-025-67672-x). A CSV file holds one object, without a header: a row per touch of
-8 whiskers x 16 displacements of their roots, integers in camera pixels, 0 at rest. Rows have no time and no
-pose. The files do not say that rows are in the order of the touches, nor which of their values belong to one
-whisker; 16 successive ones are taken to.
-
-Objects touched by the three fingertips of a Barrett hand, 22 pressure taxels each.
-
-From the recordings of the TXZY robot (github.com/mathewzilla/TXZY, Sheffield). A MATLAB file holds one cell
-array: objects x (position of the hand, fingertips 1 to 3) x trials, or the same cut into single contacts:
-x contacts. A cell of a fingertip is an array of samples x 22 pressures, counts. Samples have no time.
+No file has times of its readings. Each cell of each row of a CSV file must be a number.
 """
 
 from __future__ import annotations
@@ -68,7 +50,7 @@ def read_columns(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, str]:
     return _parse(path, rows, columns, first_line=2), digest_of([content])
 
 
-def read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
+def _read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
     """The numbers [N, count] of a file without a header, and sha256 (hex) of the file.
 
     Raises:
@@ -122,10 +104,39 @@ def _first_fault(path: Path, rows: str, columns: Sequence[str], first_line: int)
     return InputError(str(path), "lines of different lengths", f"{len(columns)} numbers in each line")
 
 
+def _source(
+    name: str,
+    digest: str,
+    time: np.ndarray,
+    views: np.ndarray,
+    *,
+    alive: np.ndarray,
+    motion: np.ndarray | None = None,
+    truth: np.ndarray | None = None,
+) -> InMemorySource:
+    """A source with a view at each time; without motion of a robot at rest, whose views are signed."""
+    count, still = len(time), motion is None
+    return InMemorySource(
+        name=name,
+        digest=digest,
+        time=time,
+        motion=np.zeros((count, 4)) if motion is None else motion,
+        moved=np.full(count, not still),
+        views=views,
+        seen=np.ones(count, bool),
+        label=np.full(count, -1, np.int32),
+        truth=truth,
+        info=SourceInfo(signed_views=still),
+        alive=alive,
+    )
+
+
 WHISKERS = (*(f"left{k}" for k in range(8)), *(f"right{k}" for k in range(6)))
-"""Names of the whiskers, in the order of the columns."""
-POSE = ("ee_x_m", "ee_y_m", "ee_z_m", "q0", "q1", "q2", "q3")
-COLUMNS = ("row", *POSE, *(f"{whisker}_{axis}" for whisker in WHISKERS for axis in "xyz"))
+"""Names of the whiskers of the reach, in the order of the columns."""
+COLUMNS = (
+    *("row", "ee_x_m", "ee_y_m", "ee_z_m", "q0", "q1", "q2", "q3"),
+    *(f"{whisker}_{axis}" for whisker in WHISKERS for axis in "xyz"),
+)
 
 
 class ReachRecord(NamedTuple):
@@ -161,7 +172,7 @@ def read_reach(path: Path) -> ReachRecord:
     """The record in a file.
 
     Raises:
-        InputError: as `number_table.read_columns`, or rows are missing.
+        InputError: as `read_columns`, or rows are missing.
     """
     table, digest = read_columns(path, COLUMNS)
     if (jump := np.flatnonzero(table[:, 0] != np.arange(len(table)))).size:
@@ -199,31 +210,18 @@ def open_reach(config: ReachConfig) -> InMemorySource:
     motion = np.zeros((count, 4))
     motion[1:, :2] = np.diff(record.position[:, :2], axis=0)
     motion[1:, 3] = 1 / config.rate
-    return InMemorySource(
-        name=config.file.stem,
-        digest=record.digest,
-        time=np.arange(count) / config.rate,
+    return _source(
+        config.file.stem,
+        record.digest,
+        np.arange(count) / config.rate,
+        (touch == Touch.CONTACT).astype(float)[:, None, :, None],
         motion=motion,
-        moved=np.ones(count, bool),
-        views=(touch == Touch.CONTACT).astype(float)[:, None, :, None],
-        seen=np.ones(count, bool),
-        label=np.full(count, -1, np.int32),
         truth=np.concatenate([record.position[:, :2], np.zeros((count, 1))], axis=1),
         alive=touch[-1] != Touch.BENT,
     )
 
 
 REACH = SourceEntry(ReachConfig, lambda config, warn: open_reach(config))
-
-
-STAGE_COLUMNS = ("", "px", "py", "pz", "sx", "sy", "sz")
-"""The index has no name."""
-MILLIMETRE = 1e-3
-"""m."""
-UNEVEN = 3.0
-"""A step this many times as long or as short as the median is not part of a sweep."""
-SAME_PLACE = 1e-6
-"""Stage positions closer than this are the same, m."""
 
 
 class StageRecording(NamedTuple):
@@ -256,17 +254,17 @@ def read_stage(path: Path) -> StageRecording:
     """Reads a file.
 
     Raises:
-        InputError: as `number_table.read_columns`.
+        InputError: as `read_columns`.
     """
-    table, digest = read_columns(path, STAGE_COLUMNS)
-    return StageRecording(table[:, 1:4] * MILLIMETRE, table[:, 4:], digest)
+    table, digest = read_columns(path, ("", "px", "py", "pz", "sx", "sy", "sz"))  # the index has no name
+    return StageRecording(table[:, 1:4] * 1e-3, table[:, 4:], digest)
 
 
 def cut_sweep(recording: StageRecording) -> StageRecording:
     """The longest stretch of even steps: without the way to the start, and the row of zeros there."""
     step = np.linalg.norm(np.diff(recording.position, axis=0), axis=1)
     usual = np.median(step)
-    even = (step <= UNEVEN * usual) & (step >= usual / UNEVEN)
+    even = (step <= 3.0 * usual) & (step >= usual / 3.0)
     run = longest_run(even)
     rows = slice(run.start, run.stop + 1) if even.any() else slice(None)
     return recording._replace(position=recording.position[rows], signal=recording.signal[rows])
@@ -282,7 +280,7 @@ def read_stage_calibration(path: Path) -> StageCalibration:
     """
     recording = read_stage(path)
     base = recording.position[0]
-    free = np.linalg.norm(recording.position - base, axis=1) < SAME_PLACE
+    free = np.linalg.norm(recording.position - base, axis=1) < 1e-6  # m
     if free.sum() < 2 or free.all():
         expected = "a calibration that returns to the position of its first row, the whisker's base"
         raise InputError(str(path), f"{free.sum()} of {len(free)} rows at the first position", expected)
@@ -292,7 +290,7 @@ def read_stage_calibration(path: Path) -> StageCalibration:
     return StageCalibration(recording.position[~free], base, above[~free])
 
 
-def open_stage(config: StageConfig) -> Source:
+def _open_stage(config: StageConfig) -> Source:
     """The source of a file; its motion and its true positions are the stage's x and y.
 
     Raises:
@@ -304,24 +302,22 @@ def open_stage(config: StageConfig) -> Source:
     size = np.abs(recording.signal - recording.signal[0])
     x, y = recording.position[:, :2].T
     steps = np.diff(recording.position, axis=0, prepend=recording.position[:1])
-    return InMemorySource(
-        name=config.file.stem,
-        digest=recording.digest,
-        time=time,
+    return _source(
+        config.file.stem,
+        recording.digest,
+        time,
+        (size / max(size.max(), 1e-300)).reshape(count, 1, 1, 3),
         motion=from_motions(time, steps[:, 0], steps[:, 1], np.zeros(count)),
-        moved=np.ones(count, bool),
-        views=(size / max(size.max(), 1e-300)).reshape(count, 1, 1, 3),
-        seen=np.ones(count, bool),
-        label=np.full(count, -1, np.int32),
         truth=np.stack([x, y, np.zeros(count)], axis=1),
         alive=np.ones(1, bool),
     )
 
 
-STAGE = SourceEntry(StageConfig, lambda config, warn: open_stage(config))
+STAGE = SourceEntry(StageConfig, lambda config, warn: _open_stage(config))
 
 
-OBJECTS_WHISKERS, VALUES = 8, 16
+OBJECTS_WHISKERS = 8
+"""Whiskers that feel the objects; each gives 16 displacements of its root."""
 
 
 class ObjectRecord(NamedTuple):
@@ -343,17 +339,20 @@ class ObjectConfig(Settings):
 
 
 def read_object(path: Path) -> ObjectRecord:
-    """The record in a file.
+    """The record in a file without a header: a row per touch.
+
+    The file does not say that rows are in the order of the touches, nor which values belong to one whisker;
+    16 successive ones are taken to.
 
     Raises:
-        InputError: as `number_table.read_rows`, or a row is not of 128 whole numbers.
+        InputError: as `_read_rows`, or a row is not of 128 whole numbers.
     """
-    table, digest = read_rows(path, OBJECTS_WHISKERS * VALUES)
+    table, digest = _read_rows(path, OBJECTS_WHISKERS * 16)
     if (broken := np.argwhere(table != np.round(table))).size:
         row, column = broken[0].tolist()
         found = f"{table[row, column]:g} in column {column + 1}"
         raise InputError(f"{path}:{row + 1}", found, "whole numbers of pixels")
-    return ObjectRecord(table.reshape(-1, OBJECTS_WHISKERS, VALUES), digest)
+    return ObjectRecord(table.reshape(-1, OBJECTS_WHISKERS, 16), digest)
 
 
 def open_object(config: ObjectConfig) -> InMemorySource:
@@ -363,27 +362,14 @@ def open_object(config: ObjectConfig) -> InMemorySource:
         InputError: see `read_object`.
     """
     record = read_object(config.file)
-    count = len(record.images)
-    return InMemorySource(
-        name=config.file.stem,
-        digest=record.digest,
-        time=np.arange(count, dtype=float),
-        motion=np.zeros((count, 4)),
-        moved=np.zeros(count, bool),
-        views=record.images[:, None],
-        seen=np.ones(count, bool),
-        label=np.full(count, -1, np.int32),
-        info=SourceInfo(signed_views=True),
-        alive=np.ones(OBJECTS_WHISKERS, bool),
-    )
+    time, alive = np.arange(len(record.images), dtype=float), np.ones(OBJECTS_WHISKERS, bool)
+    return _source(config.file.stem, record.digest, time, record.images[:, None], alive=alive)
 
 
 OBJECTS = SourceEntry(ObjectConfig, lambda config, warn: open_object(config))
 
 
-FINGERS, TAXELS = 3, 22
-ARRAYS = ("TXZY_dataI", "TXZY_data")
-EXPECTED = f"a cell array objects x {1 + FINGERS} x trials (x contacts)"
+_FINGERS, _TAXELS = 3, 22
 
 
 class TaxelContact(NamedTuple):
@@ -409,7 +395,8 @@ class TaxelConfig(Settings):
 
 
 def read_contacts(path: Path) -> list[TaxelContact]:
-    """All contacts of a file.
+    """All contacts of a file with one cell array: objects x (position of the hand, fingertips 1 to 3) x
+    trials, or the same cut into single contacts (x contacts). A cell of a fingertip: samples x 22 pressures.
 
     Raises:
         InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is
@@ -423,14 +410,16 @@ def _contacts(path: Path, content: bytes) -> list[TaxelContact]:
         arrays = loadmat(BytesIO(content))
     except Exception as error:  # SciPy raises many kinds for a damaged file
         raise InputError(str(path), f"cannot be read ({error})", "a MATLAB file", "copy it again") from None
-    name = next((name for name in ARRAYS if name in arrays), None)
+    known = ("TXZY_dataI", "TXZY_data")  # cut into contacts, and whole
+    name = next((name for name in known if name in arrays), None)
     if name is None:
         there = [name for name in arrays if not name.startswith("__")]
-        raise missing_error(str(path), "array", ARRAYS[0], there)
+        raise missing_error(str(path), "array", known[0], there)
     cells = arrays[name]
-    if cells.dtype != object or cells.ndim not in (3, 4) or cells.shape[1] != 1 + FINGERS or not cells.size:
+    if cells.dtype != object or cells.ndim not in (3, 4) or cells.shape[1] != 1 + _FINGERS or not cells.size:
         found = f"{name} of {cells.dtype}, {' x '.join(map(str, cells.shape))}"
-        raise InputError(str(path), found, EXPECTED)
+        expected = f"a cell array objects x {1 + _FINGERS} x trials (x contacts)"
+        raise InputError(str(path), found, expected)
     cells = cells.reshape(*cells.shape[:3], -1)
     numbers = np.ndindex(cells.shape[0], *cells.shape[2:])
     return [
@@ -445,9 +434,9 @@ def _pressure(where: str, fingers: np.ndarray, number: tuple[int, int, int]) -> 
     where = f"{where}, object {thing}, trial {trial}, contact {contact}"
     shapes = {finger.shape for finger in fingers}
     samples, *columns = fingers[0].shape
-    if len(shapes) > 1 or columns != [TAXELS] or not samples:
+    if len(shapes) > 1 or columns != [_TAXELS] or not samples:
         found = f"fingertips of {', '.join(' x '.join(map(str, finger.shape)) for finger in fingers)}"
-        raise InputError(where, found, f"the same number of samples x {TAXELS} for each")
+        raise InputError(where, found, f"the same number of samples x {_TAXELS} for each")
     pressure = np.stack(list(fingers), axis=1).astype(float)
     if not np.isfinite(pressure).all():
         raise InputError(where, f"{np.sum(~np.isfinite(pressure))} values that are not finite", "pressures")
@@ -467,19 +456,9 @@ def open_contacts(config: TaxelConfig) -> InMemorySource:
         last = max(contact.object for contact in contacts)
         raise InputError("source.settings.object", str(config.object), f"1 to {last}")
     views = np.concatenate(chosen)[..., None]
-    count = len(views)
-    return InMemorySource(
-        name=f"{config.file.stem}, object {config.object}",
-        digest=digest_of([content, str(config.object).encode()]),
-        time=np.arange(count, dtype=float),
-        motion=np.zeros((count, 4)),
-        moved=np.zeros(count, bool),
-        views=views,
-        seen=np.ones(count, bool),
-        label=np.full(count, -1, np.int32),
-        info=SourceInfo(signed_views=True),
-        alive=np.ones(FINGERS * TAXELS, bool),
-    )
+    digest = digest_of([content, str(config.object).encode()])
+    time, alive = np.arange(len(views), dtype=float), np.ones(_FINGERS * _TAXELS, bool)
+    return _source(f"{config.file.stem}, object {config.object}", digest, time, views, alive=alive)
 
 
 CONTACTS = SourceEntry(TaxelConfig, lambda config, warn: open_contacts(config))

@@ -1,10 +1,8 @@
-"""Checks of rows: numbers are finite, times increase, view values are in 0..1.
+"""Checks of rows: numbers are finite, times increase, view values are in 0..1; and stretches of a recording.
 
 A whole recording is checked before it is used. Each check returns its errors instead of raising them, so
 that a reader can report all at once. Only `nonfinite_errors` reports non-finite values; the other checks
 ignore them. For units see `robot.recordings.input_judge`.
-
-A stretch of a recording: from one time to another, each counted from the start or absolute.
 """
 
 from __future__ import annotations
@@ -22,8 +20,6 @@ from tactile.base.settings import Settings
 RowName = Callable[[int], str]  # position of a row in the user's file, for errors
 SPOILT = 0.05
 """Share of the rows or messages, but at least one, that may be left out; more are an error."""
-UPRIGHT, LEVEL = 10.0, 0.2
-"""A path lies in another plane if its extent in z is over these times the lesser and the greater of x, y."""
 
 
 def leave_out(
@@ -55,7 +51,7 @@ def still_axis(points: np.ndarray) -> str:
     """The axis, x or y, along which a path [N, 3] m hardly moves although it does along z; '' for none."""
     points = points[np.isfinite(points).all(axis=1)]
     x, y, z = np.ptp(points, axis=0) if len(points) else np.zeros(3)
-    if z <= max(UPRIGHT * min(x, y), LEVEL * max(x, y)):
+    if z <= max(10.0 * min(x, y), 0.2 * max(x, y)):
         return ""
     return "x" if x < y else "y"
 
@@ -133,13 +129,15 @@ def _check_time(value: float | str) -> float | str:
 
 Moment = Annotated[float | str, AfterValidator(_check_time)]
 """s from the start of the recording, or an ISO time such as 2024-05-01T10:00:00+02:00; UTC without offset."""
-_WORDS = {"from": "the recording is read from here on, as if it began here", "to": "it is read to here"}
 StretchConfig = create_model(
     "StretchConfig",
     __base__=Settings,
     **{
         name: (Moment | None, Field(default=None, description=f"{words}: s from its start, or an ISO time."))
-        for name, words in _WORDS.items()
+        for name, words in (
+            ("from", "the recording is read from here on, as if it began here"),
+            ("to", "it is read to here"),
+        )
     },
 )  # type: ignore[call-overload]
 """The settings `from` and `to`; the first is a keyword of Python, which no class can name."""

@@ -1,18 +1,12 @@
-"""Video files: frames as grey images with a time each.
+"""A camera as a recording: frames of video files, their views, and visual odometry where there is no other.
 
-Views from images: a crop of the grey image, reduced by block means to a few values in 0..1.
+A view is a crop of the grey image, reduced by block means to a few values in 0..1: the first step of a view
+template (Ball et al. 2013, section 3). The second, normalisation, is done by `templates` of a run.
 
-The first step of a view template (Ball et al. 2013, section 3). The second, normalisation of the values, is
-done by `templates` of a run for every kind of view.
-
-Odometry from a camera alone, by the change of two intensity profiles.
-
-A profile is the mean of each column of a crop, divided by the profile's mean, so that exposure cancels out.
-The shift between consecutive profiles is the turn; what differs after the best shift is the distance
-(Milford & Wyeth 2008). Nothing fixes the scale of distances: they are in VO metres, `scaling` of them for a
-difference of 1.
-
-Frames of a camera to rows of a recording: views, and visual odometry where there is no other.
+Visual odometry (Milford & Wyeth 2008) compares two intensity profiles: the mean of each column of a crop,
+divided by the profile's mean, so that exposure cancels out. The shift between consecutive profiles is the
+turn; what differs after the best shift is the distance. Nothing fixes the scale of distances: they are in VO
+metres, `scaling` of them for a difference of 1.
 """
 
 from __future__ import annotations
@@ -61,7 +55,7 @@ class ImageViewConfig(Settings):
     """C, columns of a view."""
 
 
-def cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
+def _cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
     """The part of an image [H, W] as a view [h, w] of the same memory.
 
     Args:
@@ -87,7 +81,7 @@ def image_view(config: ImageViewConfig, grey: np.ndarray, where: str = "image") 
     Raises:
         InputError: the crop is not a part of the image, or has fewer pixels than the view along one axis.
     """
-    part = cropped(config.crop, grey, where, "image.crop")
+    part = _cropped(config.crop, grey, where, "image.crop")
     height, width = part.shape
     if height < config.rows or width < config.columns:
         found = f"the crop has {width} x {height} pixels"
@@ -124,49 +118,35 @@ class VisualOdometryConfig(Settings):
     """Largest turn rate, degrees/s: shifts between frames are searched up to this rate."""
 
 
-class Profile(NamedTuple):
-    """Intensities [w] with mean 1 of the columns of a crop, and whether the columns form a ring."""
-
-    values: np.ndarray
-    ring: bool
+Profile = tuple[np.ndarray, bool]
+"""Intensities [w] with mean 1 of the columns of a crop, and whether the columns form a ring."""
 
 
-class Profiles(NamedTuple):
-    """The two profiles of a frame, and the angle of one column, rad."""
-
-    rotation: Profile
-    translation: Profile
-    pixel_angle: float
-
-
-def profiles(config: VisualOdometryConfig, grey: np.ndarray, where: str = "image") -> Profiles:
-    """The profiles of an image [H, W] uint8.
-
-    Raises:
-        InputError: a crop is not a part of the image.
-    """
-    rotation = _profile(config, "rotation", grey, where)
-    translation = _profile(config, "translation", grey, where)
-    return Profiles(rotation, translation, float(np.deg2rad(config.fov_deg)) / grey.shape[1])
-
-
-def motion_between(
-    config: VisualOdometryConfig, before: Profiles, after: Profiles, dt: float
+def _motion_between(
+    config: VisualOdometryConfig,
+    before: tuple[Profile, Profile],
+    after: tuple[Profile, Profile],
+    pixel_angle: float,
+    dt: float,
 ) -> tuple[float, float]:
-    """Distance (VO metres) and turn (rad, counter-clockwise) between two frames that lie `dt` s apart."""
+    """Distance (VO metres) and turn (rad, counter-clockwise) between two frames that lie `dt` s apart.
+
+    Args:
+        before, after: the profiles of each for turns and for distances. pixel_angle: of one column, rad.
+    """
     dt = max(dt, 0.0)  # of stamps that go back, which the reader reports
-    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * dt / after.pixel_angle))
-    shift, _ = _best_shift(before.rotation, after.rotation, reach)
-    _, change = _best_shift(before.translation, after.translation, reach)
-    return min(config.scaling * change, config.max_speed * dt), shift * after.pixel_angle
+    reach = int(np.ceil(np.deg2rad(config.max_turn_rate_deg) * dt / pixel_angle))
+    shift, _ = _best_shift(before[0], after[0], reach)
+    _, change = _best_shift(before[1], after[1], reach)
+    return min(config.scaling * change, config.max_speed * dt), shift * pixel_angle
 
 
 def _profile(config: VisualOdometryConfig, name: str, grey: np.ndarray, where: str) -> Profile:
-    part = cropped(getattr(config, name), grey, where, f"visual_odometry.{name}")
+    part = _cropped(getattr(config, name), grey, where, f"visual_odometry.{name}")
     sums = part.sum(axis=0, dtype=np.int64)
     total = int(sums.sum())
     values = sums * (len(sums) / total) if total else np.ones(len(sums))
-    return Profile(values, config.fov_deg == 360 and len(sums) == grey.shape[1])
+    return values, config.fov_deg == 360 and len(sums) == grey.shape[1]
 
 
 def _best_shift(before: Profile, after: Profile, reach: int) -> tuple[float, float]:
@@ -174,12 +154,13 @@ def _best_shift(before: Profile, after: Profile, reach: int) -> tuple[float, flo
 
     Things move to the right in the image where the camera turns counter-clockwise.
     """
-    width = len(after.values)
+    (old, _), (new, ring) = before, after
+    width = len(new)
     reach = min(reach, width // 2)
     shifts = np.arange(-reach, reach + 1)
     columns = np.arange(width)[None, :] - shifts[:, None]  # where each column was before
-    inside = (columns >= 0) & (columns < width) | after.ring
-    difference = np.abs(after.values - before.values[columns % width])
+    inside = (columns >= 0) & (columns < width) | ring
+    difference = np.abs(new - old[columns % width])
     errors = np.sum(difference, axis=1, where=inside) / inside.sum(axis=1)
     best = int(np.lexsort((np.abs(shifts), errors))[0])  # of equal errors the smallest shift
     return float(shifts[best]) + _vertex(errors, best), float(errors[best])
@@ -237,7 +218,7 @@ def camera_rows(
     """
     time, pictures, moves = list[float](), list[np.ndarray](), list[tuple[float, float]]()
     size: tuple[int, ...] | None = None
-    before: Profiles | None = None
+    before: tuple[Profile, Profile] | None = None
     for number, frame in enumerate(frames):
         place = f"{where}, frame {number}"
         size = size or frame.grey.shape
@@ -246,10 +227,12 @@ def camera_rows(
             raise InputError(place, found, f"{size[1]} x {size[0]}, as in frame 0")
         pictures.append(image_view(views, frame.grey, place))
         if odometry is not None:
-            after = profiles(odometry, frame.grey, place)
+            turning = _profile(odometry, "rotation", frame.grey, place)
+            after = turning, _profile(odometry, "translation", frame.grey, place)
+            pixel_angle = float(np.deg2rad(odometry.fov_deg)) / size[1]
             step = 0.0, 0.0
             if before is not None:
-                step = motion_between(odometry, before, after, frame.time - time[-1])
+                step = _motion_between(odometry, before, after, pixel_angle, frame.time - time[-1])
             moves.append(step)
             before = after
         time.append(frame.time)
@@ -321,7 +304,11 @@ def video_frames(
         while video.grab():
             time = next(times, None)
             if time is not None and count % config.every == 0:
-                yield Frame(time, _grey(cv2, video, f"{path}, frame {count}"))
+                good, picture = video.retrieve()
+                if not good:
+                    cure = "was the file copied completely?"
+                    raise InputError(f"{path}, frame {count}", "cannot be decoded", "an image", cure)
+                yield Frame(time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)))
             count += 1
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")
@@ -355,14 +342,6 @@ def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: f
         raise InputError(str(path), "no times of its frames", "a frame rate, or a file of stamps", cure)
     rate = config.rate
     return (number / rate for number in itertools.count())
-
-
-def _grey(cv2: ModuleType, video: Any, where: str) -> np.ndarray:
-    """[H, W] uint8: the frame that was last grabbed."""
-    good, picture = video.retrieve()
-    if not good:
-        raise InputError(where, "cannot be decoded", "an image", "was the file copied completely?")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 
 def _opencv() -> ModuleType:

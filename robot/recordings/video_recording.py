@@ -1,6 +1,4 @@
-"""A video as a recording: views of its frames, with odometry from a CSV file or from the frames
-themselves.
-"""
+"""A video as a recording: views of its frames; odometry from a CSV file or from the frames themselves."""
 
 from __future__ import annotations
 
@@ -8,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
-from robot.recordings.input_judge import InputJudge, MotionTrack, UnitLimits
+from robot.recordings.input_judge import InputJudge, MotionTrack
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.video import CameraRows, VideoConfig, camera_rows, stamp_errors, video_frames
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
-from robot.sources.source import Warn
 from tactile.base.errors import InputError
 
 
@@ -46,7 +42,14 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         return _with_views(source, rows.time, rows.view, video, str(path))
     assert rows.motion is not None  # `_contradictions` requires visual odometry
     rows.motion[:1] = 0.0
-    truth = _truth(config.table, rows.time, config.limits, judge.warn)
+    truth = None
+    if config.table.truth is not None and config.table.truth.file is not None:
+        file = read_csv(config.table.truth.file, config.table.units.time)
+        raise_errors(file.absences(column_keys(config.table.truth, "table.truth")))
+        truth, errors = align_truth(
+            file, config.table.truth, rows.time, config.limits, same_rows=False, warn=judge.warn
+        )
+        raise_errors(errors)
     everywhere = np.ones(len(rows.time), bool)
     # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
     track = MotionTrack(rows.time, everywhere, rows.motion)
@@ -102,13 +105,3 @@ def _with_views(
     views, seen = np.zeros((source.length, *view.shape[1:])), np.zeros(source.length, bool)
     views[rows], seen[rows] = view, True
     return replace(source, views=views, seen=seen)
-
-
-def _truth(table: CsvConfig, time: np.ndarray, limits: UnitLimits, warn: Warn) -> np.ndarray | None:
-    if table.truth is None or table.truth.file is None:
-        return None
-    file = read_csv(table.truth.file, table.units.time)
-    raise_errors(file.absences(column_keys(table.truth, "table.truth")))
-    truth, errors = align_truth(file, table.truth, time, limits, same_rows=False, warn=warn)
-    raise_errors(errors)
-    return truth

@@ -1,19 +1,11 @@
-"""Runs a protocol: each session through all mappers and methods.
+"""The figures of Fox et al. 2012: worlds, mappers and two filters, run, scored, ranked and drawn.
 
 A set is a session: an arena, a start, the behaviour of the robot and the errors of its odometry, all from one
 seed. All mappers and methods run on the same sets, so their differences are paired.
 
-The result of a reproduction as text: metrics of paths and maps, then equation 6 under all conventions.
-
-Tests of the paper's ranking of its mappers, on the same sets and under all ways to score a map.
-
-The paper ranks its mappers by one number. Two baselines show what that number means: the best constant map,
-which needs no contact, and the same marks drawn along dead reckoning and along the true path. A ranking that
-holds there too is one of the marks, not of the filters.
-
-The protocols of Fox et al. 2012: worlds, mappers and two filters.
-
-Errors of a path with known start, without alignment, and of the offsets between visits of one place.
+The paper ranks its mappers by one number (equation 6). Two baselines show what that number means: the best
+constant map, which needs no contact, and the same marks drawn along dead reckoning and along the true path. A
+ranking that holds there too is one of the marks, not of the filters.
 """
 
 from __future__ import annotations
@@ -59,7 +51,7 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
 MAPPERS = {"blob": "none", "geometric": "geometric", "template": "template", "fused": "fused"}
-"""`touch.reports.walls` of the paper's three mappers (II-E to II-G), and ours."""
+"""`touch.reports.walls` of the paper's three mappers (II-E to II-G), and a fourth that fuses them."""
 PAPERS = ("blob", "geometric", "template")  # the paper's mappers from worst to best as printed (III)
 METHODS: dict[str, tuple[str, ...]] = {
     "as printed": (
@@ -81,30 +73,18 @@ FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
 """Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
 
 
-class World(NamedTuple):
-    """An arena and the odometry noise in it.
-
-    Attributes:
-        level: of the odometry noise; the printed filter uses it as the noise of each step.
-        settings: overrides.
-    """
-
-    name: str
-    level: float
-    settings: tuple[str, ...] = ()
-
-
 class Protocol(NamedTuple):
     """A figure of the paper.
 
     Attributes:
-        source: section and figure. stops: numbers of reports after which the result is scored; 0: all.
-            one_arena: whether all sets share an arena. note: printed below the table.
+        source: section and figure. worlds: by name, the level of the odometry noise, which the printed filter
+            uses as the noise of each step, and overrides. stops: numbers of reports after which the result is
+            scored; 0: all. one_arena: whether all sets share an arena. note: printed below the table.
     """
 
     title: str
     source: str
-    worlds: tuple[World, ...]
+    worlds: Mapping[str, tuple[float, tuple[str, ...]]]
     note: str
     mappers: tuple[str, ...] = tuple(MAPPERS)
     methods: tuple[str, ...] = tuple(METHODS)
@@ -112,7 +92,7 @@ class Protocol(NamedTuple):
     one_arena: bool = True
 
 
-_SMALL = (World("1.25 m arena", 0.05),)
+_SMALL: dict[str, tuple[float, tuple[str, ...]]] = {"1.25 m arena": (0.05, ())}
 _LARGE = ("create_simulation.arena.side=2.5", "create_simulation.reports=1500")
 
 PROTOCOLS = {
@@ -132,7 +112,7 @@ PROTOCOLS = {
     "fox-fig6": Protocol(
         "A larger arena at two levels of odometry noise",
         "Fox et al. 2012, III, Fig. 6",
-        (World("2 % noise", 0.02, _LARGE), World("5 % noise", 0.05, _LARGE)),
+        {"2 % noise": (0.02, _LARGE), "5 % noise": (0.05, _LARGE)},
         note="The paper: tracked for 200 steps at 2 %, loops not closed at 5 %. The noise is one scale error "
         "for each straight line or turn; each set has its own arena.",
         mappers=("geometric",),
@@ -142,29 +122,9 @@ PROTOCOLS = {
 }
 
 
-def session_config(world: World, method: str, mapper: str, assignments: Sequence[str] = ()) -> RunConfig:
-    """The configuration of a mapper in a world.
-
-    Raises:
-        InputError: an invalid assignment.
-    """
-    settings = [
-        "backend=grid",
-        f"create_simulation.wheels.level={world.level}",
-        *world.settings,
-        *METHODS[method],
-    ]
-    if method == "as printed":
-        settings.append(f"grid.drift.step={world.level}")
-    settings += [f"touch.reports.walls={MAPPERS[mapper]}", *assignments]
-    return validate(override(parse("create_simulation: {}\n", "the reproduction"), settings), RunConfig)
-
-
-REVISIT_DISTANCE = 0.1
-"""A report this near to an earlier one is a revisit, m: two cells."""
 LEAVE_DISTANCE = 0.5
 """Distance that the robot must have been away in between, m."""
-CLOSED_GAP = 0.1
+_CLOSED_GAP = 0.1
 """A revisit is closed if the path gives the offset of the two visits to this error, m."""
 
 
@@ -174,7 +134,7 @@ def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dic
     Returns:
         online_error, final_error: mean position errors, m. online_heading_error_deg: mean, degrees. revisits:
         number of reports at an earlier place. revisits_closed: share of these whose offset from the earlier
-        visit the path gives to `CLOSED_GAP`. revisit_gap: mean error of that offset, m.
+        visit the path gives to `_CLOSED_GAP`. revisit_gap: mean error of that offset, m.
     """
     later, earlier = find_revisits(truth).T
     gap = np.hypot(*((path[later] - path[earlier]) - (truth[later] - truth[earlier]))[:, :2].T)
@@ -183,7 +143,7 @@ def path_metrics(online: np.ndarray, path: np.ndarray, truth: np.ndarray) -> dic
         "final_error": position_error(path, truth),
         "online_heading_error_deg": float(np.degrees(np.abs(wrap(online[:, 2] - truth[:, 2])).mean())),
         "revisits": len(gap),
-        "revisits_closed": float((gap < CLOSED_GAP).mean()) if len(gap) else None,
+        "revisits_closed": float((gap < _CLOSED_GAP).mean()) if len(gap) else None,
         "revisit_gap": float(gap.mean()) if len(gap) else None,
     }
 
@@ -195,20 +155,20 @@ def find_revisits(truth: np.ndarray) -> np.ndarray:
         apart = np.hypot(*(truth[:k, :2] - here).T)
         left = np.flatnonzero(apart > LEAVE_DISTANCE)
         before = apart[: left[-1]] if len(left) else apart[:0]
-        if len(before) and before.min() < REVISIT_DISTANCE:
+        if len(before) and before.min() < 0.1:  # m: two cells
             found.append((k, int(before.argmin())))
     return np.array(found, int).reshape(-1, 2)
 
 
 KEY = ("world", "method", "mapper", "along")
 """Names of a result; the map is drawn `along` the scored path: `FILTERED`, `RECKONED` or `TRUE`."""
-MAP_METRICS = (
+_MAP_METRICS = (
     "map_brier_skill", "map_brier_skill_free", "map_log_loss", "map_auc", "map_auc_free", "map_chamfer_map",
     "map_chamfer_walls",
 )  # fmt: skip
 FIELDS = (
     "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
-    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *MAP_METRICS,
+    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *_MAP_METRICS,
 )  # fmt: skip
 """Columns of metrics in NAME.csv."""
 
@@ -216,26 +176,34 @@ HEAD = (
     f"{'':<30}{'online':>7}{'final':>7}{'heading':>9}{'/ dead r.':>11}{'better in':>11}{'gap':>7}"
     f"{'closed':>8}{'eq. 6':>8}{'Brier sk.':>11}{'AUC':>7}{'Chamfer':>15}"
 )
-LEGEND = (
+_LEGEND = (
     "online, final: mean position error of the online and the final poses, m, with known start, not aligned; "
     "heading: online,\ndegrees; / dead r.: online error over dead reckoning's, and in how many sets it is "
     "smaller; gap, closed: error of the final path\nbetween the visits of a place, m, and share of the "
-    f"revisits with less than {CLOSED_GAP:g} m (- without revisits); eq. 6: all cells, unknown\n"
+    f"revisits with less than {_CLOSED_GAP:g} m (- without revisits); eq. 6: all cells, unknown\n"
     "outside, raw; Brier skill, wall AUC and Chamfer (map to walls, walls to map, m): over the cells that "
     "whiskers can sense. Means over sets."
 )
 
-PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
+_PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
 
 
-def render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
+def _render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
     """All metrics of a reproduction, then the tests of the paper's order of mappers."""
     done = len({row.number for row in rows})
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
     for world, stop in product(protocol.worlds, range(len(protocol.stops))):
-        these = [row for row in rows if row.key[0] == world.name and row.session.stop == stop]
-        lines += _metric_lines(world.name, these, protocol)
-    lines += [LEGEND, ""]
+        these = [row for row in rows if row.key[0] == world and row.session.stop == stop]
+        if not these:
+            continue
+        counts = [row.values["reports"] for row in these]
+        spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+        lines += [f"{world}, {spread} reports", HEAD]
+        for method, along, mapper in product(protocol.methods, _PREFIXES, protocol.mappers):
+            scored = [row for row in these if row.key[1:] == (method, mapper, along)]
+            lines += [_line(_PREFIXES[along].format(method) + mapper, scored)] if scored else []
+        lines.append("")
+    lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in protocol.methods:
             scores = [
@@ -247,18 +215,6 @@ def render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> 
             lines += [f"{method.capitalize()}:", render_grid_scores(scores), ""]
             lines += [*render_rankings(method, rows), ""]
     return "\n".join([*lines, protocol.note])
-
-
-def _metric_lines(world: str, rows: Sequence[ResultRow], protocol: Protocol) -> list[str]:
-    if not rows:
-        return []
-    counts = [row.values["reports"] for row in rows]
-    spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-    lines = [f"{world}, {spread} reports", HEAD]
-    for method, along, mapper in product(protocol.methods, PREFIXES, protocol.mappers):
-        these = [row for row in rows if row.key[1:] == (method, mapper, along)]
-        lines += [_line(PREFIXES[along].format(method) + mapper, these)] if these else []
-    return [*lines, ""]
 
 
 def _line(name: str, rows: Sequence[ResultRow]) -> str:
@@ -297,7 +253,7 @@ class Measure(NamedTuple):
     trivial: float | Convention
 
 
-class Ranking(NamedTuple):
+class _Ranking(NamedTuple):
     """The test of the paper's ranking under one measure.
 
     Attributes:
@@ -326,7 +282,7 @@ MEASURES = (
 
 def rank_mappers(
     rows: Sequence[ResultRow], method: str, measure: Measure, along: str = FILTERED
-) -> Ranking | None:
+) -> _Ranking | None:
     """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
     score = measure.sign * np.array([column(rows, (method, name, along), measure.key) for name in PAPERS])
     score = score[:, np.isfinite(score).all(axis=0)]
@@ -339,7 +295,7 @@ def rank_mappers(
     trivial = measure.trivial
     if isinstance(trivial, Convention):
         trivial = float(np.mean([row.session.score.under(trivial).best for row in rows]))
-    return Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
+    return _Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
 
 
 def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
@@ -368,44 +324,32 @@ def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
 Rows = Sequence[ResultRow]
 
 
-def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
-    """The figure of a reproduction."""
-    draw, explanation = {
-        "fox-fig4": (_means, "below each mapper: the filter, eq. 6 (mean of the trials' errors)"),
-        "fox-fig5": (_singles, "below each: the filter, position error (dead reckoning's), m"),
-        "fox-fig6": (_worlds, "odometry noise, reports; position error (dead reckoning's), m"),
-    }[name]
-    panels, lines = draw(protocol, [row for row in rows if row.key[3] == FILTERED])
-    first_only = name == "fox-fig6" and any(row.number for row in rows)
+def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
+    """The figure of a reproduction: method below method, or set below set."""
+    shown = [row for row in rows if row.key[3] == FILTERED]
+    first_only, lines = False, len(protocol.methods)
+    method, mapper = protocol.methods.index, protocol.mappers.index
+    if name == "fox-fig4":  # a mean map for each mapper
+        explanation = "below each mapper: the filter, eq. 6 (mean of the trials' errors)"
+        panels = []
+        for key in product(protocol.methods, protocol.mappers):
+            these = [row for row in shown if row.key[1:3] == key]
+            error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
+            mean = mean_grid([row.session.grid for row in these])
+            panels.append(_panel(key[1], f"{key[0]}, {error:.3f}", these[0])._replace(grid=mean))
+    elif name == "fox-fig5":  # a map with the paths for each mapper and set
+        explanation = "below each: the filter, position error (dead reckoning's), m"
+        shown.sort(key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
+        panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in shown]
+        lines = len(panels) // len(protocol.mappers)
+    else:  # a map of the first set for each world and length
+        explanation = "odometry noise, reports; position error (dead reckoning's), m"
+        first_only = any(row.number for row in rows)
+        first = [row for row in shown if row.number == 0]
+        first.sort(key=lambda row: (method(row.key[1]), row.key[0], row.values["reports"]))
+        panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
     line = f"{protocol.source}  ·  {count_sets(rows, first_only)}  ·  {explanation}"
     return draw_grids(f"{name}: {protocol.title}", line, panels, across=len(panels) // lines)
-
-
-def _means(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A mean map for each mapper, and the number of lines: method below method."""
-    panels = []
-    for method, mapper in product(protocol.methods, protocol.mappers):
-        these = [row for row in rows if row.key[1:3] == (method, mapper)]
-        error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
-        mean = mean_grid([row.session.grid for row in these])
-        panels.append(_panel(mapper, f"{method}, {error:.3f}", these[0])._replace(grid=mean))
-    return panels, len(protocol.methods)
-
-
-def _singles(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A map with the paths for each mapper, and the number of lines: method below method, set below set."""
-    method, mapper = protocol.methods.index, protocol.mappers.index
-    rows = sorted(rows, key=lambda row: (method(row.key[1]), row.number, mapper(row.key[2])))
-    panels = [_with_paths(f"{row.key[2]}, trial {row.number + 1}", row) for row in rows]
-    return panels, len(panels) // len(protocol.mappers)
-
-
-def _worlds(protocol: Protocol, rows: Rows) -> tuple[list[GridPanel], int]:
-    """A map of the first set for each world and length, and the number of lines: method below method."""
-    first = [row for row in rows if row.number == 0]
-    first.sort(key=lambda row: (protocol.methods.index(row.key[1]), row.key[0], row.values["reports"]))
-    panels = [_with_paths(f"{row.key[0]}, {row.values['reports']}", row) for row in first]
-    return panels, len(protocol.methods)
 
 
 def _with_paths(name: str, row: ResultRow) -> GridPanel:
@@ -418,7 +362,7 @@ def _panel(name: str, line: str, row: ResultRow) -> GridPanel:
     return GridPanel(name, line, row.session.grid, wall_segments(row.session.arena))
 
 
-class SessionJob(NamedTuple):
+class _SessionJob(NamedTuple):
     """A session to simulate and filter.
 
     Attributes:
@@ -434,7 +378,7 @@ class SessionJob(NamedTuple):
     variants: Mapping[tuple[str, str], RunConfig]
 
 
-class MapResult(NamedTuple):
+class _MapResult(NamedTuple):
     """The map and the paths [T, 3] of a row, in the frame of the arena; `stop` is the index of its stop."""
 
     stop: int
@@ -446,27 +390,31 @@ class MapResult(NamedTuple):
     online: np.ndarray
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[SessionJob]:
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[_SessionJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:
         InputError: an invalid assignment.
     """
     jobs = []
-    for number, world in product(range(sets), protocol.worlds):
+    for number, (world, (level, overrides)) in product(range(sets), protocol.worlds.items()):
         own = int(stream(seed, f"arenas.set.{number}").integers(2**31))
         arena = seed if protocol.one_arena else own
         session, where = f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}"
         settings = (session, where, f"session.seed={own}", *assignments)
-        variants = {
-            (method, mapper): session_config(world, method, mapper, settings)
-            for method, mapper in product(protocol.methods, protocol.mappers)
-        }
-        jobs.append(SessionJob(world.name, number, own, seed, protocol.stops, variants))
+        variants = {}
+        for method, mapper in product(protocol.methods, protocol.mappers):
+            given = ["backend=grid", f"create_simulation.wheels.level={level}", *overrides, *METHODS[method]]
+            if method == "as printed":
+                given.append(f"grid.drift.step={level}")
+            given += [f"touch.reports.walls={MAPPERS[mapper]}", *settings]
+            document = parse("create_simulation: {}\n", "the reproduction")
+            variants[method, mapper] = validate(override(document, given), RunConfig)
+        jobs.append(_SessionJob(world, number, own, seed, protocol.stops, variants))
     return jobs
 
 
-def run_job(job: SessionJob) -> list[ResultRow]:
+def run_job(job: _SessionJob) -> list[ResultRow]:
     """The results of all variants on a session, and of their marks along paths without a filter.
 
     Raises:
@@ -492,7 +440,7 @@ def run_job(job: SessionJob) -> list[ResultRow]:
 
 
 def _score(
-    job: SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
+    job: _SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
 ) -> ResultRow:
     count = len(one.path)
     truth, odometry = session.truth[:count], session.odometry[:count]
@@ -502,11 +450,11 @@ def _score(
         "odometry_error": position_error(odometry, truth),
         **path_metrics(one.online, one.path, truth),
         **{error.convention.column: error.error for error in score.errors},
-        **{name: score.quantities[name].value for name in MAP_METRICS},
+        **{name: score.quantities[name].value for name in _MAP_METRICS},
     }
-    result = MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
+    result = _MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
     return ResultRow((job.world, *key), job.number, job.seed, values, result)
 
 
 _run = partial(run_with_progress, run_job)
-PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, draw_reproduction, render_results)
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run, _draw_reproduction, _render_results)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,22 +27,14 @@ from tactile.wall_estimation.strain_templates import (
 DURATIONS = (0.5, 1.0, 2.0)
 """Durations of the tested drives after first contact, s; in arenas mostly 1 to 2 s."""
 ESTIMATORS = ("winner", "between", "fused")
-"""Eq. 5; the minimum of a parabola through the best template and its neighbours; ours."""
-LARGE_ERROR_DEG = 10.0
+"""Eq. 5; the minimum of a parabola through the best template and its neighbours; of the sliding tip."""
+_LARGE_ERROR_DEG = 10.0
 """Errors above this are marked, degrees: the step between templates."""
 
 
-class HeldOutDrive(NamedTuple):
-    """One drive into a wall, not used in the training.
-
-    Attributes:
-        angle: direction of the wall in base_link, degrees. known: whether there are templates of that angle.
-        error: [S, 3] degrees, by `DURATIONS` and `ESTIMATORS`; NaN without an estimate.
-    """
-
-    angle: float
-    known: bool
-    error: np.ndarray
+HeldOutDrive = tuple[float, bool, np.ndarray]
+"""One drive into a wall, not used in the training: direction of the wall in base_link, degrees; whether there
+are templates of that angle; errors [S, 3], degrees, by `DURATIONS` and `ESTIMATORS`, NaN without estimate."""
 
 
 def train_to_file(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
@@ -80,9 +71,10 @@ def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -
             contact = WallContact(first, first, travel, StepEnd.ABORT, part, report.alive)
             wall = fused_wall(tip, points, contact)
             ways = match.angle, match.refined, wall.direction if wall.known else np.nan
-            errors.append([_apart(way, angle) for way in ways])
+            off = [(way - angle + np.pi / 2) % np.pi - np.pi / 2 for way in ways]
+            errors.append([float(np.degrees(abs(each))) for each in off])
         known = bool(np.isclose(templates.angle, angle).any())
-        found.append(HeldOutDrive(float(np.degrees(angle)), known, np.array(errors)))
+        found.append((float(np.degrees(angle)), known, np.array(errors)))
     return found
 
 
@@ -93,31 +85,21 @@ def render_drives(drives: Sequence[HeldOutDrive], repeats: int) -> str:
         f"Error of the wall direction on drives without training, degrees ({repeats} drives a template)",
         f"{'wall':>8}" + "".join(f"{head:>16}" for head in heads),
     ]
-    for one in drives:
-        cells = "".join(f"{_cell(error):>16}" for error in one.error.reshape(-1))
-        lines.append(f"{one.angle:>6.0f}{' ' if one.known else '~'} {cells}")
-    for name, known in (("trained", True), ("~ between", False)):
-        errors = np.array([one.error.reshape(-1) for one in drives if one.known == known])
+    for angle, known, error in drives:
+        cells = [
+            "-" if np.isnan(one) else f"{'! ' if one > _LARGE_ERROR_DEG else ''}{one:.1f}"
+            for one in error.flat
+        ]
+        lines.append(f"{angle:>6.0f}{' ' if known else '~'} {''.join(f'{cell:>16}' for cell in cells)}")
+    for name, trained in (("trained", True), ("~ between", False)):
+        errors = np.array([error.reshape(-1) for _, known, error in drives if known == trained])
         if len(errors):
-            lines.append(f"{name:<9}".ljust(8) + "".join(f"{_mean(column):>16}" for column in errors.T))
+            there = [column[np.isfinite(column)] for column in errors.T]
+            means = [f"{column.mean():.1f}" if len(column) else "-" for column in there]
+            lines.append(f"{name:<9}".ljust(8) + "".join(f"{mean:>16}" for mean in means))
     lines.append(
-        f"~ between two trained angles; ! off by more than {LARGE_ERROR_DEG:g}; - no wall was found. "
+        f"~ between two trained angles; ! off by more than {_LARGE_ERROR_DEG:g}; - no wall was found. "
         "Winner: eq. 5 of Fox et al. 2012; between: the\nminimum of a parabola through it and its "
         "neighbours; fused: from the sliding tip of the first whisker (`touch.reports.walls`)."
     )
     return "\n".join(lines)
-
-
-def _apart(one: float, other: float) -> float:
-    """Angle between two wall directions, degrees: 0 to 90."""
-    off = (one - other + np.pi / 2) % np.pi - np.pi / 2
-    return float(np.degrees(abs(off)))
-
-
-def _cell(error: float) -> str:
-    return "-" if np.isnan(error) else f"{'! ' if error > LARGE_ERROR_DEG else ''}{error:.1f}"
-
-
-def _mean(errors: np.ndarray) -> str:
-    known = errors[np.isfinite(errors)]
-    return f"{known.mean():.1f}" if len(known) else "-"

@@ -11,23 +11,11 @@ from evaluation.metrics.exm import ExperienceMetric, creation_rows
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
 
-SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
+_SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
 _DOTS = (0, (2, 2))
 _MEDIAN = 0.3  # half width of a median bar, share of a condition's width
-
-
-class DrivenPath(NamedTuple):
-    """A true path and its odometry.
-
-    Attributes:
-        truth, odometry: [T, 2] positions from the same start, m. lap: [T] number of the lap, from 0.
-    """
-
-    truth: np.ndarray
-    odometry: np.ndarray
-    lap: np.ndarray
 
 
 class ExperienceHistory(NamedTuple):
@@ -66,33 +54,26 @@ def experience_history(place: np.ndarray, metric: ExperienceMetric | None) -> Ex
     return ExperienceHistory(place, counted, right, invalid, base)
 
 
-class MeasuredQuantity(NamedTuple):
-    """One quantity under several conditions.
-
-    Attributes:
-        label: with unit. values: by series, [C, S] over conditions and data sets. paper: [C] values of the
-            paper, NaN for none. log: whether to use a logarithmic axis.
-    """
-
-    label: str
-    values: Mapping[str, np.ndarray]
-    paper: np.ndarray
-    log: bool = False
-
-
-def draw_drift(title: str, line: str, paths: Mapping[str, DrivenPath]) -> style.Figure:
+def draw_drift(
+    title: str, line: str, paths: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> style.Figure:
     """Draws true path and odometry side by side for several kinds of odometry error; later laps are darker
-    (Salman & Pearson 2016, Fig. 2)."""
+    (Salman & Pearson 2016, Fig. 2).
+
+    Args:
+        paths: by kind, true and dead-reckoned positions [T, 2] from the same start, m, and the number of the
+            lap [T], from 0.
+    """
     figure, panels = _panels(title, line, paths, 3.2)
-    for axes, path in zip(panels, paths.values(), strict=True):
-        axes.plot(*path.truth.T, ".", ms=3, color=INK, zorder=3, label="truth")
-        laps = np.unique(path.lap)
+    for axes, (truth, odometry, lap_of) in zip(panels, paths.values(), strict=True):
+        axes.plot(*truth.T, ".", ms=3, color=INK, zorder=3, label="truth")
+        laps = np.unique(lap_of)
         for lap in laps:
-            rows = path.lap == lap
+            rows = lap_of == lap
             shade = 0.3 + 0.7 * (lap + 1) / len(laps)
             label = "odometry, later laps darker" if lap == laps[-1] else None
-            axes.plot(*path.odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
-        axes.plot(*path.truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
+            axes.plot(*odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
+        axes.plot(*truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
         _map_axes(axes)
     style.add_legend(figure, panels[0])
     return figure
@@ -120,29 +101,37 @@ def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory
 
 
 def draw_measured(
-    title: str, line: str, conditions: Sequence[str], measured: Sequence[MeasuredQuantity]
+    title: str,
+    line: str,
+    conditions: Sequence[str],
+    measured: Sequence[tuple[str, Mapping[str, np.ndarray], np.ndarray, bool]],
 ) -> style.Figure:
-    """Draws a dot per data set, a bar for the median, a line for the paper's value (Figs. 4, 6 and 7)."""
-    figure, panels = _panels(title, line, [quantity.label for quantity in measured], 3.4, below=1.3)
-    for axes, quantity in zip(panels, measured, strict=True):
-        count = len(quantity.values)
-        for k, (name, values) in enumerate(quantity.values.items()):
+    """Draws a dot per data set, a bar for the median, a line for the paper's value (Figs. 4, 6 and 7).
+
+    Args:
+        measured: of each quantity, its label with unit, values [C, S] over conditions and data sets by
+            series, values [C] of the paper, NaN for none, and whether to use a logarithmic axis.
+    """
+    figure, panels = _panels(title, line, [label for label, *_ in measured], 3.4, below=1.3)
+    for axes, (_, series, printed, logarithmic) in zip(panels, measured, strict=True):
+        count = len(series)
+        for k, (name, values) in enumerate(series.items()):
             at = np.arange(len(conditions)) + (k - (count - 1) / 2) * 0.8 / max(count, 1)
-            color = SERIES_COLORS[k % len(SERIES_COLORS)]
+            color = _SERIES_COLORS[k % len(_SERIES_COLORS)]
             where = np.repeat(at, values.shape[1])
             axes.plot(where, values.reshape(-1), "o", ms=4, mew=0, alpha=0.6, color=color, label=name)
             some = np.isfinite(values).any(axis=1)
             middle = [np.nanmedian(row) for row in values[some]]
             half = _MEDIAN / max(count, 1)
             axes.hlines(middle, at[some] - half, at[some] + half, color=color, lw=2.2)
-        given = np.isfinite(quantity.paper)
+        given = np.isfinite(printed)
         if given.any():
-            where, paper = np.flatnonzero(given), quantity.paper[given]
+            where, paper = np.flatnonzero(given), printed[given]
             axes.hlines(paper, where - 0.42, where + 0.42, color=INK, lw=1.1, ls=_DOTS, label="paper")
         names = [name.replace(", ", ",\n") for name in conditions]
         axes.set_xticks(range(len(conditions)), names, rotation=55, ha="right", rotation_mode="anchor")
         axes.set_xlim(-0.6, len(conditions) - 0.4)
-        if quantity.log:
+        if logarithmic:
             axes.set_yscale("log")
             axes.tick_params(which="minor", length=0)
         else:
@@ -180,7 +169,7 @@ def draw_curves(
     """
     figure, panels = _panels(title, line, curves, 3.6)
     for axes, conditions in zip(panels, curves.values(), strict=True):
-        for color, (name, (arcr, arr)) in zip(SERIES_COLORS[1:], conditions.items(), strict=False):
+        for color, (name, (arcr, arr)) in zip(_SERIES_COLORS[1:], conditions.items(), strict=False):
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))

@@ -1,7 +1,5 @@
-"""The protocols: conditions, values printed in Salman & Pearson 2016, and its claims.
-
-Metrics of laps in two directions (Salman & Pearson 2016, IV-B), and of closures across a change.
-"""
+"""The protocols: conditions, values printed in Salman & Pearson 2016, and its claims; metrics of laps in two
+directions (IV-B), and of closures across a change of mazes."""
 
 from __future__ import annotations
 
@@ -99,17 +97,17 @@ PRINTED = {
     ("open loop", "arr"): 0.1765, ("RCP", "arr"): 0.2257, ("open loop", "em"): 0.1916, ("RCP", "em"): 0.1568,
 }  # fmt: skip
 """Values of max_angle views in the paper."""
-WHY_NOT_EM = (
+_WHY_NOT_EM = (
     "ARR can be compared with the paper, EM cannot: the paper adds m2 to rad2 and does not say over which "
     "pairs. Over all pairs one link turned by half a turn twists the whole unweighted map (random headings "
     "give pi2 / 3); between successive experiences even a broken map has small errors."
 )
-SAME_IMAGES = (
+_SAME_IMAGES = (
     "In the kinematic tier RCP acts after the contact, so open loop and RCP give the same contact_angle "
     "images; with --set simulation.fidelity=dynamic they can differ."
 )
-NOISES = ("gated", "telescoping")
-MATCHED = ("open max_angle", "RCP max_angle", "RCP contact_angle")
+_NOISES = ("gated", "telescoping")
+_MATCHED = ("open max_angle", "RCP max_angle", "RCP contact_angle")
 
 PROTOCOLS = {
     "fig2": Protocol(
@@ -117,7 +115,7 @@ PROTOCOLS = {
         "Salman & Pearson 2016, III-C, Fig. 2",
         tuple(
             Condition(noise, (*RCP_CONTACT, f"simulation.odometry.noise={noise}"), laps=3)
-            for noise in ("white", *NOISES)
+            for noise in ("white", *_NOISES)
         ),
         ("em_odometry", "em", "em_experiences", "closures", "false_closures"),
         note="The paper gives the size of the error, not its structure: white (in every sample), gated (on "
@@ -165,7 +163,7 @@ PROTOCOLS = {
         ),
         tuple(METHODS),
         {("after alternation", "arr"): PRINTED["open loop", "arr"]},
-        note=f"{WHY_NOT_EM} Associated: the step's experience was created on a clockwise lap, or a closure "
+        note=f"{_WHY_NOT_EM} Associated: the step's experience was created on a clockwise lap, or a closure "
         "joins it to one or to a step that is associated; correctly: within 0.1 m. Apart: median distance in "
         "the map from the clockwise step that is nearest in truth.",
     ),
@@ -181,7 +179,7 @@ PROTOCOLS = {
         ),
         tuple(METHODS),
         PRINTED,
-        note=f"{WHY_NOT_EM} Compare ratios (in the paper RCP / open loop is 0.82).",
+        note=f"{_WHY_NOT_EM} Compare ratios (in the paper RCP / open loop is 0.82).",
     ),
     "fig7": Protocol(
         "contact_angle against max_angle",
@@ -204,7 +202,7 @@ PROTOCOLS = {
         ),
         tuple(METHODS),
         {(f"{mode}, max_angle", quantity): value for (mode, quantity), value in PRINTED.items()},
-        note=f"{WHY_NOT_EM} {SAME_IMAGES}",
+        note=f"{_WHY_NOT_EM} {_SAME_IMAGES}",
     ),
     "reverse": Protocol(
         "Driven forwards and backwards",
@@ -249,14 +247,14 @@ PROTOCOLS = {
         "Salman & Pearson 2016, IV-C and IV-D (there each at its own tuning)",
         tuple(
             Condition(f"{name}, {noise}", (*views, f"simulation.odometry.noise={noise}"))
-            for noise in NOISES
-            for name, views in zip(MATCHED, (OPEN_MAX, RCP_MAX, RCP_CONTACT), strict=True)
+            for noise in _NOISES
+            for name, views in zip(_MATCHED, (OPEN_MAX, RCP_MAX, RCP_CONTACT), strict=True)
         ),
         ("arr", "arcr", "arcr_chain_free", "em", "threshold"),
         tuple(
             claim
-            for noise in NOISES
-            for open_max, rcp_max, rcp_contact in [[f"{name}, {noise}" for name in MATCHED]]
+            for noise in _NOISES
+            for open_max, rcp_max, rcp_contact in [[f"{name}, {noise}" for name in _MATCHED]]
             for claim in (
                 Claim(f"RCP raises ARR ({noise})", "arr", "rises", open_max, rcp_max),
                 Claim(f"contact_angle raises ARR ({noise})", "arr", "rises", rcp_max, rcp_contact),
@@ -266,13 +264,11 @@ PROTOCOLS = {
         controls=False,
         swept=True,
         note="In each set, the threshold with the most re-localisations among those whose strict ARCR "
-        f"reaches the highest that all conditions of that noise reach. {SAME_IMAGES}",
+        f"reaches the highest that all conditions of that noise reach. {_SAME_IMAGES}",
     ),
 }  # fmt: skip
 
 
-BESIDE = 0.02
-"""Steps of the two directions this near in truth count as the same spot, m."""
 DIRECTION_METRICS = (
     "first_anticlockwise_correct", "first_anticlockwise", "last_anticlockwise", "associated_correct",
     "directions_apart", "across",
@@ -296,6 +292,8 @@ def direction_metrics(result: SessionResult, laps: str, change: float) -> dict[s
         the two directions at the same spot, m. across: closures between the parts before and after the
         change.
     """
+    from scipy.spatial import cKDTree
+
     truth = result.truth
     first_after = int(change * len(truth))
     later, earlier = result.closures.reshape(-1, 2).T
@@ -308,12 +306,17 @@ def direction_metrics(result: SessionResult, laps: str, change: float) -> dict[s
     known = ~clockwise & (joined >= 0)
     correct = known & (np.hypot(*(truth - truth[joined])[:, :2].T) < FALSE_CLOSURE_DISTANCE)
     first, last = np.unique(lap[~clockwise])[[0, -1]]
+    # Steps of the two directions within 2 cm in truth are at the same spot.
+    ahead = np.flatnonzero(clockwise)
+    away, row = cKDTree(truth[ahead, :2]).query(truth[~clockwise, :2])
+    beside = away < 0.02
+    step = result.trajectory[~clockwise][beside, :2] - result.trajectory[ahead[row[beside]], :2]
     return metrics | {
         "first_anticlockwise_correct": float(correct[lap == first].mean()),
         "first_anticlockwise": float(known[lap == first].mean()),
         "last_anticlockwise": float(known[lap == last].mean()),
         "associated_correct": float(correct[known].mean()) if known.any() else np.nan,
-        "directions_apart": _directions_apart(result, clockwise),
+        "directions_apart": float(np.median(np.hypot(*step.T))) if len(step) else np.nan,
     }
 
 
@@ -339,13 +342,3 @@ def _associate(result: SessionResult, clockwise: np.ndarray) -> np.ndarray:
         found = [joined[before] for before in (created[step], *earlier.get(step, [])) if 0 <= before < step]
         joined[step] = max(found, default=-1)  # the newest of several
     return joined
-
-
-def _directions_apart(result: SessionResult, clockwise: np.ndarray) -> float:
-    from scipy.spatial import cKDTree
-
-    ahead = np.flatnonzero(clockwise)
-    away, row = cKDTree(result.truth[ahead, :2]).query(result.truth[~clockwise, :2])
-    beside = away < BESIDE
-    step = result.trajectory[~clockwise][beside, :2] - result.trajectory[ahead[row[beside]], :2]
-    return float(np.median(np.hypot(*step.T))) if len(step) else np.nan

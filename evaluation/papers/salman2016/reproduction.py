@@ -1,4 +1,5 @@
-"""Runs a protocol: all its conditions, methods and controls over the same sets.
+"""The figures of Salman & Pearson 2016: all conditions, methods and controls of a protocol over the same
+sets, its claims tested, its table and its figure.
 
 A set is a maze, a path with its jitter and the errors of the odometry, all from one seed. All conditions and
 methods of a reproduction run on the same sets, so their differences are paired.
@@ -24,7 +25,7 @@ from evaluation.papers.paper_sets import (
     sweep_thresholds,
 )
 from evaluation.papers.salman2016 import paper_figures
-from evaluation.papers.salman2016.paper_figures import DrivenPath, MeasuredQuantity, experience_history
+from evaluation.papers.salman2016.paper_figures import experience_history
 from evaluation.papers.salman2016.protocols import (
     BY_MAZE,
     COMMON,
@@ -64,8 +65,8 @@ Rows = Sequence[ResultRow]
 
 ALIKE = 0.05  # shares that differ by less count as equal
 SMALL = 0.1  # a share below counts as nearly zero
-DECISIVE = 6  # number of sets from which a difference of one sign in all sets is significant (1 in 32)
-RATIOS = ("em", "em_experiences", "em_odometry", "em_ratio", "directions_apart")
+_DECISIVE = 6  # number of sets from which a difference of one sign in all sets is significant (1 in 32)
+_RATIOS = ("em", "em_experiences", "em_odometry", "em_ratio", "directions_apart")
 """Quantities that span powers of ten, compared by ratio so that one false loop does not decide a mean."""
 LABELS = {
     "arr": "ARR",
@@ -90,10 +91,9 @@ LABELS = {
     "across_share": "the same over those in one maze",
     "threshold": "threshold",
 }
-CONTROL_LABELS = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
 
 
-class Verdict(NamedTuple):
+class _Verdict(NamedTuple):
     """The test of a claim with the sessions of one method.
 
     Attributes:
@@ -108,18 +108,18 @@ class Verdict(NamedTuple):
     text: str
 
 
-def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) -> Verdict:
+def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) -> _Verdict:
     """Tests a claim with the values [S] of its two conditions over the same sets."""
     if claim.kind == "small":
         values, name, back = here, "mean", lambda x: x
-    elif claim.quantity in RATIOS:
+    elif claim.quantity in _RATIOS:
         with np.errstate(divide="ignore", invalid="ignore"):
             values, name, back = np.log(there / here), "ratio", np.exp
     else:
         values, name, back = there - here, "difference", lambda x: x
     values = values[np.isfinite(values)]
     if len(values) < 2:
-        return Verdict(np.nan, np.nan, np.nan, "undefined", "fewer than two sets have both figures")
+        return _Verdict(np.nan, np.nan, np.nan, "undefined", "fewer than two sets have both figures")
     low, high = bootstrap(values, f"reproduce.{claim.text}", seed=seed)
     if claim.kind == "small":
         yes, no = high < SMALL, low >= SMALL
@@ -130,15 +130,16 @@ def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0
     word = "confirmed" if yes else "refuted" if no else "not decided"
     estimate, low, high = (float(back(x)) for x in (float(values.mean()), low, high))
     text = f"{name} {estimate:.3g} [{low:.3g}, {high:.3g}], {len(values)} sets"
-    return Verdict(estimate, low, high, word, text)
+    return _Verdict(estimate, low, high, word, text)
 
 
 def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
     """For each quantity the paper's value and the sessions' by method and control; then the claims."""
     done = 1 + max((row.number for row in rows), default=-1)
-    columns = series(protocol, rows)
+    columns = _series(protocol, rows)
     methods = [method for method, control in columns if control == "none"]
-    heads = [CONTROL_LABELS[control] + method for method, control in columns]
+    named = {"none": "", "shuffled": "shuffled, ", "blank": "no images, "}
+    heads = [named[control] + method for method, control in columns]
     width = max(34, *(len(condition.name) + 4 for condition in protocol.conditions))
     wide = max(24, *(len(head) + 2 for head in heads))
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets: median (least-most)"]
@@ -159,10 +160,10 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
             here, there = (column(rows, key, claim.quantity) for key in keys)
             verdict = judge_claim(claim, here, there)
             lines.append(f"  {method:<20} {verdict.word.upper()}: {verdict.text}")
-    if protocol.claims and 1 < done < DECISIVE:
+    if protocol.claims and 1 < done < _DECISIVE:
         lines.append(
             f"By chance all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
-            f"--sets {DECISIVE} lowers that to {2.0 ** (1 - DECISIVE):.0%}."
+            f"--sets {_DECISIVE} lowers that to {2.0 ** (1 - _DECISIVE):.0%}."
         )
     return "\n".join([*lines, *([protocol.note] if protocol.note else [])])
 
@@ -187,7 +188,7 @@ def _render_mazes(protocol: Protocol, rows: Rows) -> list[str]:
     return lines
 
 
-def series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str]]:
+def _series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str]]:
     """Pairs of method and control with rows: first without controls, then the controls of the protocol."""
     there = {row.key[1:] for row in rows}
     methods = [method for method in METHODS if any(row.key[1] == method for row in rows)]
@@ -212,32 +213,47 @@ def _short(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if value == round(value) and abs(value) >= 1 else f"{value:.{digits}g}"
 
 
-def draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
+def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: metrics over all sets, or sessions of the first set."""
-    draw_sessions = {"fig2": _drift, "fig3": _history, "fig5": _directions}.get(name)
-    title = f"{name}: {protocol.title}"
-    line = f"{protocol.source}  ·  {count_sets(rows, first_only=draw_sessions is not None)}"
-    if draw_sessions is not None:
-        return draw_sessions(title, line, [row for row in rows if row.session is not None])
+    title, first_only = f"{name}: {protocol.title}", name in ("fig2", "fig3", "fig5")
+    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}"
+    first = [row for row in rows if row.session is not None]
+    if name == "fig2":
+        paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for row in first:
+            laps, result = row.session
+            odometry = compose(result.truth[0], result.odometry)
+            lap = lap_of_step(result.truth, len(laps))
+            paths.setdefault(row.key[0], (result.truth[:, :2], odometry[:, :2], lap))
+        return paper_figures.draw_drift(title, line, paths)
+    if name == "fig3":
+        runs = ((row.key[1], row.session[1]) for row in first)
+        histories = {
+            method: experience_history(run.place, experience_metric_if_defined(run)) for method, run in runs
+        }
+        return paper_figures.draw_experiences(title, line, histories)
+    if name == "fig5":
+        maps = {}
+        for row in sorted(first, key=lambda row: row.key[1]):
+            laps, result = row.session
+            position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
+            maps[f"{row.key[0]}, {row.key[1]}"] = position, clockwise_steps(result.truth, laps)
+        return paper_figures.draw_directions(title, line, maps)
     return (_curves if protocol.swept else _dots)(title, line, protocol, rows)
 
 
 def _dots(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figure:
     names = [condition.name for condition in protocol.conditions]
     labels = {"none": "", "shuffled": ", shuffled", "blank": ", no images"}
-    shown = [(m, c) for m, c in series(protocol, rows) if c == "none" or m == "ours"]
-    measured = [
-        MeasuredQuantity(
-            LABELS[quantity],
-            {
-                m + labels[c]: np.array([column(rows, (name, m, c), quantity) for name in names])
-                for m, c in shown
-            },
-            np.array([protocol.paper.get((name, quantity), np.nan) for name in names]),
-            quantity in RATIOS,
-        )
-        for quantity in ("arr", "arcr", "em")
-    ]
+    shown = [(m, c) for m, c in _series(protocol, rows) if c == "none" or m == "ours"]
+    measured = []
+    for quantity in ("arr", "arcr", "em"):
+        values = {
+            m + labels[c]: np.array([column(rows, (name, m, c), quantity) for name in names])
+            for m, c in shown
+        }
+        paper = np.array([protocol.paper.get((name, quantity), np.nan) for name in names])
+        measured.append((LABELS[quantity], values, paper, quantity in _RATIOS))
     return paper_figures.draw_measured(title, line, names, measured)
 
 
@@ -254,32 +270,7 @@ def _curves(title: str, line: str, protocol: Protocol, rows: Rows) -> style.Figu
     return paper_figures.draw_curves(title, line, curves)
 
 
-def _drift(title: str, line: str, rows: Rows) -> style.Figure:
-    paths: dict[str, DrivenPath] = {}
-    for row in rows:
-        laps, result = row.session
-        odometry = compose(result.truth[0], result.odometry)
-        lap = lap_of_step(result.truth, len(laps))
-        paths.setdefault(row.key[0], DrivenPath(result.truth[:, :2], odometry[:, :2], lap))
-    return paper_figures.draw_drift(title, line, paths)
-
-
-def _history(title: str, line: str, rows: Rows) -> style.Figure:
-    runs = ((row.key[1], row.session[1]) for row in rows)
-    histories = {name: experience_history(run.place, experience_metric_if_defined(run)) for name, run in runs}
-    return paper_figures.draw_experiences(title, line, histories)
-
-
-def _directions(title: str, line: str, rows: Rows) -> style.Figure:
-    maps = {}
-    for row in sorted(rows, key=lambda row: row.key[1]):
-        laps, result = row.session
-        position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
-        maps[f"{row.key[0]}, {row.key[1]}"] = position, clockwise_steps(result.truth, laps)
-    return paper_figures.draw_directions(title, line, maps)
-
-
-class TrialJob(NamedTuple):
+class _TrialJob(NamedTuple):
     """One session of a reproduction.
 
     Attributes:
@@ -296,7 +287,7 @@ class TrialJob(NamedTuple):
     cut: bool
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[TrialJob]:
+def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[_TrialJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:
@@ -316,7 +307,7 @@ def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[st
                 for control in controls if protocol.controls else controls[:1]:
                     key = (condition.name, method, control)
                     change = condition.control if control == "none" else control
-                    jobs.append(TrialJob(key, number, set_seed, config, change, laps, condition.laps > 0))
+                    jobs.append(_TrialJob(key, number, set_seed, config, change, laps, condition.laps > 0))
     return jobs
 
 
@@ -352,7 +343,7 @@ def match_thresholds(rows: Sequence[ResultRow]) -> dict[str, ResultRow]:
     }
 
 
-def run_job(job: TrialJob) -> ResultRow:
+def _run_job(job: _TrialJob) -> ResultRow:
     """Runs one session.
 
     Raises:
@@ -381,7 +372,7 @@ def parts_of_em(result: SessionResult) -> dict[str, float]:
     return dict(zip(BY_MAZE[2:], (parts.trans2, parts.rot2, successive.total), strict=True))
 
 
-def sweep_job(job: TrialJob) -> list[ResultRow]:
+def _sweep_job(job: _TrialJob) -> list[ResultRow]:
     """The Experience Metric of the classic method at the thresholds `SWEPT`, without maps."""
     config, log = collect_session(job.config)
     rows = []
@@ -399,22 +390,22 @@ def sweep_job(job: TrialJob) -> list[ResultRow]:
     return rows
 
 
-def _run_figure(name: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[list[ResultRow]]:
+def _run_figure(name: str, jobs: Sequence[_TrialJob], workers: int) -> Iterator[list[ResultRow]]:
     if PROTOCOLS[name].swept:
         yield from _run_sweeps(name, jobs, workers)
         return
     unchanged = 0.0  # closures across the change of mazes in the set's session without one
-    for row in run_with_progress(run_job, name, jobs, workers):
+    for row in run_with_progress(_run_job, name, jobs, workers):
         share = {"across_share": row.values["across"] / unchanged} if unchanged else {}
         if row.key[0] == "unchanged":
             share, unchanged = {}, row.values["across"]
         yield [row._replace(values={**row.values, **share})]
 
 
-def _run_sweeps(name: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[list[ResultRow]]:
+def _run_sweeps(name: str, jobs: Sequence[_TrialJob], workers: int) -> Iterator[list[ResultRow]]:
     """First the sweeps over all thresholds, then a session at the matched threshold of each condition."""
     swept: list[ResultRow] = []
-    for rows in run_with_progress(sweep_job, f"{name}, thresholds", jobs, workers):
+    for rows in run_with_progress(_sweep_job, f"{name}, thresholds", jobs, workers):
         swept += rows
         yield rows
     chosen = []
@@ -425,9 +416,9 @@ def _run_sweeps(name: str, jobs: Sequence[TrialJob], workers: int) -> Iterator[l
         if best is not None:
             templates = job.config.templates.model_copy(update={"threshold": best.values["threshold"]})
             chosen.append(job._replace(config=job.config.model_copy(update={"templates": templates})))
-    matched = run_with_progress(run_job, f"{name}, matched", chosen, workers)
+    matched = run_with_progress(_run_job, f"{name}, matched", chosen, workers)
     for job, row in zip(chosen, matched, strict=True):
         yield [row._replace(values={**row.values, "threshold": job.config.templates.threshold})]
 
 
-PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run_figure, draw_reproduction, render_claims)
+PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run_figure, _draw_reproduction, render_claims)

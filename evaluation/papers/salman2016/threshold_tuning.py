@@ -31,7 +31,7 @@ CLASSIC = ("backend=classic", "templates.energy=0.05")
 """The tuned method: half of the iRat's energy of 0.1 (III-F; the value is of Ball et al. 2013)."""
 THRESHOLDS = tuple(np.round(np.arange(1, 33) * 0.005, 3).tolist())
 LAPS = 3  # laps that are scored, the base set excepted
-ENOUGH = 10  # correct re-localisations that a threshold must give
+_ENOUGH = 10  # correct re-localisations that a threshold must give
 
 
 class ThresholdScore(NamedTuple):
@@ -85,18 +85,18 @@ def choose_threshold(
     scores: Sequence[ThresholdScore], views: ViewDifferences
 ) -> tuple[ThresholdScore | None, str]:
     """The score that the rule takes, or None, and the reason."""
-    enough = [score for score in scores if score.correct >= ENOUGH]
+    enough = [score for score in scores if score.correct >= _ENOUGH]
     clean = [score for score in enough if not score.incorrect]
     if clean:
         best = max(clean, key=lambda score: score.correct)  # the lowest of equal ones
-        return best, f"{len(clean)} thresholds give at least {ENOUGH} correct and none incorrect"
-    reason = f"all thresholds with {ENOUGH} correct re-localisations have incorrect ones"
+        return best, f"{len(clean)} thresholds give at least {_ENOUGH} correct and none incorrect"
+    reason = f"all thresholds with {_ENOUGH} correct re-localisations have incorrect ones"
     if enough:
         least = min(enough, key=lambda score: score.incorrect)
         found = f"{least.threshold:g} has the fewest, {least.incorrect} beside {least.correct} correct"
     else:
         most = max(scores, key=lambda score: score.correct)
-        reason = f"no threshold gives {ENOUGH} correct re-localisations"
+        reason = f"no threshold gives {_ENOUGH} correct re-localisations"
         found = f"{most.threshold:g} gives {most.correct}"
     half = views.quantile(views.same, 0.5)
     below = views.share_below(views.other, half)

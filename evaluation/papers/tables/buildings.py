@@ -1,18 +1,11 @@
-"""The table of real buildings: whether the map is better than odometry where nobody tuned it.
+"""Tables of recordings: real buildings, where nobody tuned the map, and laser views or given place ids.
 
-Rows are recordings as they are with miscalibrated copies of them (`evaluation.studies.perturbation`), and a
-recording with given place ids of which a third is lost, wrong or new; depth views of a Create are mapped at
-several cell sizes and sector widths. ATE is the RMS position error after a rigid alignment, m: of the final
-map, of the live pose (as estimated at the time) and of odometry. A run is worse than odometry if its ATE
-exceeds `HARM_FACTOR` times odometry's by `HARM_MARGIN`. A closure is false if its two true positions are more
-than `FALSE_DISTANCE` apart, or its claimed difference of headings is off by more than `FALSE_TURN`; a closure
-sequence is false if that holds for the medians over its closures.
-
-The table of recordings with laser views, camera-like views or given place ids.
-
-ATE is the RMS position error of the final map after a rigid alignment, in metres. A closure is false if its
-two steps are more than `FALSE_CLOSURE_CELLS` pose cells apart in truth. Perturbed copies have another start,
-noise and dropped frames (`evaluation.studies.perturbation`).
+ATE is the RMS position error after a rigid alignment, m: of the final map, of the live pose (as estimated at
+the time) and of odometry. A run is worse than odometry if its ATE exceeds `HARM_FACTOR` times odometry's by
+`HARM_MARGIN`. Copies of a recording are miscalibrated, perturbed, or have a third of their given ids lost,
+wrong or new (`evaluation.studies.perturbation`); depth views of a Create are mapped at several cell sizes and
+sector widths. In buildings a closure is false by `FALSE_DISTANCE` or `FALSE_TURN`, a sequence if the medians
+over its closures are; in the table `laser` if its two steps are 2.5 pose cells apart in truth.
 """
 
 from __future__ import annotations
@@ -38,9 +31,9 @@ FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
 """Of a closure's steps: true distance, m, and error of the claimed heading difference, rad."""
 HARM_FACTOR, HARM_MARGIN = 1.05, 0.3
 """Of odometry's ATE, and m."""
-SUFFIX = "_odom_gt.csv"
+_SUFFIX = "_odom_gt.csv"
 """End of the file names of buildings, in the folder `buildings` of the real recordings."""
-PERTURBATIONS = {
+_PERTURBATIONS = {
     "miscalibrated": miscalibrate,
     "ids lost": lose_labels,
     "ids wrong": mistake_labels,
@@ -55,12 +48,12 @@ COLUMNS = (
 
 Section = Literal["buildings", "ids", "create"]
 CREATE = "configs/create_lab.yaml"
-FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
+_FACTORS = {"1/2": 0.5, "1": 1.0, "2": 2.0}
 """Of cell size and sector width in the rows of the Create."""
 
 
 class BuildingsRow(NamedTuple):
-    """A row: a recording, its section of the table, what its copies are (a key of `PERTURBATIONS`; "": there
+    """A row: a recording, its section of the table, what its copies are (a key of `_PERTURBATIONS`; "": there
     are none), and factors on cell size and sector width."""
 
     recording: Recording
@@ -87,14 +80,6 @@ class BuildingsRow(NamedTuple):
         return self.recording.configuration(folder, *(f"{key}={value!r}" for key, value in scaled.items()))
 
 
-class RunTask(NamedTuple):
-    """One run: a configuration, and the copy's kind and seed (0: the recording as it is)."""
-
-    config: RunConfig
-    copies: str
-    seed: int
-
-
 class RunFigures(NamedTuple):
     """The figures of one run.
 
@@ -117,11 +102,11 @@ def buildings_rows() -> dict[str, BuildingsRow]:
     """All rows by name; those of the buildings are the files found in the folder of the real recordings, or
     one row, `buildings`, for a file that is missing."""
     folder = (real_recordings() or Path()).absolute() / "buildings"
-    found = {file.name.removesuffix(SUFFIX): file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+    found = {file.name.removesuffix(_SUFFIX): file for file in sorted(folder.glob(f"*{_SUFFIX}"))}
     hall = "configs/tuc_lecture_hall.yaml"
     recordings = {
         name: Recording(name, "configs/building.yaml", (f"recording.file={file}",), real=True)
-        for name, file in (found or {"buildings": folder / f"NAME{SUFFIX}"}).items()
+        for name, file in (found or {"buildings": folder / f"NAME{_SUFFIX}"}).items()
     }
     recordings["intel"] = Recording(
         "intel (`configs/intel_laser.yaml`)", "configs/intel_laser.yaml", real=True
@@ -131,7 +116,7 @@ def buildings_rows() -> dict[str, BuildingsRow]:
     for fault in ("lost", "wrong", "new"):
         recording = Recording(f"lecture hall, copies with a third of the ids {fault}", hall, real=True)
         rows[f"ids {fault}"] = BuildingsRow(recording, "ids", f"ids {fault}")
-    for (cell, cells), (sector, sectors) in product(FACTORS.items(), FACTORS.items()):
+    for (cell, cells), (sector, sectors) in product(_FACTORS.items(), _FACTORS.items()):
         recording = Recording(f"Create, depth, cell x {cell}, sector x {sector}", CREATE, real=True)
         rows[f"create {cell} {sector}"] = BuildingsRow(recording, "create", "", cells, sectors)
     return rows
@@ -171,90 +156,89 @@ def buildings_table(
     counts = {name: 1 + copies * bool(row.copies) for name, row in present.items()}
     planned = [(name, seed) for name, count in counts.items() for seed in range(count)]
     log = SessionLog("buildings", files, [(name, str(seed)) for name, seed in planned])
-    tasks = [
-        RunTask(present[name].configuration(folder), present[name].copies, seed) for name, seed in planned
-    ]
-    results = zip(planned, run_tasks(measure_run, tasks, workers=workers), strict=True)
+    tasks = [(present[name].configuration(folder), present[name].copies, seed) for name, seed in planned]
+    results = zip(planned, run_tasks(_measure_run, tasks, workers=workers), strict=True)
     found: dict[Section, list[RunFigures]] = {}
     notes = []
     yield markdown_header(COLUMNS)
     for name, row in present.items():
         runs = []
         for (_, seed), figures in islice(results, counts[name]):
-            log.add(name, seed, run_record(figures))
+            accepted = figures.sequences[figures.sequences[:, 0].astype(bool), 1]
+            counts_of = {
+                "closures": len(figures.closures),
+                "false_closures": int(figures.closures.sum()),
+                "sequences": len(accepted),
+                "false_sequences": int(accepted.sum()),
+            }
+            errors = {"odometry": figures.odometry, "final": figures.final, "live": figures.live}
+            log.add(name, seed, errors | counts_of)
             runs.append(figures)
         yield markdown_row([row.recording.label, *_cells(runs)])
         found.setdefault(row.section, []).extend(runs)
-        notes += [_ids_note(row, runs)] if row.section == "ids" else []
+        if row.section == "ids":
+            _, final, _ = _errors(runs)
+            notes.append(f"{row.copies}: worst copy {final[1:].max() / final[0]:.2f} times the ATE as is.")
     notes = ([_total(found["buildings"])] if "buildings" in found else []) + notes
-    notes += [_create_note(found["create"])] if "create" in found else []
+    if "create" in found:
+        odometry, final, live = _errors(found["create"])
+        above = f"final {(final > odometry).sum()}, live {(live > odometry).sum()}"
+        median = metres(np.median(final))
+        notes.append(f"Create, {len(final)} settings: final median {median} m; above odometry: {above}.")
     notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
     yield from ["", *notes] if notes else []
     yield from compare_runs(COMPARED, log, list(rows))
 
 
-def run_record(figures: RunFigures) -> dict[str, float | int]:
-    """The figures of a run by name: ATEs, m, and numbers of closures and of accepted sequences."""
-    accepted = figures.sequences[figures.sequences[:, 0].astype(bool), 1]
-    return {
-        "odometry": figures.odometry,
-        "final": figures.final,
-        "live": figures.live,
-        "closures": len(figures.closures),
-        "false_closures": int(figures.closures.sum()),
-        "sequences": len(accepted),
-        "false_sequences": int(accepted.sum()),
-    }
-
-
-def measure_run(task: RunTask) -> RunFigures:
-    """Runs and measures a recording or a copy.
+def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
+    """Runs and measures a recording with a configuration, or its copy of a kind and a seed (0: as it is).
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
     config, copies, seed = task
-    run = run_recording(config, PERTURBATIONS[copies] if seed else None, seed)
+    run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
     claims = closure_claims(run)
+    false, sequences, odds = judge_claims(claims)
     return RunFigures(
         odometry=run.ate(run.odometry),
         final=run.ate(run.final),
         live=run.ate(run.online),
-        closures=is_false(claims.distance, claims.turn)[claims.accepted],
-        sequences=judge_sequences(claims),
-        odds=sequence_odds(claims),
+        closures=false[claims.accepted],
+        sequences=sequences,
+        odds=odds,
     )
 
 
-def is_false(distance: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Whether closures are false, [n] bool, from `ClosureClaims.distance` and `ClosureClaims.turn`."""
-    return (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+def judge_claims(claims: ClosureClaims) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether closures and closure sequences are false, and the odds of sequences.
 
-
-def judge_sequences(claims: ClosureClaims) -> np.ndarray:
-    """[R, 2] bool, of each closure sequence, whether it is accepted and whether it is false."""
+    Returns:
+        [n] bool, of each claim, whether it is false. [R, 2] bool, of each sequence, whether it is accepted
+        and whether it is false: by the medians of its claims. [R] log odds that each sequence is true; NaN
+        where the truth or they themselves are unknown.
+    """
     members = [claims.sequence == number for number in np.unique(claims.sequence)]
-    distance, turn = (
+    middles = [
         np.array([np.median(values[rows]) for rows in members]) for values in (claims.distance, claims.turn)
+    ]
+    single, whole = (
+        (distance > FALSE_DISTANCE) | (turn > FALSE_TURN)
+        for distance, turn in ((claims.distance, claims.turn), middles)
     )
     accepted = np.array([claims.accepted[rows].any() for rows in members], bool)
-    return np.column_stack([accepted, is_false(distance, turn)])
+    known = np.array([np.isfinite(claims.distance[rows]).all() for rows in members], bool)
+    odds = np.array([claims.log_odds[rows][0] for rows in members], float)
+    return single, np.column_stack([accepted, whole]), np.where(known, odds, np.nan)
 
 
-def sequence_odds(claims: ClosureClaims) -> np.ndarray:
-    """[R] log odds that each closure sequence is true; NaN where the truth or they themselves are unknown."""
-    _, first = np.unique(claims.sequence, return_index=True)
-    known = [np.isfinite(claims.distance[claims.sequence == k]).all() for k in claims.sequence[first]]
-    return np.where(known, claims.log_odds[first], np.nan)
-
-
-def is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+def _is_worse(error: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     """Whether ATEs, m, exceed those of odometry by more than the margins."""
     return error > HARM_FACTOR * odometry + HARM_MARGIN
 
 
 COMPARED = Compared(
-    "final ATE", "final", "live", "odometry", worse=is_worse, failed=is_worse,
+    "final ATE", "final", "live", "odometry", worse=_is_worse, failed=_is_worse,
     counts={
         "false / closures": ("false_closures", "closures"),
         "false / sequences": ("false_sequences", "sequences"),
@@ -273,7 +257,7 @@ def _cells(runs: Sequence[RunFigures]) -> list[str]:
         _spread(final[1:]),
         _spread(live[1:]),
         f"{ratio:.2f}",
-        f"{is_worse(final, odometry).sum()}, {is_worse(live, odometry).sum()} of {len(runs)}",
+        f"{_is_worse(final, odometry).sum()}, {_is_worse(live, odometry).sum()} of {len(runs)}",
         _closures(runs[:1]),
         _closures(runs),
         _sequences(runs),
@@ -284,34 +268,15 @@ def _total(runs: Sequence[RunFigures]) -> str:
     """The line below the table over all runs of buildings."""
     odometry, final, live = _errors(runs)
     closures = np.concatenate([run.closures for run in runs])
-    share = f" ({closures.mean():.1%})" if len(closures) else ""
-    return (
-        f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
-        f"{_sequences(runs)}; worse than odometry: final {is_worse(final, odometry).mean():.1%}, live "
-        f"{is_worse(live, odometry).mean():.1%}; {_calibration(runs)}."
-    )
-
-
-def _calibration(runs: Sequence[RunFigures]) -> str:
-    """How well the odds of all sequences, accepted or not, agree with the truth."""
     odds, sequences = np.concatenate([run.odds for run in runs]), np.vstack([run.sequences for run in runs])
     known = np.isfinite(odds)
     error = expected_calibration_error(expit(odds[known]), ~sequences[known, 1])
-    return f"expected calibration error of the odds of {known.sum()} sequences {error:.3f}"
-
-
-def _ids_note(row: BuildingsRow, runs: Sequence[RunFigures]) -> str:
-    """The line below the table that compares spoilt ids with the recording as it is."""
-    _, final, _ = _errors(runs)
-    return f"{row.copies}: worst copy {final[1:].max() / final[0]:.2f} times the ATE as is."
-
-
-def _create_note(runs: Sequence[RunFigures]) -> str:
-    """The line below the table over all settings of the Create."""
-    odometry, final, live = _errors(runs)
+    share = f" ({closures.mean():.1%})" if len(closures) else ""
     return (
-        f"Create, {len(runs)} settings: final median {metres(np.median(final))} m; above odometry: final "
-        f"{(final > odometry).sum()}, live {(live > odometry).sum()}."
+        f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
+        f"{_sequences(runs)}; worse than odometry: final {_is_worse(final, odometry).mean():.1%}, live "
+        f"{_is_worse(live, odometry).mean():.1%}; expected calibration error of the odds of {known.sum()} "
+        f"sequences {error:.3f}."
     )
 
 
@@ -334,8 +299,6 @@ def _sequences(runs: Sequence[RunFigures]) -> str:
     return f"{accepted[:, 1].sum()} / {len(accepted)}"
 
 
-FALSE_CLOSURE_CELLS = 2.5
-
 ROWS = {
     "square": Recording("`configs/square.yaml`, synthetic", "configs/square.yaml"),
     "figure8": Recording(
@@ -355,19 +318,6 @@ ROWS = {
         "`configs/intel_laser.yaml`, real, 18-number laser views", "configs/intel_laser.yaml", real=True
     ),
 }
-LASER_COLUMNS = (
-    "recording", "odometry", "classic (closures, false)", "ratslam (closures, false)",
-    "perturbed: median, maximum",
-)  # fmt: skip
-
-
-class RecordingFigures(NamedTuple):
-    """The figures of one run: ATE of the final map and of dead reckoning, m; closures and false ones."""
-
-    ate: float
-    odometry: float
-    closures: int
-    false_closures: int
 
 
 def laser_table(
@@ -384,18 +334,20 @@ def laser_table(
     for row in present:
         tasks.append((ROWS[row].configuration(folder, "backend=classic"), 0))
         tasks += [(ROWS[row].configuration(folder), seed) for seed in range(copies + 1)]
-    results = run_tasks(measure_recording, tasks, workers=workers)
-    yield markdown_header(LASER_COLUMNS)
+    results = run_tasks(_measure_recording, tasks, workers=workers)
+    heads = ("classic (closures, false)", "ratslam (closures, false)", "perturbed: median, maximum")
+    yield markdown_header(["recording", "odometry", *heads])
     for row in present:
         classic, ours, *perturbed_copies = (next(results) for _ in range(copies + 2))
-        errors = [copy.ate for copy in perturbed_copies]
-        spread = f"{metres(np.median(errors))}, {metres(max(errors))}" if errors else "-"
-        yield markdown_row([ROWS[row].label, metres(ours.odometry), _cell(classic), _cell(ours), spread])
+        spread = _spread(np.array([error for error, *_ in perturbed_copies]))
+        cells = [f"{metres(error)} ({closures}, {false})" for error, _, closures, false in (classic, ours)]
+        yield markdown_row([ROWS[row].label, metres(ours[1]), *cells, spread])
     yield from ["", *(f"Left out: {row}: {reason}" for row, reason in missing.items())] if missing else []
 
 
-def measure_recording(task: tuple[RunConfig, int]) -> RecordingFigures:
-    """Runs and measures one recording, perturbed with a seed (0: not at all).
+def _measure_recording(task: tuple[RunConfig, int]) -> tuple[float, float, int, int]:
+    """ATE of the final map and of dead reckoning, m, number of closures and of false ones of one recording,
+    perturbed with a seed (0: not at all).
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
@@ -404,13 +356,5 @@ def measure_recording(task: tuple[RunConfig, int]) -> RecordingFigures:
     run = run_recording(config, perturb if seed else None, seed)
     closures = run.session.map.closures()
     apart = np.hypot(*(run.truth[closures[:, 0]] - run.truth[closures[:, 1]])[:, :2].T)
-    return RecordingFigures(
-        ate=run.ate(run.final),
-        odometry=run.ate(run.odometry),
-        closures=len(closures),
-        false_closures=int((apart > FALSE_CLOSURE_CELLS * run.config.pose_cells.cell_size).sum()),
-    )
-
-
-def _cell(figures: RecordingFigures) -> str:
-    return f"{metres(figures.ate)} ({figures.closures}, {figures.false_closures})"
+    false = int((apart > 2.5 * run.config.pose_cells.cell_size).sum())
+    return run.ate(run.final), run.ate(run.odometry), len(closures), false

@@ -52,10 +52,6 @@ RIDGE = 10.0
 """Penalty on the squared weights."""
 YOUNG = 10
 """Keyframes after a sequence that is judged while it is young."""
-LEAST_SCORE, LEAST_LENGTH = 5.0, 2
-"""Least evidence of recall and least number of candidates of a sequence that counts."""
-TRUE_WITHIN, TRUE_TURN = 3.6, np.radians(30)
-"""Distance, cells, and difference of heading, rad, between what a true candidate claims and the truth."""
 COLUMNS = (
     "condition", "sessions", "sequences", "true", "AUC: recall's evidence", "accepted or not", "log-odds",
     "log-odds when they end",
@@ -84,7 +80,7 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
     """
     sessions = max(sessions, FEW)
     tasks = [TouchTask(row, FIRST + number) for row in ROWS for number in range(sessions)]
-    every = list(run_tasks(judge_session, tasks, workers=workers))
+    every = list(run_tasks(_judge_session, tasks, workers=workers))
     fitted = [fit_weights([other for other in every if other is not one]) for one in every]
     yield markdown_header(COLUMNS)
     for k, row in enumerate(ROWS):
@@ -99,7 +95,7 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
         (folder / WEIGHTS).write_text(text + "\n", encoding="utf-8")
 
 
-def judge_session(task: TouchTask) -> JudgedSession:
+def _judge_session(task: TouchTask) -> JudgedSession:
     """Runs a session and judges the sequences of its final map."""
     with open_observations(task_config(task)) as (config, source):
         log = load_into_memory(source)
@@ -114,7 +110,8 @@ def judge_session(task: TouchTask) -> JudgedSession:
     assert isinstance(map, KeyframeMap)
     final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
     scores = final.log.scores()
-    chosen = np.flatnonzero((scores >= LEAST_SCORE) & (final.log.left() >= LEAST_LENGTH))
+    # Sequences count from this evidence of recall and this number of candidates on.
+    chosen = np.flatnonzero((scores >= 5.0) & (final.log.left() >= 2))
     later = steps >= (int(CHANGE * len(truth)) if task.row == "control: other maze" else 0)
     first, second, third = (
         sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
@@ -156,7 +153,8 @@ def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray
 def _are_true(
     graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, later: np.ndarray, sequences: np.ndarray
 ) -> np.ndarray:
-    """[n] bool of sequences [n]: at least half of their candidates claim about the true poses [N, 3].
+    """[n] bool of sequences [n]: at least half of their candidates agree with the true poses [N, 3], to 3.6
+    cells and 30 degrees.
 
     Args:
         later: [N] bool, keyframes of another world than the earlier ones.
@@ -165,7 +163,7 @@ def _are_true(
     frame, match = table[:, 0].astype(int), table[:, 1].astype(int)
     error = between(truth[match], truth[frame])
     turned = np.abs(wrap(error[:, 2] + table[:, 2] * graph.sector_angle))
-    right = (np.hypot(error[:, 0], error[:, 1]) < TRUE_WITHIN * graph.cell) & (turned < TRUE_TURN)
+    right = (np.hypot(error[:, 0], error[:, 1]) < 3.6 * graph.cell) & (turned < np.radians(30))
     right &= later[frame] == later[match]
     return np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in sequences.tolist()], bool)
 
@@ -178,12 +176,8 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
         for k in (0, 2)
     )
     known = np.isfinite(odds)
-    told = (score, accepted.astype(float), odds, ended)
-    return markdown_row(
-        [name, len(sessions), int(known.sum()), int(true[known].sum())]
-        + [_auc(values[known], true[known]) for values in told]
-    )
-
-
-def _auc(values: np.ndarray, happened: np.ndarray) -> str:
-    return f"{auc(values[~happened], values[happened]):.3f}" if happened.any() and not happened.all() else "-"
+    cells, true = [], true[known]
+    for values in (score, accepted.astype(float), odds, ended):
+        both = true.any() and not true.all()
+        cells.append(f"{auc(values[known][~true], values[known][true]):.3f}" if both else "-")
+    return markdown_row([name, len(sessions), int(known.sum()), int(true.sum()), *cells])

@@ -26,7 +26,6 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,17 +142,17 @@ def read_sessions(path: Path) -> Sessions:
         if key in seen:
             raise ValueError(f"session {' '.join(key)} for the second time")
         seen.add(key)
-        figures = {name: _figure(cell) for name, cell in cells.items() if name not in KEY and cell}
+        figures = dict[str, Figure]()
+        for name, cell in cells.items():
+            if name in KEY or not cell:
+                continue
+            if cell in ("True", "False"):
+                figures[name] = cell == "True"
+            else:
+                figures[name] = int(cell) if cell.lstrip("-").isdecimal() else float(cell)
         return StoredSession(key, cells["code"], figures)
 
     return {one.key: one for one in read_rows(path, "a file of sessions, as -o writes it", parse)}
-
-
-def _figure(cell: str) -> Figure:
-    """A figure from its text."""
-    if cell in ("True", "False"):
-        return cell == "True"
-    return int(cell) if cell.lstrip("-").isdecimal() else float(cell)
 
 
 def _earlier_sessions(folder: Path, name: str, planned: Iterable[Key]) -> Sessions:
@@ -176,7 +175,7 @@ def _some(keys: Iterable[Key]) -> str:
     return ", ".join(names if len(names) < 3 else (names[0], "...", names[-1])) or "no session"
 
 
-class Pairs(NamedTuple):
+class _Pairs(NamedTuple):
     """n sessions that were measured twice.
 
     Attributes:
@@ -205,11 +204,11 @@ class Pairs(NamedTuple):
         return [key for key, there in zip(self.keys, has, strict=True) if there], old, new
 
 
-def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> Pairs:
+def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> _Pairs:
     """The sessions of these rows that are in both runs, in the order of that now."""
     old, new = ({key: one for key, one in run.items() if key[0] in rows} for run in (old, new))
     keys = [key for key in new if key in old]
-    return Pairs(
+    return _Pairs(
         keys, [old[key].figures for key in keys], [new[key].figures for key in keys],
         len(old) - len(keys), len(new) - len(keys),
     )  # fmt: skip
@@ -273,22 +272,12 @@ def compare_runs(what: Compared, log: SessionLog, rows: Sequence[str]) -> Iterat
     """
     if log.earlier is None:
         return
-    columns: dict[str, Callable[[Pairs], str]] = {
-        "sessions": lambda pairs: str(len(pairs.keys)),
-        f"{what.label}, now / before [95 %]": lambda pairs: _ratio(pairs, what.error),
-        f"live {what.label.split()[-1]}, now / before [95 %]": lambda pairs: _ratio(pairs, what.live),
-        f"{what.label} / odometry, median": lambda pairs: _over_odometry(what, pairs),
-        "worse than odometry": lambda pairs: _count(what.worse, pairs, what.error, what.odometry),
-        "live worse than odometry": lambda pairs: _count(what.worse, pairs, what.live, what.odometry),
-        **{title: partial(_medians, name=name) for title, name in what.medians.items()},
-        **{title: partial(_sums, names=names) for title, names in what.counts.items()},
-        "failures": lambda pairs: _count(what.failed, pairs, what.error, what.odometry),
-        "cured, new (p)": lambda pairs: _changed(*_failures(what, pairs)[1:]),
-    }  # fmt: skip
     yield from ["", "Before, and now, of the same sessions:", ""]
-    yield markdown_header(["row", *columns])
-    for name, pairs in _groups(log, rows):
-        yield markdown_row([name, *(cell(pairs) for cell in columns.values())])
+    for number, (name, pairs) in enumerate(_groups(log, rows)):
+        cells = _compared_cells(what, pairs)
+        if not number:
+            yield markdown_header(["row", *cells])
+        yield markdown_row([name, *cells.values()])
     keys, before, now = _failures(what, pair_sessions(log.earlier, log.measured, rows))
     failures = [" ".join(key) for key, new in zip(keys, now & ~before, strict=True) if new]
     yield from ["", f"New failures: {', '.join(failures) or 'none'}."]
@@ -330,7 +319,7 @@ ALL = "all rows"
 """Name of the line over several rows."""
 
 
-def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, Pairs]]:
+def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, _Pairs]]:
     """The pairs of each row, then of all rows if there are several."""
     assert log.earlier is not None
     for row in rows:
@@ -355,13 +344,40 @@ def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
     yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."
 
 
-def _failures(what: Compared, pairs: Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
+def _failures(what: Compared, pairs: _Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
     """The sessions [m], and whether they fail, [m] bool before and now."""
     keys, old, new = pairs.named(what.error, what.odometry)
     return keys, what.failed(*old), what.failed(*new)
 
 
-def _ratio(pairs: Pairs, name: str) -> str:
+def _compared_cells(what: Compared, pairs: _Pairs) -> dict[str, str]:
+    """The cells of a line of `compare_runs` by the title of their column; figures are before, now."""
+    over = [paired_ratios(odometry, error) for error, odometry in pairs.known(what.error, what.odometry)]
+    medians, counts = dict[str, str](), dict[str, str]()
+    for title, name in what.medians.items():
+        old, new = pairs.known(name)
+        medians[title] = f"{_median(old)}, {_median(new)}{_of(len(old), pairs)}"
+    for title, names in what.counts.items():
+        sides = pairs.known(*names)
+        sums = [f"{side[0].sum():.0f} / {side[1].sum():.0f}" for side in sides]
+        counts[title] = f"{', '.join(sums)}{_of(sides[0].shape[1], pairs)}"
+    return {
+        "sessions": str(len(pairs.keys)),
+        f"{what.label}, now / before [95 %]": _ratio(pairs, what.error),
+        f"live {what.label.split()[-1]}, now / before [95 %]": _ratio(pairs, what.live),
+        f"{what.label} / odometry, median": (
+            f"{_median(over[0])}, {_median(over[1])}{_of(len(over[0]), pairs)}"
+        ),
+        "worse than odometry": _count(what.worse, pairs, what.error, what.odometry),
+        "live worse than odometry": _count(what.worse, pairs, what.live, what.odometry),
+        **medians,
+        **counts,
+        "failures": _count(what.failed, pairs, what.error, what.odometry),
+        "cured, new (p)": _changed(*_failures(what, pairs)[1:]),
+    }
+
+
+def _ratio(pairs: _Pairs, name: str) -> str:
     ratio = paired_ratios(*pairs.known(name))
     return _spread(ratio) + _of(len(ratio), pairs) * bool(len(ratio))
 
@@ -374,25 +390,9 @@ def _spread(ratio: np.ndarray) -> str:
     return f"{np.median(ratio):.3f} " + (f"[{low:.3f}-{high:.3f}]" if low == low else "[-]")
 
 
-def _over_odometry(what: Compared, pairs: Pairs) -> str:
-    ratios = [paired_ratios(odometry, error) for error, odometry in pairs.known(what.error, what.odometry)]
-    return f"{_median(ratios[0])}, {_median(ratios[1])}{_of(len(ratios[0]), pairs)}"
-
-
-def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: Pairs, *names: str) -> str:
+def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: _Pairs, *names: str) -> str:
     old, new = pairs.known(*names)
     return f"{happens(*old).sum()}, {happens(*new).sum()}{_of(old.shape[1], pairs)}"
-
-
-def _medians(pairs: Pairs, name: str) -> str:
-    old, new = pairs.known(name)
-    return f"{_median(old)}, {_median(new)}{_of(len(old), pairs)}"
-
-
-def _sums(pairs: Pairs, names: tuple[str, str]) -> str:
-    old, new = pairs.known(*names)
-    sums = [f"{side[0].sum():.0f} / {side[1].sum():.0f}" for side in (old, new)]
-    return f"{', '.join(sums)}{_of(old.shape[1], pairs)}"
 
 
 def _changed(old: np.ndarray, new: np.ndarray) -> str:
@@ -405,6 +405,6 @@ def _median(values: np.ndarray) -> str:
     return f"{np.median(values):.3f}" if len(values) else "-"
 
 
-def _of(count: int, pairs: Pairs) -> str:
+def _of(count: int, pairs: _Pairs) -> str:
     """How many pairs a cell is of, where that is not all."""
     return f" of {count}" if count < len(pairs.keys) else ""

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +43,7 @@ COLUMNS = (
     "session", "backend", "dtype", "steps", "replayed: mean us", "live: median us", "99 %",
     "slowest, ms", "slowest by the clock, ms",
 )  # fmt: skip
-VERBS = {
+PARTS = {
     "views and belief (compiled kernel)": (
         "core/session.py:_compute", "core/packing.py:records", "core/packing.py:<listcomp>",
     ),
@@ -68,17 +69,7 @@ VERBS = {
 counts."""
 
 
-class LiveTimes(NamedTuple):
-    """Times of live steps: median and 99th percentile of the own thread, us; the largest of it, and by the
-    clock, ms."""
-
-    median: float
-    percentile: float
-    slowest: float
-    clock: float
-
-
-class Cycle(NamedTuple):
+class _Cycle(NamedTuple):
     """A compiled session and its observations."""
 
     name: str
@@ -95,8 +86,9 @@ class Cycle(NamedTuple):
             pass
         return 1e6 * (time.process_time() - began) / len(self.observations)
 
-    def time_live(self) -> LiveTimes:
-        """Times of the steps of a live session from the start."""
+    def time_live(self) -> tuple[float, float, float, float]:
+        """Times of the steps of a live session from the start: median and 99th percentile of its own thread,
+        us; the largest of it, and by the clock, ms."""
         self.session.restart()
         clocks = time.thread_time, time.perf_counter
         times = np.empty((len(self.observations), len(clocks)))
@@ -105,10 +97,8 @@ class Cycle(NamedTuple):
             self.session.step(observation)
             times[k] = [clock() - first for clock, first in zip(clocks, began, strict=True)]
         own, clock = times.T
-        return LiveTimes(
-            1e6 * float(np.median(own)), 1e6 * float(np.percentile(own, 99)),
-            1e3 * float(own.max()), 1e3 * float(clock.max()),
-        )  # fmt: skip
+        percentile = 1e6 * float(np.percentile(own, 99))
+        return 1e6 * float(np.median(own)), percentile, 1e3 * float(own.max()), 1e3 * float(clock.max())
 
 
 def cycle_table(
@@ -123,7 +113,7 @@ def cycle_table(
     Raises:
         InputError: a recording cannot be read.
     """
-    cycles = open_cycles(sessions, ("float64", "float32"), folder)
+    cycles = _open_cycles(sessions, ("float64", "float32"), folder)
     rows = np.array([[(cycle.time(), *cycle.time_live()) for cycle in cycles] for _ in range(rounds)])
     yield markdown_header(COLUMNS)
     for cycle, found in zip(cycles, np.median(rows, axis=0).tolist(), strict=True):
@@ -133,48 +123,42 @@ def cycle_table(
 
 
 def profile_table(sessions: Sequence[str] | None = None, folder: Path = Path()) -> Iterator[str]:
-    """The lines of a table of where the processor time of a replayed step goes, us, by part (`VERBS`). The
+    """The lines of a table of where the processor time of a replayed step goes, us, by part (`PARTS`). The
     selection runs on the thread of the session here. Profiling slows down Python, not compiled code, so its
     times are scaled to the sum of a session that is not profiled."""
-    cycles = open_cycles(sessions, ("float64",), folder)
+    cycles = _open_cycles(sessions, ("float64",), folder)
     columns = []
     for cycle in cycles:
-        with selecting_inline():
+        with _selecting_inline():
             total = min(cycle.time() for _ in range(3))
-            parts = profile(cycle)
+            parts = _profile(cycle)
         columns.append({part: us * total / sum(parts.values()) for part, us in parts.items()})
     yield markdown_header(["us a step", *(f"{cycle.name}, {cycle.backend}" for cycle in cycles)])
-    for part in VERBS:
+    for part in PARTS:
         yield markdown_row([part, *(f"{column[part]:.0f}" for column in columns)])
     yield markdown_row(["all", *(f"{sum(column.values()):.0f}" for column in columns)])
 
 
-def open_cycles(sessions: Sequence[str] | None, precisions: Sequence[Precision], folder: Path) -> list[Cycle]:
+def _open_cycles(
+    sessions: Sequence[str] | None, precisions: Sequence[Precision], folder: Path
+) -> list[_Cycle]:
     """The compiled sessions of a table."""
     prepare_precision("float64")
-    chosen = select_rows(sessions, SESSIONS, tuple(SESSIONS))
-    cycles = [
-        open_cycle(name, backend, precision, folder)
-        for name in chosen
-        for backend in BACKENDS
-        for precision in precisions
-    ]
+    cycles = []
+    names = select_rows(sessions, SESSIONS, tuple(SESSIONS))
+    for name, backend, precision in product(names, BACKENDS, precisions):
+        settings = [f"backend={backend}", f"session.precision={precision}"]
+        config: RunConfig = load_config(folder / SESSIONS[name], settings)
+        with open_observations(config) as (config, source):
+            log = load_into_memory(source)
+        observations = [observation_of(sample) for sample in log]
+        cycles.append(_Cycle(name, backend, precision, build_session(config, log), observations))
     for cycle in cycles:
         cycle.time()  # compiles
     return cycles
 
 
-def open_cycle(name: str, backend: str, precision: Precision, folder: Path) -> Cycle:
-    """The session of a configuration with a backend, not compiled yet."""
-    settings = [f"backend={backend}", f"session.precision={precision}"]
-    config: RunConfig = load_config(folder / SESSIONS[name], settings)
-    with open_observations(config) as (config, source):
-        log = load_into_memory(source)
-    observations = [observation_of(sample) for sample in log]
-    return Cycle(name, backend, precision, build_session(config, log), observations)
-
-
-def profile(cycle: Cycle) -> dict[str, float]:
+def _profile(cycle: _Cycle) -> dict[str, float]:
     """Time of a step by part in a profiled replay, us."""
     profiler = cProfile.Profile()
     cycle.session.restart()
@@ -183,10 +167,10 @@ def profile(cycle: Cycle) -> dict[str, float]:
     for _ in steps:
         pass
     profiler.disable()
-    parts = dict.fromkeys(VERBS, 0.0)
+    parts = dict.fromkeys(PARTS, 0.0)
     for function, seconds in own_times(vars(pstats.Stats(profiler))["stats"]).items():
         place = f"{function[0].rpartition('/ratslam/')[2]}:{function[2]}"
-        part = next(name for name, begins in VERBS.items() if place.startswith(begins))
+        part = next(name for name, begins in PARTS.items() if place.startswith(begins))
         parts[part] += 1e6 * seconds / len(cycle.observations)
     return parts
 
@@ -206,7 +190,7 @@ def own_times(stats: dict[Any, Any]) -> dict[Any, float]:
 
 
 @contextmanager
-def selecting_inline() -> Iterator[None]:
+def _selecting_inline() -> Iterator[None]:
     """Lets selections run where they begin."""
     modules: tuple[Any, ...] = selection_worker, archive
     threads = [each.THREAD for each in modules]

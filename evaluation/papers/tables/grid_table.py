@@ -30,19 +30,11 @@ from robot.world.walls import segment_distance
 from tactile.base.se2 import compose, integrate
 from tactile.base.types import MotionKind, Observation
 
-FIRST_ARENA = 9000
-LARGE_ERROR_DEG = 15.0
-"""Error of a wall direction that counts as large, degrees."""
-BACK_DURATION = 0.5
-"""Duration of a BACK motion whose odometry is left out, s."""
-
-WORLDS: dict[str, dict[str, Any]] = {
+_WORLDS: dict[str, dict[str, Any]] = {
     "A": {"arena": {"side": 1.25}, "reports": 900},
     "B": {"arena": {"side": 2.5}, "reports": 1500},
     "rotated": {"arena": {"side": 1.25, "rotated": True}, "reports": 900},
 }
-MAP_SIDES = {"A": 2.5, "B": 5.0, "rotated": 2.5}
-"""Side of the filter's map by world, m: one size for all arenas, so that the filter compiles once."""
 AS_PRINTED = {
     "likelihood": {"model": "literal"},
     "drift": {"session": 0.0, "move": 0.0, "step": 0.05},
@@ -99,14 +91,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class GridTask(NamedTuple):
-    """One session of a row."""
-
-    world: str
-    row: str
-    arena: int
-
-
 class GridFigures(NamedTuple):
     """The figures of one session.
 
@@ -126,7 +110,7 @@ class GridFigures(NamedTuple):
 def grid_table(
     rows: Sequence[tuple[str, str]] = DEFAULT_ROWS,
     arenas: int = 10,
-    first: int = FIRST_ARENA,
+    first: int = 9000,
     workers: int = 0,
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
@@ -134,7 +118,7 @@ def grid_table(
     Args:
         rows: pairs of a world and a row. first: seed of the first arena.
     """
-    tasks = [GridTask(*row, arena) for row in rows for arena in range(first, first + arenas)]
+    tasks = [(*row, arena) for row in rows for arena in range(first, first + arenas)]
     results = run_tasks(measure_session, tasks, workers=workers)
     yield markdown_header(COLUMNS)
     for world, row in rows:
@@ -142,30 +126,32 @@ def grid_table(
         yield markdown_row([f"{world}, {ODOMETRY_ERRORS.get(row, row)}", *_cells(found)])
 
 
-def task_config(task: GridTask) -> RunConfig:
-    """The configuration of a session."""
-    noise = task.row.replace(",", " ").split()[0]
-    create_simulation = WORLDS[task.world] | {"wheels": {"noise": noise}, "seed": task.arena}
+def task_config(world: str, row: str, arena: int) -> RunConfig:
+    """The configuration of a session of a row in the arena with this seed."""
+    noise = row.replace(",", " ").split()[0]
+    create_simulation = _WORLDS[world] | {"wheels": {"noise": noise}, "seed": arena}
     given = {"create_simulation": create_simulation, "backend": "grid", "session": {"precision": "float32"}}
-    return RunConfig.model_validate(given | ROWS[task.row])
+    return RunConfig.model_validate(given | ROWS[row])
 
 
-def measure_session(task: GridTask) -> GridFigures:
-    """Runs and measures one session."""
+def measure_session(task: tuple[str, str, int]) -> GridFigures:
+    """Runs and measures one session: of a world, a row and the seed of an arena."""
+    world, row, _ = task
     prepare_precision("float64")
-    config = task_config(task)
+    config = task_config(*task)
     source: Any = open_source(config)
     config = complete(config, source)
-    grid = config.grid.model_copy(update={"side": MAP_SIDES[task.world]})
-    rows = list(read_observations(open_touch_source(source, config.touch)))
-    truth = np.array([sample.truth for sample, _ in rows])
-    observations = [observation for _, observation in rows]
+    # The map has one size for all arenas of a world, so that the filter compiles once.
+    grid = config.grid.model_copy(update={"side": 2 * _WORLDS[world]["arena"]["side"]})
+    samples = list(read_observations(open_touch_source(source, config.touch)))
+    truth = np.array([sample.truth for sample, _ in samples])
+    observations = [observation for _, observation in samples]
     start = source.arena.start
-    if "calibrated" in task.row:
+    if "calibrated" in row:
         observations = correct_observations(MEAN_ERRORS, observations)
     moves = np.array([observation.odometry[:3] for observation in observations])
-    if "BACK skipped" in task.row:
-        still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=BACK_DURATION)
+    if "BACK skipped" in row:
+        still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=0.5)
         observations = [
             o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
         ]
@@ -174,12 +160,17 @@ def measure_session(task: GridTask) -> GridFigures:
     online = np.array([step.pose for step in session.replay(observations)])
     walls = [(pose, each) for pose, each in zip(truth, observations, strict=True) if each.wall]
     readings = (sample.reading for sample in source)
+    map: Any = session.map
+    drawn = OccupancyGrid(map.occupancy(), np.full(2, -map.side * map.config.cell / 2), map.config.cell)
+    scores = score_grid(drawn, true_grid(source.arena, drawn)).quantities
+    names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
+    values = [scores[name].value for name in names]
     return GridFigures(
         error=position_error(compose(start, online), truth),
         odometry=position_error(integrate(moves, start), truth),
         wall_errors=np.array([_wall_error(source.arena, pose, observation) for pose, observation in walls]),
         contacts=sum(each.moment >= 2 and each.motion == MotionKind.FORWARD for each in readings),
-        map=_map_scores(session.map, source.arena),
+        map=tuple(np.nan if value is None else float(value) for value in values),
     )
 
 
@@ -196,21 +187,12 @@ def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> flo
     return float(abs((error + np.pi / 2) % np.pi - np.pi / 2))
 
 
-def _map_scores(map: Any, arena: Arena) -> tuple[float, ...]:
-    corner = np.full(2, -map.side * map.config.cell / 2)
-    grid = OccupancyGrid(map.occupancy(), corner, map.config.cell)
-    found = score_grid(grid, true_grid(arena, grid)).quantities
-    names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
-    values = [found[name].value for name in names]
-    return tuple(np.nan if value is None else float(value) for value in values)
-
-
 def _cells(found: Sequence[GridFigures]) -> list[str]:
     error, odometry = (np.array([getattr(each, part) for each in found]) for part in ("error", "odometry"))
     walls = np.degrees(np.concatenate([each.wall_errors for each in found]))
     share = len(walls) / max(sum(each.contacts for each in found), 1)
     auc, skill, free, to_walls, to_map = np.nanmean([each.map for each in found], axis=0)
-    wall = f"{walls.mean():.1f} degrees, {(walls > LARGE_ERROR_DEG).mean():.0%}, {share:.0%}"
+    wall = f"{walls.mean():.1f} degrees, {(walls > 15.0).mean():.0%}, {share:.0%}"
     return [
         f"{odometry.mean():.3f} m",
         f"{error.mean():.3f}",

@@ -1,6 +1,6 @@
 """The table of map health: whether a map's own doubt tells bad maps from good ones.
 
-Each session is finished once and its map spoilt in many ways (`trials.spoilt_maps`). A map is bad if its
+Each session is finished once and its map spoilt in many ways (`spoilt_maps`). A map is bad if its
 error exceeds `HARM_FACTOR` times odometry's (recordings: and 0.3 m): whisker sessions by the Energy Metric,
 recordings by ATE, both of keyframes. Even sessions fit the regression, odd ones test it; the weights below
 the table, of all sessions, become those of `ratslam.mapping.map_solution`. Only maps with closures count.
@@ -71,14 +71,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class HealthTask(NamedTuple):
-    """A session: a row, and its number."""
-
-    row: str
-    number: int
-    folder: Path
-
-
 class JudgedMaps(NamedTuple):
     """The maps of sessions, n in all.
 
@@ -99,13 +91,13 @@ def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> 
         sessions: of each row; recordings are perturbed copies but the first. folder: of the repository.
     """
     rows = [*TOUCH, *(REAL if real_recordings() else ())]
-    tasks = [HealthTask(row, number, folder) for row in rows for number in range(sessions)]
-    found = list(run_tasks(judge_session, tasks, workers=workers))
+    tasks = [(row, number, folder) for row in rows for number in range(sessions)]
+    found = list(run_tasks(_judge_session, tasks, workers=workers))
     weights, final = (fit_weights(_together(maps)) for maps in (found[0::2], found))
     constants = np.array([INTERCEPT, *WEIGHTS])
     yield markdown_header(COLUMNS)
     for row in rows:
-        maps = _together([one for task, one in zip(tasks, found, strict=True) if task.row == row])
+        maps = _together([one for task, one in zip(tasks, found, strict=True) if task[0] == row])
         yield _line(row, maps, constants)
     yield _line("all", _together(found), constants)
     yield _line("even, fitted on these", _together(found[0::2]), weights)
@@ -113,11 +105,12 @@ def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> 
     yield f"\nIntercept and weights fitted on all sessions: {', '.join(f'{w:.2f}' for w in final)}."
 
 
-def judge_session(task: HealthTask) -> JudgedMaps:
-    """Runs a session and judges its spoilt maps."""
-    config, touch = task_config(task)
-    copied = task.number > 0 and not touch
-    run = run_recording(config, miscalibrate if copied else None, task.number)
+def _judge_session(task: tuple[str, int, Path]) -> JudgedMaps:
+    """Runs a session, of a row and a number, and judges its spoilt maps."""
+    number = task[1]
+    config, touch = task_config(*task)
+    copied = number > 0 and not touch
+    run = run_recording(config, miscalibrate if copied else None, number)
     map = run.session.map
     assert isinstance(map, KeyframeMap)
     truth, graph = run.truth[map.keyframe_steps()], map.keyframes()
@@ -131,7 +124,7 @@ def judge_session(task: HealthTask) -> JudgedMaps:
     before = error(graph.dead_reckoned())
     limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)
     rows = []
-    for _, solution in spoilt_maps(map, truth, task.number):
+    for _, solution in spoilt_maps(map, truth, number):
         closures = int((solution.log.weights() > ACCEPTED_WEIGHT).sum())
         if closures:
             after = error(solution.fit.poses)
@@ -140,18 +133,18 @@ def judge_session(task: HealthTask) -> JudgedMaps:
     return JudgedMaps(values[:, :-3], values[:, -3], values[:, -2] > 0, values[:, -1])
 
 
-def task_config(task: HealthTask) -> tuple[RunConfig, bool]:
-    """The configuration of a session, and whether it is a whisker session."""
-    if task.row in TOUCH:
-        maze = FIRST_MAZE + task.number
-        simulation = TOUCH[task.row]
-        simulation = simulation | {"seed": task.number, "maze": {"seed": maze} | simulation.get("maze", {})}
+def task_config(row: str, number: int, folder: Path) -> tuple[RunConfig, bool]:
+    """The configuration of a session, and whether it is a whisker session; folder: of the repository."""
+    if row in TOUCH:
+        maze = FIRST_MAZE + number
+        simulation = TOUCH[row]
+        simulation = simulation | {"seed": number, "maze": {"seed": maze} | simulation.get("maze", {})}
         parts = {"simulation": simulation, "session": {"reserve": 2048}}
         return RunConfig.model_validate(parts), True
-    config, file = REAL[task.row]
+    config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
-    recording = Recording(task.row, config, settings, real=True)
-    return recording.configuration(task.folder, "session.reserve=1024"), False
+    recording = Recording(row, config, settings, real=True)
+    return recording.configuration(folder, "session.reserve=1024"), False
 
 
 def fit_weights(maps: JudgedMaps) -> np.ndarray:

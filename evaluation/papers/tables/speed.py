@@ -1,19 +1,12 @@
-"""The speed table: time of a pose-cell step in replay, µs, by size of the network.
+"""Tables of speed, µs: a pose-cell step by size of the network, and steps of many networks and sessions.
 
-All columns of a row are timed in turns on one core, so that they share its state; only ratios carry over to
-other machines.
+The speed table times a step in replay beside `NumpyNetwork`, the baseline of all stated speeds. All columns
+of a row are timed in turns on one core, so that they share its state; only ratios carry over to other
+machines.
 
-A dense pose-cell network step in plain NumPy float64: the baseline of all stated speeds.
-
-A straightforward implementation: separable circular convolutions as circulant products, heading layers
-translated one after another, a search for the peak. Time it in the same process as the engine: only the
-ratio of both times is meaningful.
-
-The batch table: µs of a step of networks, of parameter sets in one call and of whole sessions in one call,
-on the processor and, if JAX has one, on the GPU beside it.
-
-On a GPU all sets and sessions are computed at once; on the processor sets in blocks that fit into its cache,
-and sessions one after another.
+The batch table times networks, parameter sets in one call and whole sessions in one call, on the processor
+and, if JAX has one, on the GPU beside it. On a GPU all sets and sessions are computed at once; on the
+processor sets in blocks that fit into its cache, and sessions one after another.
 """
 
 from __future__ import annotations
@@ -52,9 +45,6 @@ STEPS = 4000
 MOTION = 0.2, 0.1
 """Cells forward and heading cells per step."""
 COLUMNS = ("cells a side", "ratslam", "float32", "whole torus", "NumPy", "NumPy / ratslam")
-
-TimedCalls = Mapping[str, tuple[Callable[[], Any], int]]
-"""By name: a call, and the number of steps that it makes."""
 
 
 def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[str]:
@@ -123,20 +113,29 @@ def replay_network(
     return replay, start
 
 
-def interleaved_medians(calls: TimedCalls, rounds: int = ROUNDS) -> dict[str, float]:
-    """Median microseconds per step of each call; each round times all calls in turn."""
-    times = [{name: _time(*call) for name, call in calls.items()} for _ in range(rounds)]
-    return {name: float(np.median([each[name] for each in times])) for name in calls}
+def interleaved_medians(
+    calls: Mapping[str, tuple[Callable[[], Any], int]], rounds: int = ROUNDS
+) -> dict[str, float]:
+    """Median microseconds per step of each call; each round times all calls in turn.
 
-
-def _time(call: Callable[[], Any], count: int) -> float:
-    start = time.perf_counter()
-    jax.block_until_ready(call())
-    return (time.perf_counter() - start) / count * 1e6
+    Args:
+        calls: by name, a call and the number of steps that it makes.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, (call, steps) in calls.items():
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            times[name].append((time.perf_counter() - start) / steps * 1e6)
+    return {name: float(np.median(each)) for name, each in times.items()}
 
 
 class NumpyNetwork:
-    """A network of [K, N, N] cells; `step(d, turn)` moves it d cells forward and turns it by `turn` cells."""
+    """A dense network of [K, N, N] cells in plain NumPy float64, the straightforward way.
+
+    `step(d, turn)` moves it d cells forward and turns it by `turn` cells: separable circular convolutions as
+    circulant products, heading layers translated one after another, a search for the peak.
+    """
 
     def __init__(self, n: int, k: int = 36) -> None:
         self.n, self.k = n, k
@@ -193,8 +192,7 @@ def _convolve(p: np.ndarray, along: list[np.ndarray]) -> np.ndarray:
     return p @ along[2].T
 
 
-BATCHES_COLUMNS = "what is computed", "device", "us a step of each"
-BATCHES_SIZES = 21, 61, 201
+BATCH_SIZES = 21, 61, 201
 """Cells along one side of the single networks."""
 FEW = 200
 """Steps of a call with many sets."""
@@ -215,22 +213,22 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
             repeats, of which the median is taken. folder: of the repository, which holds `configs`.
     """
     prepare_precision("float64")
-    yield markdown_header(BATCHES_COLUMNS)
+    yield markdown_header(["what is computed", "device", "us a step of each"])
     core = jax.devices("cpu")[0]
     with jax.default_device(core):
-        backend, recordings = record_circuits(steps, folder)
+        backend, recordings = _record_circuits(steps, folder)
     for device in dict.fromkeys([jax.devices()[0], core]):
         gpu = device.platform != "cpu"
         name = device.device_kind if gpu else "one core"
         with jax.default_device(device):
-            for n in BATCHES_SIZES:
+            for n in BATCH_SIZES:
                 for engine in ("window", "dense"):
                     replay, start = replay_network(n, engine, SINGLE, np.float32)
                     us = _median(partial(replay, start), SINGLE, rounds)
                     yield markdown_row([f"one network of {n} cells a side, {engine}", name, f"{us:.0f}"])
             many = sets if gpu else max(sets // 5, 1)
             for every in (0, EVERY, 1):
-                call = set_call(many, every, many if gpu else batch.BLOCK)
+                call = _set_call(many, every, many if gpu else batch.BLOCK)
                 us = _median(call, many * FEW, rounds)
                 views = f"a view every {every} steps" if every else "path integration"
                 yield markdown_row([f"{many} sets of 21 cells, {views}", name, f"{us:.2f}"])
@@ -238,7 +236,12 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
             used = [recordings[k % len(recordings)] for k in range(several)]
             run = SessionBatch(backend, at_once=gpu)
             us = _median(partial(run.replay, used), several * steps, rounds)
-            gap = belief_gap(run.replay(used), used)
+            states = run.replay(used)
+            gap = max(  # largest difference of a belief from that of the single run
+                float(np.abs(np.asarray(found[k], float) - own).max(initial=0.0))
+                for k, recording in enumerate(used)
+                for found, own in zip(states.belief, recording.state.belief, strict=True)
+            )
             what = f"{several} sessions of {steps} steps, largest difference of a belief {gap:.0e}"
             yield markdown_row([what, name, f"{us:.1f}"])
     with jax.default_device(core):
@@ -248,7 +251,7 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
     yield markdown_row([what, "one core", f"{us:.1f}"])
 
 
-def record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Recording]]:
+def _record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Recording]]:
     """The backend and recordings of the first steps of `RECORDED` whisker sessions of ten circuits whose maps
     need as many pose cells."""
     recordings: list[Recording] = []
@@ -262,19 +265,15 @@ def record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Recor
             assert isinstance(made.backend, RecallBackend)
             backend, session = made.backend, RecordingSession(made.backend, reserve=made.reserve)
         found = session.record(observations)
-        if not recordings or cells_of(found) == cells_of(recordings[0]):
+        sides = [chunk.sides for chunk in found.chunks]  # numbers of cells along x and y
+        if not recordings or sides == [chunk.sides for chunk in recordings[0].chunks]:
             recordings.append(found)
         if len(recordings) == RECORDED:
             break
     return backend, recordings
 
 
-def cells_of(recording: Recording) -> list[tuple[int, ...]]:
-    """The numbers of cells along x and y at each chunk."""
-    return [chunk.sides for chunk in recording.chunks]
-
-
-def set_call(sets: int, every: int, block: int) -> Callable[[], Any]:
+def _set_call(sets: int, every: int, block: int) -> Callable[[], Any]:
     """A call of `FEW` steps of many parameter sets, with a view half a torus away every so many steps, 0:
     none."""
     config, single = NetworkConfig(cells_xy=21), np.dtype(np.float32)
@@ -289,20 +288,7 @@ def set_call(sets: int, every: int, block: int) -> Callable[[], Any]:
     return lambda: batch.networks(config, given, course, block)
 
 
-def belief_gap(states: Any, recordings: list[Recording]) -> float:
-    """The largest difference of a belief from that of the single run."""
-    return max(
-        float(np.abs(np.asarray(found[k], float) - own).max(initial=0.0))
-        for k, recording in enumerate(recordings)
-        for found, own in zip(states.belief, recording.state.belief, strict=True)
-    )
-
-
 def _median(call: Callable[[], Any], steps: int, rounds: int) -> float:
-    """Median us of a step of a call that makes so many, compiled before."""
-    times = []
-    for _ in range(1 + rounds):
-        began = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - began)
-    return float(np.median(times[1:])) / steps * 1e6
+    """Median us of a step of a call that makes so many, which is compiled first."""
+    jax.block_until_ready(call())
+    return interleaved_medians({"": (call, steps)}, rounds)[""]

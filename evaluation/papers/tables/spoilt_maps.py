@@ -1,7 +1,7 @@
 """Spoilt maps of a finished session: its sequences thinned out, all accepted, or joined by false ones.
 
 A false sequence claims that a stretch of the session was driven where an earlier one was, far from it in
-truth, along which odometry moved alike: the one of `ATTEMPTS` random pairs that looks most alike, or any.
+truth, along which odometry moved alike: the one of `_ATTEMPTS` random pairs that looks most alike, or any.
 """
 
 from __future__ import annotations
@@ -19,16 +19,8 @@ from ratslam.mapping.optimizer import MapFit, System
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 
-ATTEMPTS = 300
+_ATTEMPTS = 300
 """Pairs of stretches tried for one false sequence."""
-COUNT, LENGTH, EVIDENCE = (1, 4), (6, 39), (1.0, 4.0)
-"""Smallest and largest number of false sequences, of their candidates, and evidence of each candidate."""
-FAR, TURNED = 5.0, 0.7
-"""True distance, cells, and heading difference, rad, beyond which a place is another one."""
-AGREEMENT, AGREEMENT_HEADING = 2.0, 0.5
-"""Largest difference between the odometry of the two stretches, cells and rad."""
-STEPS, FINE = 40, 1e-3
-"""Solver iterations of a spoilt map, and change of the poses at their end, m and rad."""
 
 
 class Recipe(NamedTuple):
@@ -49,7 +41,7 @@ class Recipe(NamedTuple):
     robust: bool = True
 
 
-RECIPES = (
+_RECIPES = (
     Recipe("all accepted", least=2.0, robust=False),
     Recipe("half", kept=0.5),
     Recipe("false, alike", false=True, robust=False),
@@ -73,7 +65,7 @@ def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tupl
     graph, final = map.keyframes(), map.solution()
     random = stream(seed, "spoilt_maps")
     yield "final", final
-    for recipe in RECIPES:
+    for recipe in _RECIPES:
         log = spoil(graph, final.log, truth, recipe, random)
         if len(log.accepted_rows()):
             yield recipe.name, solved_anew(graph, log, final, recipe.robust)
@@ -95,42 +87,42 @@ def spoil(
     for sequence in chosen.tolist():
         log.judge(sequence, Verdict.ACCEPTED)
     if recipe.false:
-        count, length = (int(random.integers(low, high + 1)) for low, high in (COUNT, LENGTH))
+        # 1 to 4 false sequences of 6 to 39 candidates.
+        count, length = (int(random.integers(low, high + 1)) for low, high in ((1, 4), (6, 39)))
         for _ in range(count):
-            add_false_sequence(graph, log, truth, length, random, ATTEMPTS if recipe.alike else 1)
+            _add_false_sequence(graph, log, truth, length, random, _ATTEMPTS if recipe.alike else 1)
     return log
 
 
-def add_false_sequence(
+def _add_false_sequence(
     graph: KeyframeGraph,
     log: ClosureLog,
     truth: np.ndarray,
     length: int,
     random: np.random.Generator,
     choices: int,
-) -> bool:
-    """Accepts a false sequence, the one that looks most alike of at most `choices` pairs of stretches.
-
-    Returns:
-        whether there was one among `ATTEMPTS` random pairs.
-    """
+) -> None:
+    """Accepts the false sequence that looks most alike of at most `choices` pairs of stretches; none if
+    there is none among `_ATTEMPTS` random pairs."""
     found: list[tuple[float, int, int]] = []
     first, reckoned = graph.guard + length + 5, graph.dead_reckoned()
     if graph.count - length <= first:
-        return False
-    for _ in range(ATTEMPTS):
+        return
+    for _ in range(_ATTEMPTS):
         frame = int(random.integers(first, graph.count - length))
         match = int(random.integers(0, frame - graph.guard - length))
         if len(found) < choices and _is_false(graph, reckoned, truth, frame, match, length):
-            found.append((_unlikeness(graph, frame, match, length), frame, match))
+            # Mean misfit of the candidates, about every sixth.
+            steps = range(0, length, max(1, length // 6))
+            misfits = [graph.least_misfit(frame + k, np.array([match + k]), np.array([False])) for k in steps]
+            found.append((float(np.mean(misfits)), frame, match))
     if not found:
-        return False
+        return
     _, frame, match = min(found)
-    evidence = float(random.uniform(*EVIDENCE))
+    evidence = float(random.uniform(1.0, 4.0))
     for k in range(length):
         sequence = log.add(Candidate(frame + k, match + k, 0, 0.9, evidence), k > 0)
     log.judge(sequence, Verdict.ACCEPTED)
-    return True
 
 
 def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robust: bool) -> MapSolution:
@@ -145,7 +137,8 @@ def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robus
         problem = problem._replace(closures=problem.closures._replace(scale=scale, cost_limit=np.inf))
     starts = [final.fit, MapFit(graph.dead_reckoned(), 0.0, np.zeros(0))]
     system = System(problem)
-    fit = min((system.solve(start, STEPS, FINE) for start in starts), key=system.robust_cost)
+    # 40 iterations at most, to changes of 1 mm and 1 mrad.
+    fit = min((system.solve(start, 40, 1e-3) for start in starts), key=system.robust_cost)
     log.weigh(fit.weights)
     return MapSolution(fit, log, final.cut)
 
@@ -155,18 +148,12 @@ def _is_false(
 ) -> bool:
     """Whether two stretches are of other places, and odometry moved alike on both."""
     apart = truth[frame] - truth[match]
-    if not np.hypot(*apart[:2]) > FAR * graph.cell and not abs(wrap(apart[2])) > TURNED:
+    # A place is another one beyond 5 cells or 0.7 rad; odometry is alike within 2 cells and 0.5 rad.
+    if not np.hypot(*apart[:2]) > 5.0 * graph.cell and not abs(wrap(apart[2])) > 0.7:
         return False
     for k in (length // 2, length):
         moved = [between(reckoned[at], reckoned[at + k]) for at in (frame, match)]
         error = moved[0] - moved[1]
-        if np.hypot(*error[:2]) > AGREEMENT * graph.cell or abs(wrap(error[2])) > AGREEMENT_HEADING:
+        if np.hypot(*error[:2]) > 2.0 * graph.cell or abs(wrap(error[2])) > 0.5:
             return False
     return True
-
-
-def _unlikeness(graph: KeyframeGraph, frame: int, match: int, length: int) -> float:
-    """Mean misfit of the candidates, about every sixth."""
-    ahead = np.array([False])
-    steps = range(0, length, max(1, length // 6))
-    return float(np.mean([graph.least_misfit(frame + k, np.array([match + k]), ahead) for k in steps]))

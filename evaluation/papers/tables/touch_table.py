@@ -2,7 +2,7 @@
 
 Each row is a condition, with the preset of the sensor and what the row changes; each session of it has its
 own maze, so that an unlucky maze counts once. Values are medians over the sessions; a failure is an Energy
-Metric (all pairs, m^2 + rad^2) of `SUCCESS` or more.
+Metric (all pairs, m^2 + rad^2) of `_SUCCESS` or more.
 """
 
 from __future__ import annotations
@@ -39,24 +39,21 @@ from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.sources.in_memory import InMemorySource, load_into_memory
 
 FIRST_MAZE = 31100
-SUCCESS = 0.25
+_SUCCESS = 0.25
 TOLERANCE = 1.05
 """A map is worse than odometry if its Energy Metric is above odometry's times this."""
 CHANGE = 0.3
 """Share of a session before the change of mazes."""
-RECOVERY_LIMIT = 45
+_RECOVERY_LIMIT = 45
 """Whisks within which a place should be recognised after a kidnap."""
-REVISIT_GAP, REVISIT_DISTANCE = 60, 0.05
-"""A revisit is a step within this distance (m) of the position more than this many steps before."""
 
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
-ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
-MAX_ANGLE = {"image": {"transform": "max_angle"}}
+_ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
+_MAX_ANGLE = {"image": {"transform": "max_angle"}}
 KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
 EXPLORATION = {"path": {"explore": 1500}}
 NOISE = OdometryConfig()
-OPEN_LOOP = {"whisking": {"mode": "open"}}
-HALL = {"mechanics": {"baseline": HALL_BASELINE.model_dump()}}
+_OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
@@ -81,11 +78,11 @@ def _head(*radii: float) -> dict[str, Any]:
 ROWS = {
     "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN, sessions=40),
     "clean": TouchRow("clean: 2 mm / 0.5 deg"),
-    "rough": TouchRow("rough: 10 mm / 3 deg / 10 %", ROUGH),
+    "rough": TouchRow("rough: 10 mm / 3 deg / 10 %", _ROUGH),
     "rough, 3 % faults": TouchRow(
-        "rough, 3 % contacts missed, 3 % spurious", ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
+        "rough, 3 % contacts missed, 3 % spurious", _ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
-    "open, max_angle": TouchRow("open loop, max_angle", OPEN_LOOP, MAX_ANGLE),
+    "open, max_angle": TouchRow("open loop, max_angle", _OPEN_LOOP, _MAX_ANGLE),
     "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
     "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
     "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
@@ -124,30 +121,33 @@ ROWS = {
     "rest 60": TouchRow("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
     "radial channel": TouchRow("with the radial channel", {}, {"image": {"radial": True}}),
     "2 Hz": TouchRow("2 Hz whisking", {"whisking": {"rate": 2.0}}),
-    "RCP, max_angle": TouchRow("RCP, max_angle", {}, MAX_ANGLE),
+    "RCP, max_angle": TouchRow("RCP, max_angle", {}, _MAX_ANGLE),
     "1 dead": TouchRow("1 dead whisker", {}, {"head": {"dead": [10]}}),
     "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
     "noise 1e-2": TouchRow("1e-2 rad", {"mechanics": {"noise": 1e-2}}),
     "raw": TouchRow("main from raw samples", MAIN | {"raw": True}),
-    "drift": TouchRow("main from raw samples with drift, colour and creep", MAIN | HALL),
+    "drift": TouchRow(
+        "main from raw samples with drift, colour and creep",
+        MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
+    ),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
-    "open, contact_angle": TouchRow("open loop, contact_angle", OPEN_LOOP),
+    "open, contact_angle": TouchRow("open loop, contact_angle", _OPEN_LOOP),
     "noise 5e-3": TouchRow("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
     "soft servo, open, max": TouchRow(
-        "soft servo, open loop, max_angle", OPEN_LOOP | {"mechanics": {"servo": 0.3}}, MAX_ANGLE
+        "soft servo, open loop, max_angle", _OPEN_LOOP | {"mechanics": {"servo": 0.3}}, _MAX_ANGLE
     ),
-    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, MAX_ANGLE),
+    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, _MAX_ANGLE),
 }
 DEFAULT_ROWS = tuple(ROWS)[:-4]
 """The rows printed if none are chosen."""
 COMPARED = Compared(
     "EM", "em", "em_live", "em_odometry",
     worse=lambda error, odometry: error > TOLERANCE * odometry,
-    failed=lambda error, _: error >= SUCCESS,
+    failed=lambda error, _: error >= _SUCCESS,
     counts={"false / closures": ("false_closures", "closures")},
     medians={"revisits closed": "revisits_closed"},
 )  # fmt: skip
@@ -213,13 +213,17 @@ def touch_table(
     counts = {row: sessions or ROWS[row].sessions for row in rows}
     tasks = [TouchTask(row, first + k, backend) for row in rows for k in range(counts[row])]
     log = SessionLog("touch", files, [(task.row, str(task.maze)) for task in tasks], backend)
-    results = zip(tasks, run_tasks(measure_session, tasks, workers=workers), strict=True)
+    results = zip(tasks, run_tasks(_measure_session, tasks, workers=workers), strict=True)
     notes: list[str] = []
     yield markdown_header(COLUMNS)
     for row in rows:
         found = []
         for task, figures in islice(results, counts[row]):
-            log.add(row, task.maze, session_record(figures))
+            record = figures.metrics._asdict() | figures._asdict()
+            del record["metrics"]
+            whisks = record.pop("recovery")  # of which the number of kidnaps and the median are kept
+            recovery = np.median(whisks) if whisks else np.nan
+            log.add(row, task.maze, record | {"kidnaps": len(whisks), "recovery": recovery})
             found.append(figures)
         yield markdown_row([ROWS[row].label, *_cells(found)])
         notes += _notes(row, found)
@@ -227,15 +231,7 @@ def touch_table(
     yield from compare_runs(COMPARED, log, rows)
 
 
-def session_record(figures: SessionFigures) -> dict[str, Any]:
-    """The figures of a session by name; of `recovery` the number of kidnaps and the median."""
-    record = figures.metrics._asdict() | figures._asdict()
-    whisks = record.pop("recovery")
-    del record["metrics"]
-    return record | {"kidnaps": len(whisks), "recovery": np.median(whisks) if whisks else np.nan}
-
-
-def measure_session(task: TouchTask) -> SessionFigures:
+def _measure_session(task: TouchTask) -> SessionFigures:
     """Runs and measures one session."""
     return run_and_measure(task)[1]
 
@@ -292,13 +288,12 @@ def task_config(task: TouchTask) -> RunConfig:
 
 
 def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
-    """Share of the revisits that a true closure has found."""
+    """Share of the revisits, within 5 cm of the position more than 60 steps before, that a true closure has
+    found."""
     closed = np.zeros(len(truth), bool)
     closed[true_closures[:, 0]] = True
     revisits = [
-        k
-        for k in range(REVISIT_GAP + 1, len(truth))
-        if (np.hypot(*(truth[: k - REVISIT_GAP, :2] - truth[k, :2]).T) < REVISIT_DISTANCE).any()
+        k for k in range(61, len(truth)) if (np.hypot(*(truth[: k - 60, :2] - truth[k, :2]).T) < 0.05).any()
     ]
     return float(closed[revisits].mean()) if revisits else np.nan
 
@@ -318,7 +313,7 @@ def _cells(found: Sequence[SessionFigures]) -> list[str]:
         f"{np.median(em):.3f} ({em.max():.2f})",
         median("em_live"),
         median("em_odometry", 2),
-        _rate(em >= SUCCESS),
+        _rate(em >= _SUCCESS),
         f"{_rate(ratio > TOLERANCE)} ({ratio.max():.2f})",
         median("em_experiences"),
         median("arr"),
@@ -345,7 +340,7 @@ def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
     if len(recovery):
         notes.append(
             f"{row}: whisks to the first true closure, median {np.median(recovery):.0f}; "
-            f"within {RECOVERY_LIMIT}: {(recovery <= RECOVERY_LIMIT).mean():.0%}."
+            f"within {_RECOVERY_LIMIT}: {(recovery <= _RECOVERY_LIMIT).mean():.0%}."
         )
         em, unjoined = np.array([(one.em_pieces, one.unjoined) for one in found]).T
         notes.append(

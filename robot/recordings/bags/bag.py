@@ -1,8 +1,7 @@
-"""A bag: its topics and messages, read with rosbags, and one error for everything that damage can do.
+"""A bag of ROS 1 or ROS 2, read with rosbags: its topics, messages and their times.
 
-Bounds on what compressed chunks, messages and files of bags expand to, for rosbags, which has none.
-
-Times of the messages of a topic, and messages that cannot be used.
+Whatever damage can do becomes one error. What compressed chunks, messages and files expand to is bounded,
+which rosbags does not do. Messages that cannot be used are left out and reported.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def _zstd(file: IO[bytes]) -> IO[bytes]:
     return cast(IO[bytes], zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True))
 
 
-def expand_message(content: bytes) -> bytes:
+def _expand_message(content: bytes) -> bytes:
     """What a message expands to that is compressed with zstd; an `InputError` if it is too much."""
     return expand(_zstd(io.BytesIO(content)), "a compressed message", len(content))
 
@@ -53,7 +52,7 @@ class _Counted(io.RawIOBase):
         return piece
 
 
-def bound_expansion() -> None:
+def _bound_expansion() -> None:
     """Replaces the decompressors of rosbags by bounded ones."""
     import lz4.frame
     from rosbags.rosbag1 import reader as first
@@ -66,7 +65,7 @@ def bound_expansion() -> None:
             known[name] = lambda content, *_, opener=openers[name]: expand(
                 opener(io.BytesIO(content)), "a compressed chunk", len(content)
             )
-    zstd = SimpleNamespace(decompress=expand_message, open=lambda file, _: _Counted(file))
+    zstd = SimpleNamespace(decompress=_expand_message, open=lambda file, _: _Counted(file))
     second.zstd = cast(Any, zstd)
 
 
@@ -74,9 +73,8 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
 MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
-ROS2_CODES = {"cdr", "ros2msg", "ros2idl", "omgidl", ""}
 REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
-CONVERT = (
+_CONVERT = (
     "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
     "`mcap convert` or `rosbags-convert`"
 )
@@ -122,12 +120,14 @@ class Bag:
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError:
             raise InputError("rosbags", "not installed", "", "pip install 'ratslam[ros]'") from None
-        bound_expansion()
+        _bound_expansion()
         first = files[0].suffix == ".bag"
-        with damage_errors(path):
+        with _damage_errors(path):
             readers: list[Any] = [rosbag1.Reader(file) for file in files] if first else [rosbag2.Reader(path)]
-            if files[0].name == METADATA and not _names_its_storage(files[0]):
-                readers = [rosbag2.Reader(file) for file in files[1:]]
+            if files[0].name == METADATA:
+                text = files[0].read_text(encoding="utf-8", errors="replace")
+                if re.search(r"^\s*storage_identifier:\s*(''|\"\")?\s*$", text, re.MULTILINE):
+                    readers = [rosbag2.Reader(file) for file in files[1:]]  # `ros2 bag reindex` left it empty
             for reader in readers:
                 reader.open()
                 self._stack.callback(reader.close)
@@ -213,23 +213,21 @@ class Bag:
         """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
         decoded."""
         self._check_type(topic)
-        with damage_errors(self.path):
+        with _damage_errors(self.path):
             for number, (time, raw) in enumerate(self._raw(topic)):
-                if not self._is_within(time, topic):
+                everywhere = self._stretch == WHOLE or topic.name.endswith("tf_static")
+                if not everywhere and not self._stretch.inside(np.array([time / 1e9]), self._start)[0]:
                     continue
                 try:
-                    content = self._decode(_plain(raw), topic.kind)
+                    plain = bytes(raw)
+                    if plain[:4] == ZSTD:  # of a storage file read without the folder that says so
+                        plain = _expand_message(plain)
+                    content = self._decode(plain, topic.kind)
                 except Exception as error:  # whatever a decoder raises for damaged bytes
                     found = f"{len(raw)} bytes that cannot be decoded ({_reason(error)})"
                     place = f"{self.path}, {topic.name}, message {number}"
                     content = InputError(place, found, f"a message of type {topic.kind}")
                 yield number, time, content
-
-    def _is_within(self, time: int, topic: Topic) -> bool:
-        """Whether a message received at this time, ns, is read."""
-        if self._stretch == WHOLE or topic.name.endswith("tf_static"):
-            return True
-        return bool(self._stretch.inside(np.array([time / 1e9]), self._start)[0])
 
     def since_start(self, received: float) -> float:
         """s from the start of the recording to a time of receipt, ns.
@@ -237,7 +235,7 @@ class Bag:
         Raises:
             InputError: the bag is damaged.
         """
-        with damage_errors(self.path):
+        with _damage_errors(self.path):
             return received / 1e9 - self._start
 
     @cached_property
@@ -251,7 +249,7 @@ class Bag:
         Raises:
             InputError: the bag is damaged.
         """
-        with damage_errors(self.path):
+        with _damage_errors(self.path):
             for time, _ in self._raw(topic):
                 yield time
 
@@ -283,7 +281,7 @@ class Bag:
         ]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
         if coded:
-            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
+            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", _CONVERT)
         known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
         if self._first and any(each.digest not in known for each in connections):
             raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
@@ -298,7 +296,7 @@ class Bag:
 
 
 @contextmanager
-def damage_errors(path: Path) -> Iterator[None]:
+def _damage_errors(path: Path) -> Iterator[None]:
     """Turns whatever a reader of damaged bytes raises into an `InputError`."""
     try:
         yield
@@ -339,9 +337,9 @@ def container_fault(path: Path) -> tuple[str, str] | None:
                     break
         file.seek(-min(file.seek(0, 2), len(MCAP)), 2)
         whole = file.read() == MCAP
-    if profile and (profile != "ros2" or codes - ROS2_CODES):
+    if profile and (profile != "ros2" or codes - {"cdr", "ros2msg", "ros2idl", "omgidl", ""}):
         found = f"an MCAP file of profile {profile} with {', '.join(sorted(codes))}, not of ROS 2"
-        return f"cannot be read as a bag: {found}", CONVERT
+        return f"cannot be read as a bag: {found}", _CONVERT
     if whole or not profile:
         return None
     return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"
@@ -370,18 +368,6 @@ def bag_files(path: Path) -> list[Path]:
     stored = [file for file in there if file.suffix in SUFFIXES]
     cure = f"`ros2 bag reindex`, or name the file: {stored[0].name}" if stored else ""
     raise InputError(str(path), f"is a folder without {METADATA}", "a file or the folder of a bag", cure)
-
-
-def _plain(raw: Any) -> bytes:
-    """A message, decompressed if its storage file is read without the folder that says so."""
-    content = bytes(raw)
-    return expand_message(content) if content[:4] == ZSTD else content
-
-
-def _names_its_storage(metadata: Path) -> bool:
-    """Whether metadata.yaml says how the files are stored; `ros2 bag reindex` may leave that empty."""
-    text = metadata.read_text(encoding="utf-8", errors="replace")
-    return re.search(r"^\s*storage_identifier:\s*(''|\"\")?\s*$", text, re.MULTILINE) is None
 
 
 def _storages(reader: Any) -> list[Any]:

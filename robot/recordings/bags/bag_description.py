@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -157,8 +156,11 @@ class FrameLink(NamedTuple):
 
 
 class BagDescription(NamedTuple):
-    """A bag. Attributes: topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is
-    left out."""
+    """A bag.
+
+    Attributes:
+        topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is left out.
+    """
 
     path: Path
     topics: tuple[TopicDescription, ...]
@@ -186,45 +188,42 @@ def describe_bag(path: Path) -> BagDescription:
     return BagDescription(path, topics, tuple(links), tuple(told))
 
 
-def roles_of(kind: str) -> tuple[Role, ...]:
-    """What messages of a type can serve as."""
-    if kind in POSES:
-        return ("odometry", "truth")
-    if kind in TWISTS:
-        return ("odometry",)
-    if kind in (SCAN, CLOUD, *IMAGES):
-        return ("views",)
-    return ("touch",) if kind in (JOINTS, *ARRAYS) else ()
+_ROLES: dict[str, tuple[Role, ...]] = {
+    **dict.fromkeys(TWISTS, ("odometry",)),
+    **dict.fromkeys(POSES, ("odometry", "truth")),  # also of types that have both
+    **dict.fromkeys((SCAN, CLOUD, *IMAGES), ("views",)),
+    **dict.fromkeys((JOINTS, *ARRAYS), ("touch",)),
+}
+"""What messages of a type can serve as."""
 
 
 def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
     received, stamps, fault, shape = list[int](), list[int](), "", None
-    frames, roles, contents = ("", ""), roles_of(topic.kind), list[Any]()
-    summary = SUMMARIES.get(topic.kind)
+    frames, roles, kept = ("", ""), _ROLES.get(topic.kind, ()), list[Any]()
+    only_first = topic.kind in (CLOUD, *IMAGES)  # which would take too long to describe one by one
     try:
         if not roles:
             received = list(bag.receipts(topic))
         else:
 
             def read(content: Any, place: str) -> None:
-                if summary is not None and (topic.kind not in FIRST or not contents):
-                    contents.append(summary[0](content, topic.kind, place))
+                if not (only_first and kept):
+                    kept.append(_summary_of(content, topic.kind, place))
 
             for _, time, content, _ in bag.usable(topic, read):
                 received.append(time)
                 if hasattr(content, "header"):
                     stamps.append(nanoseconds(content.header.stamp))
                     frames = frames if any(frames) else frames_of(content)
-            if summary is not None:
-                shape = summary[1](bag, contents, stamps or received)
+            shape = _shape_of(bag, topic.kind, kept, stamps or received)
     except InputError as error:
         fault, roles = str(error), ()
         received = received or list(bag.receipts(topic))
-    stamped = times_of(stamps, received) if len(stamps) == len(received) > 0 else None
-    return TopicDescription(*topic, times_of(received), stamped, *frames, shape, roles, fault)
+    stamped = _times_of(stamps, received) if len(stamps) == len(received) > 0 else None
+    return TopicDescription(*topic, _times_of(received), stamped, *frames, shape, roles, fault)
 
 
-def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
+def _times_of(stamps: list[int], other: list[int] | None = None) -> Times:
     """The times of N messages, ns, at least one; other: by the other clock."""
     times = np.array(stamps, np.int64)
     others = times if other is None else np.array(other, np.int64)
@@ -246,82 +245,62 @@ def times_of(stamps: list[int], other: list[int] | None = None) -> Times:
     )
 
 
-def _scan_values(content: Any, kind: str, where: str) -> tuple[Any, ...]:
-    own, (low, high) = extent_of(content, where), scan_limits(content)
-    ranges = np.asarray(content.ranges, float)
-    nothing = (ranges > high) | np.isposinf(ranges)
-    within = ranges[~nothing & (ranges >= low)]
-    median = float(np.median(within)) if len(within) else np.nan
-    return len(ranges), high, median, nothing.mean(), content.header.frame_id, own
-
-
-def _scan_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ScanShape:
-    """The shape of scans; directions are those in the frame of the first."""
-    beams, highs, medians, nothing, frames, extents = zip(*values, strict=True)
-    known = [median for median in medians if np.isfinite(median)]
-    median = float(np.median(known)) if known else np.nan
-    if len(set(frames)) > 1:
-        mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
-        turned = zip(frames, extents, strict=True)
-        extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
-    wider = wider_extent(extents)
-    extent = wider or extents[0]
-    return ScanShape(
-        int(np.median(beams)), extent, wider is not None, highs[0], median, float(np.mean(nothing))
-    )
-
-
-def _cloud_shape(bag: Bag, values: list[Any], stamps: list[int]) -> CloudShape:
-    points = values[0][np.isfinite(values[0]).all(axis=1)]
-    reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
-    return CloudShape(len(values[0]), reach)
-
-
-def _image_values(content: Any, kind: str, where: str) -> ImageShape:
-    grey = grey_image(content, kind, where)
-    encoding = content.encoding if kind == RAW else content.format
-    return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
-
-
-def _values(content: Any, kind: str, where: str) -> tuple[tuple[int, ...], np.ndarray]:
+def _summary_of(content: Any, kind: str, where: str) -> Any:
+    """What is kept of a message, for `_shape_of`."""
+    if kind == SCAN:
+        own, (low, high) = extent_of(content, where), scan_limits(content)
+        ranges = np.asarray(content.ranges, float)
+        nothing = (ranges > high) | np.isposinf(ranges)
+        within = ranges[~nothing & (ranges >= low)]
+        median = float(np.median(within)) if len(within) else np.nan
+        return len(ranges), high, median, nothing.mean(), content.header.frame_id, own
+    if kind == CLOUD:
+        return cloud_points(content, where)
+    if kind in IMAGES:
+        grey = grey_image(content, kind, where)
+        encoding = content.encoding if kind == RAW else content.format
+        return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
     if kind == JOINTS:
         return (len(content.name),), np.asarray(content.position, float)
-    sizes = tuple(int(dim.size) for dim in content.layout.dim)
-    return sizes or (len(content.data),), np.asarray(content.data, float)
-
-
-def _value_shape(bag: Bag, values: list[Any], stamps: list[int]) -> ValueShape:
-    numbers = np.concatenate([value for _, value in values])
-    low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
-    return ValueShape(values[0][0], low, high)
-
-
-def _motion_values(content: Any, kind: str, where: str) -> np.ndarray:
-    """[6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none."""
+    if kind in ARRAYS:
+        sizes = tuple(int(dim.size) for dim in content.layout.dim)
+        return sizes or (len(content.data),), np.asarray(content.data, float)
+    # [6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none
     pose = pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
     return np.array([*pose, *(twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3)])
 
 
-def _motion_shape(bag: Bag, values: list[Any], stamps: list[int]) -> MotionShape:
-    rows, time, sizes = np.array(values), np.array(stamps, float) / 1e9, list[float]()
+def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
+    """What the messages of a topic hold; kept: of each (`_summary_of`); stamps: their times, ns."""
+    if kind == SCAN:
+        beams, highs, medians, nothing, frames, extents = zip(*kept, strict=True)
+        known = [median for median in medians if np.isfinite(median)]
+        median = float(np.median(known)) if known else np.nan
+        if len(set(frames)) > 1:  # directions in the frame of the first
+            mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
+            turned = zip(frames, extents, strict=True)
+            extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
+        wider = wider_extent(extents)
+        absent = float(np.mean(nothing))
+        return ScanShape(
+            int(np.median(beams)), wider or extents[0], wider is not None, highs[0], median, absent
+        )
+    if kind == CLOUD:
+        points = kept[0][np.isfinite(kept[0]).all(axis=1)]
+        reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
+        return CloudShape(len(kept[0]), reach)
+    if kind in IMAGES:
+        return kept[0]
+    if kind in (JOINTS, *ARRAYS):
+        numbers = np.concatenate([value for _, value in kept])
+        low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
+        return ValueShape(kept[0][0], low, high)
+    rows, time, sizes = np.array(kept), np.array(stamps, float) / 1e9, list[float]()
     order = np.argsort(time, kind="stable")
     rows, time = rows[order], time[order]
     for motion in (from_poses(time, rows[:, :3]), from_velocities(time, *rows[:, 3:].T)):
-        known = np.isfinite(motion[:, 0]).any()
+        measured = np.isfinite(motion[:, 0]).any()
         track = MotionTrack(time, np.ones(len(time), bool), motion)
         path = float(np.nansum(np.hypot(motion[:, 0], motion[:, 1])))
-        sizes += [path, typical_motion(track).speed] if known else [np.nan, np.nan]
+        sizes += [path, typical_motion(track).speed] if measured else [np.nan, np.nan]
     return MotionShape(*sizes)
-
-
-Summary = tuple[Callable[[Any, str, str], Any], Callable[[Bag, list[Any], list[int]], Shape]]
-SUMMARIES: dict[str, Summary] = {
-    SCAN: (_scan_values, _scan_shape),
-    CLOUD: (lambda content, kind, where: cloud_points(content, where), _cloud_shape),
-    **dict.fromkeys(IMAGES, (_image_values, lambda bag, values, stamps: values[0])),
-    **dict.fromkeys((JOINTS, *ARRAYS), (_values, _value_shape)),
-    **dict.fromkeys((*POSES, *TWISTS), (_motion_values, _motion_shape)),
-}
-"""What is kept of a message of each type, and what follows from that and the times, ns."""
-FIRST = (CLOUD, *IMAGES)
-"""Types of which only the first message is described."""

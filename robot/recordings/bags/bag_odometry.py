@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,8 +23,6 @@ from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate, wrap
 
-AGREED = 1.2
-"""Length of the path of all frames over that of each of them, up to which their poses agree."""
 TURNED = 0.5
 """Typical turn between poses of different frames, rad, from which they disagree."""
 
@@ -137,7 +134,13 @@ def _read_series(
         position, turn = POSES[topic.kind](content)
         value = pose_in_plane(position, turn, place, config.plane)
         points.append((position.x, position.y, position.z))
-        for doubt in _doubts(content, turn):
+        found = list[str]()  # doubtful, and can be read
+        if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
+            found.append("orientations are not unit quaternions (only their direction is used)")
+        covariance = np.asarray(getattr(getattr(content, "pose", None), "covariance", 0.0), float).ravel()
+        if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
+            found.append("covariances are not numbers or negative: the publisher did not know the pose")
+        for doubt in found:
             doubts.setdefault(doubt, []).append(place)
         return value
 
@@ -188,7 +191,8 @@ def _frame_errors(
     alone = [_length(places[names == k]) for k in range(len(counts))]
     in_turn = len(changes) > len(counts)
     turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
-    if turned < TURNED and _length(places) <= AGREED * (max(alone) if in_turn else sum(alone)):
+    # Poses agree up to a path of all frames that is this many times that of each of them.
+    if turned < TURNED and _length(places) <= 1.2 * (max(alone) if in_turn else sum(alone)):
         report(f"{at}: {found}; their poses agree, look at the publisher")
         return []
     cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
@@ -202,12 +206,3 @@ def _frame_errors(
 
 def _length(places: np.ndarray) -> float:
     return float(np.hypot(*np.diff(places, axis=0).T).sum())
-
-
-def _doubts(message: Any, turn: Any) -> Iterator[str]:
-    """What is doubtful about a pose that can be read, and its orientation."""
-    if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
-        yield "orientations are not unit quaternions (only their direction is used)"
-    covariance = np.asarray(getattr(getattr(message, "pose", None), "covariance", 0.0), float).ravel()
-    if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
-        yield "covariances are not numbers or negative: the publisher did not know the pose"

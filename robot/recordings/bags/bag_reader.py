@@ -1,6 +1,5 @@
-"""Bags as sources: odometry, views or touch, and truth, each from a topic.
-
-Touch sensors in JointState and MultiArray messages.
+"""Bags as sources: odometry, views or touch (JointState and MultiArray messages), and truth, each from a
+topic.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
 
 
-def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Series:
+def _read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Series:
     """Touch [M, R, C, 1] in 0..1.
 
     Raises:
@@ -62,7 +61,10 @@ def read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Se
                 return None
             value = _joint_values(content, names or tuple(content.name), config.use, place)
         else:
-            value = _array_values(content, place)
+            value, skip = np.asarray(content.data, float), int(content.layout.data_offset)
+            if skip > len(value):
+                raise InputError(place, f"data_offset {skip} of {len(value)} values", "at most their number")
+            value = value[skip:]
         if not np.isfinite(value).all():
             raise InputError(place, f"touch is {value[~np.isfinite(value)][0]}", "a finite number")
         shape = shape or _shape(content, len(value), config, place)
@@ -105,13 +107,6 @@ def _joint_values(content: Any, names: tuple[str, ...], use: str, place: str) ->
     return given[[at[name] for name in names]]
 
 
-def _array_values(content: Any, place: str) -> np.ndarray:
-    data, skip = np.asarray(content.data, float), int(content.layout.data_offset)
-    if skip > len(data):
-        raise InputError(place, f"data_offset {skip} of {len(data)} values", "at most their number")
-    return data[skip:]
-
-
 def _shape(content: Any, size: int, config: TouchTopic, place: str) -> tuple[int, int]:
     """(R, C) of the sensors."""
     rows, columns = config.rows, config.columns
@@ -149,8 +144,13 @@ def read_bag(
     """
     report = judge.say
     with Bag(path, report, judge.stretch) as bag:
-        config = with_preset(bag, config)
-        _check_roles(bag, config, visual_odometry)
+        config = _with_preset(bag, config)
+        if config.views is not None and config.touch is not None:
+            raise InputError("recording.topics", "both views and touch", "one of them")
+        if config.odometry is None and (visual_odometry is None or config.views is None):
+            expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
+            listed = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics.values())
+            raise InputError("recording.topics", "no odometry", expected, f"the bag has {listed}")
         images = image or ImageViewConfig()
         odometry, views = _read_steps(bag, config, images, visual_odometry, report)
         truth = None if config.truth is None else read_poses(bag, config.truth, config.clock, report)
@@ -188,7 +188,7 @@ def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
     return judge.errors(track, place, where, odometry.clock, cures)
 
 
-def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
+def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     """The topics, with those of OpenRatSLAM where only their root is given.
 
     Raises:
@@ -208,15 +208,6 @@ def with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     if config.views is None and config.touch is None and images:
         found["views"] = ViewsTopic(topic=images[0])
     return config.model_copy(update=found)
-
-
-def _check_roles(bag: Bag, config: TopicsConfig, visual_odometry: VisualOdometryConfig | None) -> None:
-    if config.views is not None and config.touch is not None:
-        raise InputError("recording.topics", "both views and touch", "one of them")
-    if config.odometry is None and (visual_odometry is None or config.views is None):
-        expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
-        cure = f"the bag has {', '.join(f'{topic.name} ({topic.kind})' for topic in bag.topics.values())}"
-        raise InputError("recording.topics", "no odometry", expected, cure)
 
 
 def _read_steps(
@@ -242,7 +233,7 @@ def _read_steps(
     if config.views is not None:
         body = config.body or odometry.body
         return odometry, read_range_views(bag, config.views, body, clock, report)
-    return odometry, None if config.touch is None else read_touch(bag, config.touch, clock, report)
+    return odometry, None if config.touch is None else _read_touch(bag, config.touch, clock, report)
 
 
 def _sample_views(odometry: BagOdometry, views: Series, report: Report) -> tuple[BagOdometry, Series]:

@@ -25,34 +25,34 @@ TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|idea
 WHEELS = re.compile(r"/?(|.+[/_.-])(odom|odom_combined)")
 """Frames whose link to the robot in /tf is odometry, and the prefix of the robot."""
 LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
-SECTORS = 18  # of a view by default
-FASTER = 1.2  # times the odometry's rate: views beyond are the samples
 
 
 def suggested_topics(bag: BagDescription) -> dict[str, Any]:
     """`recording.topics` that read the bag; {} if it has neither odometry nor images."""
     truth = _first(bag, "truth", [topic for topic in bag.topics if TRUE.search(topic.name)])
     odometry, wheels = _odometry(bag, truth)
-    views = _views(bag)
-    touch = None if views is not None else _touch(bag)
+    views, touch = _views(bag), None
+    if views is None:
+        touch = _first(bag, "touch", [topic for topic in bag.topics if topic.kind != JOINTS])
     found: dict[str, Any] = {}
     if odometry is not None:
         found["odometry"] = odometry
     elif views is None or views[0].kind not in IMAGES:
         return {}
-    seen = views or touch
-    if seen is not None:
-        found["views" if views else "touch"] = seen[1]
+    seen = views[0] if views else None
+    if views is not None:
+        found["views"] = views[1]
+    elif touch is not None and isinstance(touch.shape, ValueShape):
+        seen, found["touch"] = touch, touch.name
+        low, high = touch.shape.low, touch.shape.high
+        if low < high and not (low >= 0 and high <= 1):
+            found["touch"] = {"topic": touch.name, "low": low, "high": high}
     if truth is not None:
         found["truth"] = truth.name
-    used = [topic for topic in (wheels, seen and seen[0], truth) if topic is not None]
+    used = [topic for topic in (wheels, seen, truth) if topic is not None]
     if not _headers_serve(used):
         found["clock"] = "bag"
-    if (
-        seen is not None
-        and wheels is not None
-        and seen[0].received.rate_hz > FASTER * wheels.received.rate_hz
-    ):
+    if seen is not None and wheels is not None and seen.received.rate_hz > 1.2 * wheels.received.rate_hz:
         found["samples"] = "views"
     return found
 
@@ -75,10 +75,10 @@ def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any,
 def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
     """The frames of the odometry and of the body of each robot in /tf; that with a view comes first."""
     found = []
-    for link in bag.links:
-        named = None if link.fixed or link.total < 2 else WHEELS.fullmatch(link.parent)
-        if named and link.child in [named[1] + body for body in (*BODIES, "base")]:
-            found.append((named[1], (link.parent, link.child)))
+    for parent, child, fixed, total in bag.links:
+        named = None if fixed or total < 2 else WHEELS.fullmatch(parent)
+        if named and child in [named[1] + body for body in (*BODIES, "base")]:
+            found.append((named[1], (parent, child)))
     views = _views(bag)
     frame = "" if views is None else views[0].frame
     return [pair for prefix, pair in sorted(found, key=lambda each: not frame.startswith(each[0]))]
@@ -90,22 +90,12 @@ def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
         if topic is not None:
             shape = topic.shape
             options: dict[str, Any] = {}
-            if isinstance(shape, ScanShape) and shape.beams < SECTORS:
+            if isinstance(shape, ScanShape) and shape.beams < 18:  # sectors of a view by default
                 options = {"rows": 1, "columns": shape.beams}
             if isinstance(shape, ScanShape) and shape.wider:
                 options["span"] = [round(angle, 4) for angle in shape.extent.span]
             return topic, {"topic": topic.name, **options} if options else topic.name
     return None
-
-
-def _touch(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
-    topic = _first(bag, "touch", [topic for topic in bag.topics if topic.kind != JOINTS])
-    if topic is None or not isinstance(topic.shape, ValueShape):
-        return None
-    low, high = topic.shape.low, topic.shape.high
-    if (low >= 0 and high <= 1) or not low < high:
-        return topic, topic.name
-    return topic, {"topic": topic.name, "low": low, "high": high}
 
 
 def _first(bag: BagDescription, role: str, topics: Sequence[TopicDescription]) -> TopicDescription | None:

@@ -1,6 +1,5 @@
-"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames.
-
-Poses and velocities in the messages of a topic.
+"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames; the poses and
+velocities in messages of other types, in the plane.
 """
 
 from __future__ import annotations
@@ -8,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from itertools import compress
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,7 +114,7 @@ Link = list[tuple[int, tuple[float, ...], tuple[float, ...], int]]
 """The transforms from a frame to a child frame: stamp in ns, (x, y, z) in m, quaternion (x, y, z, w), number
 of the message; one is enough for a fixed link."""
 Links = dict[tuple[str, str], Link]
-Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
+_Chain = list[tuple[tuple[str, str], bool]]  # links, each with whether it is followed downwards
 
 
 class Mount(NamedTuple):
@@ -161,7 +161,7 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
     return links
 
 
-def chain_between(links: Links, parent: str, child: str) -> Chain | None:
+def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
     neighbours: dict[str, list[tuple[str, tuple[str, str], bool]]] = {}
     for upper, lower in links:
@@ -197,20 +197,13 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     links: Links = {}
     for name in (STATIC, MOVING):
         links = read_links(bag, name, clock) | links
-        chains = (chain_between(links, each, sensor) for each in bodies)
+        chains = (_chain_between(links, each, sensor) for each in bodies)
         if (chain := next(filter(None, chains), None)) is not None:
             whole = np.eye(4)
             for frames, down in chain:
                 whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
             return Mount(whole[:3, :3], whole[:3, 3])
     return None
-
-
-class _Axes(NamedTuple):
-    x: float
-    y: float
-    z: float
-    w: float = 0.0
 
 
 def poses_between(
@@ -229,7 +222,7 @@ def poses_between(
         if frame not in there:
             raise missing_error(f"{bag.path}, {MOVING}", "frame", frame, there)
     where = f"{bag.path}, {MOVING} {parent} to {child}"
-    chain = chain_between(links, parent, child)
+    chain = _chain_between(links, parent, child)
     if chain is None:
         raise InputError(where, "frames that are not connected", f"a chain of links in {MOVING} or {STATIC}")
     moving = [pair for pair, _ in chain if len(links[pair]) > 1]
@@ -247,7 +240,13 @@ def poses_between(
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        given = [(_Axes(*shift), _Axes(*turn)) for _, shift, turn, _ in links[lead]]
+        given = [
+            (
+                SimpleNamespace(**dict(zip("xyz", shift, strict=True))),
+                SimpleNamespace(**dict(zip("xyzw", turn, strict=True))),
+            )
+            for _, shift, turn, _ in links[lead]
+        ]
         poses = [pose_in_plane(*pose, where, plane) for pose in given]
         errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
         return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)

@@ -1,8 +1,4 @@
-"""Views of a bag from scans, clouds and images.
-
-Grey images from Image and CompressedImage messages.
-
-Ranges of LaserScan and PointCloud2 messages as sectors.
+"""Views of a bag: Image and CompressedImage messages in grey, LaserScan and PointCloud2 messages as sectors.
 
 A beam is *measured* unless its range is NaN, -inf or below `range_min`. Of measured beams, +inf and ranges
 above `range_max` mean that nothing was there. A sector is the mean of min(range, max_range) / max_range over
@@ -27,10 +23,9 @@ from tactile.base.errors import InputError
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGES = (RAW, COMPRESSED)
-LUMA = {"y": 1000, "r": 299, "g": 587, "b": 114}  # per mille (BT.601), as Pillow weighs them
 LARGEST = 1 << 26  # pixels
 
-ENCODINGS: dict[str, tuple[str, str]] = {
+_ENCODINGS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("mono8", "8UC1"), ("u1", "y")),
     **dict.fromkeys(("mono16", "16UC1"), ("u2", "y")),
     **dict.fromkeys(("rgb8",), ("u1", "rgb")),
@@ -47,7 +42,7 @@ ENCODINGS: dict[str, tuple[str, str]] = {
     },
 }
 """Encodings of raw images: NumPy type and channels."""
-NO_DEPTH = "name a topic of grey or colour images with recording.topics.views"
+_NO_DEPTH = "name a topic of grey or colour images with recording.topics.views"
 
 
 def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
@@ -61,10 +56,10 @@ def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
 
 def _raw(message: Any, where: str) -> np.ndarray:
     if message.encoding in ("32FC1", "64FC1"):
-        raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", NO_DEPTH)
-    if message.encoding not in ENCODINGS:
-        raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(ENCODINGS)}")
-    number, channels = ENCODINGS[message.encoding]
+        raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", _NO_DEPTH)
+    if message.encoding not in _ENCODINGS:
+        raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(_ENCODINGS)}")
+    number, channels = _ENCODINGS[message.encoding]
     kind = np.dtype((">" if message.is_bigendian else "<") + number)
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
@@ -76,15 +71,14 @@ def _raw(message: Any, where: str) -> np.ndarray:
     pixels = np.ndarray((height, width, len(channels)), kind, data.tobytes(), strides=strides)
     if channels == "y":
         grey = (pixels[..., 0] >> 8).astype(np.uint8) if kind.itemsize == 2 else pixels[..., 0].copy()
-        return _without_mosaic(grey) if message.encoding.startswith("bayer") else grey
-    weights = np.array([LUMA.get(name, 0) for name in channels], np.int32)
+        if not message.encoding.startswith("bayer"):
+            return grey
+        # Means of each pixel and its right and lower neighbours, one of each colour of the Bayer filter.
+        near = np.pad(grey.astype(np.uint16), ((0, 1), (0, 1)), "reflect" if min(grey.shape) > 1 else "edge")
+        return ((near[:-1, :-1] + near[1:, :-1] + near[:-1, 1:] + near[1:, 1:] + 2) // 4).astype(np.uint8)
+    luma = {"y": 1000, "r": 299, "g": 587, "b": 114}  # per mille (BT.601), as Pillow weighs them
+    weights = np.array([luma.get(name, 0) for name in channels], np.int32)
     return ((pixels.astype(np.int32) @ weights + 500) // 1000).astype(np.uint8)
-
-
-def _without_mosaic(mosaic: np.ndarray) -> np.ndarray:
-    """[H, W] means of each pixel and its right and lower neighbours, one of each colour of the filter."""
-    near = np.pad(mosaic.astype(np.uint16), ((0, 1), (0, 1)), "reflect" if min(mosaic.shape) > 1 else "edge")
-    return ((near[:-1, :-1] + near[1:, :-1] + near[:-1, 1:] + near[1:, 1:] + 2) // 4).astype(np.uint8)
 
 
 def _decoded(message: Any, where: str) -> np.ndarray:
@@ -93,7 +87,7 @@ def _decoded(message: Any, where: str) -> np.ndarray:
     except ImportError:
         raise InputError("pillow", "not installed", "", "pip install 'ratslam[ros]'") from None
     if "compressedDepth" in message.format:
-        raise InputError(where, f"distances ({message.format})", "a grey or colour image", NO_DEPTH)
+        raise InputError(where, f"distances ({message.format})", "a grey or colour image", _NO_DEPTH)
     data = bytes(message.data)
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
@@ -113,10 +107,8 @@ def _decoded(message: Any, where: str) -> np.ndarray:
 
 
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
-RING_BEAMS = 360  # of a cloud: the nearest point of each degree
-POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""NumPy types of PointField.datatype."""
-COVERED = 0.5
+_RING_BEAMS = 360  # of a cloud: the nearest point of each degree
+_COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
 
@@ -174,7 +166,7 @@ def extent_of(message: Any, where: str) -> Extent:
 
 def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     """What scans cover together, in the order of the first; None if that is no more than the first covers, or
-    if most scans cover less than `COVERED` of it."""
+    if most scans cover less than `_COVERED` of it."""
     first = extents[0]
     if first.ring:
         return None
@@ -182,7 +174,7 @@ def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     middle, half = _wrapped(middle - first.middle), np.abs(width) / 2
     low, high = float((middle - half).min()), float((middle + half).max())
     whole = 2 * np.pi if any(extent.ring for extent in extents) else min(high - low, 2 * np.pi)
-    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < COVERED * whole:
+    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < _COVERED * whole:
         return None
     return Extent(first.middle + (low + high) / 2, float(np.copysign(whole, first.width)), float(step.max()))
 
@@ -266,10 +258,10 @@ def cloud_view(
     points = points @ mount.rotation.T + mount.position
     points = points[(heights[0] <= points[:, 2]) & (points[:, 2] <= heights[1])]
     turn = (np.arctan2(points[:, 1], points[:, 0]) + np.pi) / (2 * np.pi)
-    beams = np.full(RING_BEAMS, np.inf)
-    degree = np.minimum((turn % 1.0 * RING_BEAMS).astype(int), RING_BEAMS - 1)
+    beams = np.full(_RING_BEAMS, np.inf)
+    degree = np.minimum((turn % 1.0 * _RING_BEAMS).astype(int), _RING_BEAMS - 1)
     np.minimum.at(beams, degree, np.hypot(points[:, 0], points[:, 1]))
-    return _fan_view(beams, np.ones(RING_BEAMS, bool), pixels, max_range)
+    return _fan_view(beams, np.ones(_RING_BEAMS, bool), pixels, max_range)
 
 
 def cloud_points(message: Any, where: str) -> np.ndarray:
@@ -287,7 +279,17 @@ def cloud_points(message: Any, where: str) -> np.ndarray:
     try:
         if height * width * step > len(data):
             raise ValueError("too few")
-        kinds = [order + POINT_TYPES[fields[name].datatype] for name in "xyz"]
+        types = {
+            1: "i1",
+            2: "u1",
+            3: "i2",
+            4: "u2",
+            5: "i4",
+            6: "u4",
+            7: "f4",
+            8: "f8",
+        }  # PointField.datatype
+        kinds = [order + types[fields[name].datatype] for name in "xyz"]
         offsets = [fields[name].offset for name in "xyz"]
         kind = np.dtype({"names": list("xyz"), "formats": kinds, "offsets": offsets, "itemsize": step})
         rows = np.ndarray((height, width), kind, data.tobytes(), strides=(row, step))
@@ -345,7 +347,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         raise InputError(where, f"messages of type {topic.kind}", expected)
     reader = _RangeReader(bag, topic, config, body, clock)
     read = list(read_usable(bag, topic, clock, reader.view))
-    rows = [row for row in read if row[2] is not None and row[2].covered >= COVERED]
+    rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
     empty = sum(view is None for *_, view in read)
     for count, fault in (
         (empty, "have no measured range"),

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.papers.salman2016.paper_figures import (
-    DrivenPath,
     ExperienceHistory,
-    MeasuredQuantity,
     draw_curves,
     draw_directions,
     draw_drift,
@@ -33,7 +31,7 @@ EDGE = np.linspace(0, 1, 11)
 
 
 def drift():
-    return draw_drift("a", "b", {"white": DrivenPath(WAY, WAY + 1, np.repeat([0, 1], 20))})
+    return draw_drift("a", "b", {"white": (WAY, WAY + 1, np.repeat([0, 1], 20))})
 
 
 def experiences():
@@ -44,8 +42,8 @@ def measured():
     values = {"classic": np.array([[0.1, 0.2], [0.3, np.nan]]), "ours": np.full((2, 2), np.nan)}
     paper = np.array([0.15, np.nan])
     quantities = [
-        MeasuredQuantity("ARR", values, paper),
-        MeasuredQuantity("EM", values, np.full(2, np.nan), log=True),
+        ("ARR", values, paper, False),
+        ("EM", values, np.full(2, np.nan), True),
     ]
     return draw_measured("a", "b", ["open", "RCP"], quantities)
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from evaluation.papers.tables.grid_table import GridFigures, GridTask, measure_session
+from evaluation.papers.tables.grid_table import GridFigures, measure_session
 
 ONE, FEW, MANY = (9100,), (9100, 9101), tuple(range(9100, 9108))
 ARENAS = pytest.mark.parametrize("arenas", [ONE, pytest.param(FEW, marks=pytest.mark.soak)])
@@ -15,7 +15,7 @@ ARENAS = pytest.mark.parametrize("arenas", [ONE, pytest.param(FEW, marks=pytest.
 
 @cache
 def sessions(row: str, arenas: tuple[int, ...] = FEW) -> list[GridFigures]:
-    return [measure_session(GridTask("A", row, arena)) for arena in arenas]
+    return [measure_session(("A", row, arena)) for arena in arenas]
 
 
 def ratio(row: str, arenas: tuple[int, ...] = FEW) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.papers.tables import health
-from evaluation.papers.tables.health import HealthTask, JudgedMaps, fit_weights
+from evaluation.papers.tables.health import JudgedMaps, fit_weights
 
 ROOT = Path(__file__).parents[4]
 
@@ -46,6 +46,6 @@ def test_every_second_session_tests_the_regression(monkeypatch):
 
 @pytest.mark.parametrize("row", health.TOUCH)
 def test_rows_are_valid_configurations(row):
-    config, touch = health.task_config(HealthTask(row, 3, ROOT))
+    config, touch = health.task_config(row, 3, ROOT)
     assert touch
     assert config.simulation.maze.seed == health.FIRST_MAZE + 3

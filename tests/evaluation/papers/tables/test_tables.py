@@ -70,7 +70,7 @@ def test_new_ground_enters_no_cell_twice_and_differs_by_maze():
 
 @pytest.mark.parametrize("row", grid.ROWS)
 def test_grid_rows_are_valid_configurations(row):
-    assert grid.task_config(grid.GridTask("A", row, 9003)).create_simulation.seed == 9003
+    assert grid.task_config("A", row, 9003).create_simulation.seed == 9003
 
 
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
@@ -112,7 +112,7 @@ def test_kidnaps_and_the_change_of_mazes_are_reported_below_the_touch_table(monk
 def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
     tasks = stub_sessions(monkeypatch, grid, lambda task: ARENA)
     _, row = grid.grid_table([("A", "bias")], arenas=2, first=7)
-    assert [task.arena for task in tasks] == [7, 8]
+    assert tasks == [("A", "bias", 7), ("A", "bias", 8)]
     assert "| 0.200 m | 0.020 | 0.10 | 2, 2 of 2 | 10.5 degrees, 50%, 50% |" in row
 
 
@@ -132,11 +132,12 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_sequences_by_their_m
         turn=np.radians([0.0, 0.0, 0.0, 31.0, 31.0, 0.0]),
         log_odds=np.array([1.0, 1.0, 1.0, -2.0, -2.0, -2.0]),
     )
-    assert buildings.is_false(claims.distance, claims.turn).tolist() == [0, 0, 1, 1, 1, 0]
-    assert buildings.judge_sequences(claims).tolist() == [[True, False], [False, True]]
-    assert buildings.sequence_odds(claims).tolist() == [1.0, -2.0]
+    false, sequences, odds = buildings.judge_claims(claims)
+    assert false.tolist() == [0, 0, 1, 1, 1, 0]
+    assert sequences.tolist() == [[True, False], [False, True]]
+    assert odds.tolist() == [1.0, -2.0]
     unknown = claims._replace(distance=np.array([0.0, np.nan, 2.1, 0.0, 0.0, 0.0]))
-    np.testing.assert_equal(buildings.sequence_odds(unknown), [np.nan, -2.0])
+    np.testing.assert_equal(buildings.judge_claims(unknown)[2], [np.nan, -2.0])
 
 
 def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(monkeypatch):
@@ -153,9 +154,9 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
         np.array([4.0, np.nan, -4.0]),
     )
     harmed = harmless._replace(odometry=2.0, final=2.5, live=2.0)
-    tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task.seed == 2 else harmless)
+    tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task[2] == 2 else harmless)
     _, lab, ids, _, total, note = buildings.buildings_table(rows, copies=2, folder=ROOT)
-    assert [(task.copies, task.seed) for task in tasks[:3]] == [("miscalibrated", seed) for seed in range(3)]
+    assert [task[1:] for task in tasks[:3]] == [("miscalibrated", seed) for seed in range(3)]
     assert lab == (
         "| lab | 10.00 | 1.00 | 10.80 | 1.75, 2.50 | 6.40, 10.80 | 1.25 | 1, 0 of 3 | 1 / 2 | 3 / 6 | 3 / 6 |"
     )
@@ -173,8 +174,8 @@ def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
     monkeypatch.setenv(recordings.DATA, ".")
     rows = buildings.choose_rows(["create"])
     lines = list(buildings.buildings_table(rows, copies=2, folder=ROOT))
-    configs = [task.config for task in tasks]
-    assert [task.seed for task in tasks] == [0] * 9
+    configs = [task[0] for task in tasks]
+    assert [task[2] for task in tasks] == [0] * 9
     assert len({config.recall.sector_fov for config in configs}) == 3
     assert {round(config.pose_cells.cell_size / config.experience.match_sd, 9) for config in configs} == {1.0}
     assert {config.pose_cells.cell_size for config in configs} == {0.15, 0.3, 0.6}
@@ -255,7 +256,7 @@ def test_the_command_refuses_unknown_rows(capsys):
 
 
 def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
-    for name, value in {"SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
+    for name, value in {"BATCH_SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
         monkeypatch.setattr(speed, name, value)
     lines = list(speed.batch_table(sets=10, sessions=3, steps=40, rounds=1, folder=ROOT))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
@@ -283,7 +284,7 @@ def test_the_parts_of_a_cycle_add_up_to_its_time():
     header, *lines = cycles.profile_table(["square"], folder=ROOT)
     assert "square, recall" in header
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    assert [name for name, *_ in rows] == [*cycles.VERBS, "all"]
+    assert [name for name, *_ in rows] == [*cycles.PARTS, "all"]
     parts = {name: float(recall) for name, recall, _ in rows}
     whole = parts.pop("all")
     assert sum(parts.values()) == pytest.approx(whole, abs=len(parts))

@@ -45,7 +45,7 @@ def templates(folder: Path) -> StrainTemplates:
 
 def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
     """Errors [drives, DURATIONS] of one estimator, at trained angles or between them."""
-    return np.array([one.error[:, ESTIMATORS.index(way)] for one in drives if one.known == known])
+    return np.array([error[:, ESTIMATORS.index(way)] for _, there, error in drives if there == known])
 
 
 @pytest.mark.soak
@@ -61,8 +61,8 @@ def test_the_file_follows_from_the_seed(templates: StrainTemplates) -> None:
 
 def test_walls_without_training_are_recognised(templates: StrainTemplates) -> None:
     tried = drive_held_out(CONFIG, templates)
-    assert [one.known for one in tried] == [True, False] * 14 + [True]
-    assert np.allclose([one.angle for one in tried], np.arange(20, 161, 5))
+    assert [known for _, known, _ in tried] == [True, False] * 14 + [True]
+    assert np.allclose([angle for angle, _, _ in tried], np.arange(20, 161, 5))
     assert errors(tried, "winner", True).mean() < 2
     # Between two templates the error of the nearer one is at least half a step.
     between = errors(tried, "winner", False)
@@ -86,7 +86,7 @@ def test_the_report_marks_large_errors_and_missing_walls() -> None:
     far, unknown = error.copy(), error.copy()
     far[0, 0], unknown[:, 2] = 12.3, np.nan
     lines = render_drives(
-        [HeldOutDrive(20.0, True, far), HeldOutDrive(25.0, False, unknown), HeldOutDrive(30.0, True, error)],
+        [(20.0, True, far), (25.0, False, unknown), (30.0, True, error)],
         4,
     ).splitlines()
     assert lines[2].split()[:3] == ["20", "!", "12.3"]
