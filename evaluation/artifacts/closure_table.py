@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.artifacts.run_reader import first_step
-from tactile.base.files import read_rows
+from tactile.base.bounded import read_rows
 
 ACCEPTED = "accepted"
 """Verdict on the closures of the map."""

@@ -16,8 +16,9 @@ import numpy as np
 import yaml
 
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid
+from tactile.base.bounded import read_npz, read_plain_yaml
 from tactile.base.errors import InputError, os_errors_of
-from tactile.base.files import read_npz, read_plain_yaml, write_atomically, write_text_atomically
+from tactile.base.files import write_atomically, write_text_atomically
 
 
 def read_grid(path: str | Path) -> OccupancyGrid:

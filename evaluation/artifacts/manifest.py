@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactile.base.files import read_json
+from tactile.base.bounded import read_json
 
 SESSION_REPORT = "live.json"
 """Report of a live session, written when it has ended."""

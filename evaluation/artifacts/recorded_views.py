@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile.base.files import read_npz
+from tactile.base.bounded import read_npz
 
 NAME = "closure_views.npz"
 

@@ -17,8 +17,8 @@ from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
+from tactile.base.bounded import read_json, read_npz, read_text
 from tactile.base.errors import InputError
-from tactile.base.files import read_json, read_npz, read_text
 
 PIECES = "pieces.csv"
 PIECE_COLUMNS = ("t", "piece")

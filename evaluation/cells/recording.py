@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactile.base.files import read_npz, write_atomically
+from tactile.base.bounded import read_npz
+from tactile.base.files import write_atomically
 
 NAME = "cells.npz"
 """The file in a run directory."""

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
-from tactile.base.files import read_text
 
 LONGEST = 80
 """Characters of a bad row that an error shows."""

@@ -21,7 +21,7 @@ from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
 from evaluation.plots.map_plot import Layers, draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
-from tactile.base.files import read_json
+from tactile.base.bounded import read_json
 from tactile.base.se2 import between
 
 if TYPE_CHECKING:

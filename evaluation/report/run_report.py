@@ -29,8 +29,8 @@ from evaluation.metrics.trajectory import read_tum
 from evaluation.plots.map_plot import Layers
 from evaluation.report.run_files import list_run_files
 from evaluation.report.verdict import Verdict, judge_map
+from tactile.base.bounded import read_json, read_plain_yaml, read_text
 from tactile.base.errors import InputError
-from tactile.base.files import read_json, read_plain_yaml, read_text
 from tactile.base.se2 import between
 
 SOURCES = {

@@ -115,7 +115,7 @@ def _render_scores(path: Path, card: Scorecard) -> str:
     """All figures as text: the table, that of the grid in a run directory with one, warnings and health."""
     from evaluation.metrics.occupancy_score import GridScore, render_grid_scores
     from evaluation.metrics.scorecard import render_health, render_scorecard, render_warnings
-    from tactile.base.files import read_json
+    from tactile.base.bounded import read_json
 
     parts, grid = [render_scorecard(card)], path / "gridscore.json"
     if grid.exists():

@@ -1,4 +1,4 @@
-"""How JAX and Numba compile: precision, flags of the compiler, kernels kept on disk, compiled loops.
+"""How JAX compiles: precision, flags of the compiler, kernels kept on disk.
 
 Importing ratslam changes no setting of JAX. A program calls `prepare_precision` before it makes a `Session`;
 `ratslam.runs` does so for every run. JAX reads XLA_FLAGS of the environment when it first computes, for the
@@ -11,27 +11,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
-
-import jax
-import numba
-
-from tactile.base.se2 import wrap
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def compiled(function: Function) -> Function:
-    """The function compiled at its first call, or loaded from the cache of an earlier process; it releases
-    Python's global lock."""
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-
-
-wrapped = compiled(wrap)
-"""`tactile.base.se2.wrap` of one angle, for compiled loops."""
-
+from typing import Literal
 
 CPUINFO = Path("/proc/cpuinfo")
 FOLDER = "jax_compilation_cache_dir"
@@ -55,6 +36,8 @@ def cache_settings() -> dict[str, str | int]:
 
 def keep_kernels() -> None:
     """Lets JAX keep compiled kernels on disk, unless the program has chosen a folder for them."""
+    import jax
+
     if not getattr(jax.config, FOLDER):
         for name, value in cache_settings().items():
             jax.config.update(name, value)
@@ -65,6 +48,8 @@ Precision = Literal["float64", "float32"]
 
 def prepare_precision(precision: Precision) -> None:
     """Enables JAX's 64-bit types for `float64`; `float32` works with them enabled or not."""
+    import jax
+
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
 

@@ -17,7 +17,7 @@ import numpy as np
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.backend import Evidence
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import NEAR, GainPrior
 from ratslam.mapping.odometry_calibration import NO_ESTIMATE, BiasEstimate, SectorFan
 from ratslam.recall.memory import NO_LIKENESS

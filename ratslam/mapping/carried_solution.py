@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import GrowableArray
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.closure_selection import (
     CUT,
     MapHypotheses,

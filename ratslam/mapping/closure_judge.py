@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import expit
 
 from ratslam.core.arrays import GrowableArray
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict

@@ -12,7 +12,7 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compilation import compiled, wrapped
+from ratslam.core.compiled import compiled, wrapped
 from ratslam.core.estimates import Action
 from tactile.base.se2 import between, compose
 

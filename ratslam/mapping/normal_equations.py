@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 
 
 class BlockPattern:

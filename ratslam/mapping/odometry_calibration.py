@@ -20,7 +20,7 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, System
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.optimizer import CalibrationPrior
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compilation import compiled
+from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import (
     DEVIATIONS,
     LEAVING,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.checkpoint import Checkpointed
-from ratslam.core.compilation import compiled, wrapped
+from ratslam.core.compiled import compiled, wrapped
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate
 from ratslam.mapping.optimizer import MapFit

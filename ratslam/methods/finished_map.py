@@ -9,8 +9,8 @@ from typing import TypeVar
 from ratslam.core.backend import Map
 from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.methods.config import LocaliseConfig
+from tactile.base.bounded import NPZ_SPOILT, malformed, read_arrays
 from tactile.base.errors import InputError
-from tactile.base.files import NPZ_SPOILT, malformed, read_arrays
 
 FinishedMap = TypeVar("FinishedMap", bound=Map)
 

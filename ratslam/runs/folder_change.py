@@ -15,8 +15,9 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError, InputErrors
-from tactile.base.files import errors_of, flush_to_disk, read_json, write_text_atomically
+from tactile.base.files import errors_of, flush_to_disk, write_text_atomically
 
 READY = ".change"
 """Folder of a complete change within the folder that it changes."""

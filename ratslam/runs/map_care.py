@@ -24,8 +24,9 @@ from ratslam.runs.map_results import rewrite_results
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
 from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.files import make_new_file, malformed, require_writable
+from tactile.base.files import make_new_file, require_writable
 
 CURES = {
     Obstacle.NOT_ACCEPTED: "`ratslam map info {path} --json` lists them",

@@ -28,8 +28,9 @@ from ratslam.runs.settings.run_config import LoopConfig, RunConfig
 from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate
 from robot.sources.source import Source, SourceDescription, describe
 from robot.touch_source import TouchSource
+from tactile.base.bounded import NPZ_SPOILT, malformed, read_arrays, reason
 from tactile.base.errors import InputError
-from tactile.base.files import NPZ_SPOILT, flush_to_disk, malformed, read_arrays, reason, write_atomically
+from tactile.base.files import flush_to_disk, write_atomically
 
 FORMAT = "ratslam-map-3"
 """Name and version of the format; a later version reads it."""

@@ -21,8 +21,9 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Sample, Source, SourceDescription, SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
+from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.files import malformed, require_new_file
+from tactile.base.files import require_new_file
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 from tactile.frontend import TouchConfig
 from tactile.whisker_geometry import ur10_head

@@ -21,8 +21,8 @@ from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.service.recording_check import Diagnosis
 from robot.live.polling import SessionFault
 from robot.live.selftest import check_arm_session, check_create
+from tactile.base.bounded import read_rows
 from tactile.base.errors import InputError
-from tactile.base.files import read_rows
 from tactile.base.se2 import between
 
 SAME = 0.99

@@ -24,8 +24,8 @@ from evaluation.cells.recording import CellRecording
 from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig
 from ratslam.classic.levels import to_full_torus, window_levels
+from tactile.base.bounded import read_npz
 from tactile.base.errors import InputError
-from tactile.base.files import read_npz
 from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 from tactile.base.types import Odometry

@@ -12,8 +12,8 @@ from robot.recordings.sanity_checks import RowName, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
 from robot.sources.source import PlanarWhiskersInfo, SourceInfo
+from tactile.base.bounded import MOST_PIXELS
 from tactile.base.errors import InputError
-from tactile.base.files import MOST_PIXELS
 
 
 @dataclass(eq=False)

@@ -42,7 +42,7 @@ from robot.recordings.cdr import (
 )
 from robot.sources.input_files import unreadable_error
 from robot.sources.source import Sample, SourceInfo
-from tactile.base.files import MOST_BYTES
+from tactile.base.bounded import MOST_BYTES
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
 _DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)

@@ -24,8 +24,8 @@ from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
 from robot.sources.odometry import TURN_THEN_MOVE, from_velocities
 from robot.sources.source import SourceInfo
+from tactile.base.bounded import NPZ_SPOILT, check_size, read_arrays, reason
 from tactile.base.errors import InputError
-from tactile.base.files import NPZ_SPOILT, check_size, read_arrays, reason
 
 VIEW, ODOMETRY = 1, 2
 COLUMNS = ("in_t", "in_v", "in_w", "in_flags")

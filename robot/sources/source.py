@@ -16,8 +16,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, runtime
 import numpy as np
 from pydantic import Field, NonNegativeInt, PlainSerializer, PlainValidator, PositiveFloat
 
+from tactile.base.bounded import SPOILT, reason
 from tactile.base.errors import InputError
-from tactile.base.files import SPOILT, reason
 from tactile.base.plugins import Registry
 from tactile.base.settings import Settings
 from tactile.calibration import Calibration

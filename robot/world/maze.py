@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from robot.world.walls import Walls
+from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
-from tactile.base.files import read_text
 
 CELL_SIDE = 0.18
 """Side length of a cell, m (IEEE micromouse rules)."""

@@ -17,8 +17,8 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
+from tactile.base.bounded import read_npz
 from tactile.base.errors import InputError
-from tactile.base.files import read_npz
 from tactile.base.settings import Settings
 from tactile.base.types import Report
 from tactile.whisker_geometry import PlanarWhiskers

@@ -34,8 +34,9 @@ import numpy as np
 
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.machine import code_digest
+from tactile.base.bounded import read_rows
 from tactile.base.errors import InputError
-from tactile.base.files import read_rows, write_text_atomically
+from tactile.base.files import write_text_atomically
 
 KEY = ("row", "session", "code")
 """The first columns of a file."""

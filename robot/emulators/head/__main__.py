@@ -11,8 +11,8 @@ from pathlib import Path
 
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.emulators.head.server import serve
+from tactile.base.bounded import read_json
 from tactile.base.errors import InputError
-from tactile.base.files import read_json
 
 
 def main(words: list[str] | None = None) -> int:

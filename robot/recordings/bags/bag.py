@@ -24,8 +24,8 @@ import zstandard
 from robot.recordings.input_judge import GAP, LEAST_GAP
 from robot.recordings.sanity_checks import WHOLE, Stretch, leave_out
 from robot.sources.input_files import missing_error, raise_errors, require_file, unreadable_error
+from tactile.base.bounded import check_size, expand
 from tactile.base.errors import InputError
-from tactile.base.files import check_size, expand
 
 
 def _zstd(file: IO[bytes]) -> IO[bytes]:

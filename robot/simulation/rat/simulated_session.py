@@ -36,8 +36,8 @@ from robot.sources.in_memory import (
 )
 from robot.sources.input_files import digest_of, raise_errors, require_file
 from robot.sources.source import SourceInfo
+from tactile.base.bounded import read_npz
 from tactile.base.errors import InputError
-from tactile.base.files import read_npz
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
 from tactile.base.settings import Settings
