@@ -1,4 +1,8 @@
-"""The table of agreement: scores of recorded cells beside those of opexebo and pynapple."""
+"""The table of agreement: scores of recorded pose cells beside those of opexebo and pynapple.
+
+Each package gets the same maps in its own convention; `grid_score`, `border_score` and `mutual_information`
+call the packages so. They are also what the tests of `evaluation/cells` compare its scores with.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +70,7 @@ def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
     Raises:
         InputError: a package is not installed.
     """
-    opexebo, pynapple = load_package("opexebo"), load_package("pynapple")
+    opexebo, pynapple = _load_package("opexebo"), _load_package("pynapple")
     count = task.sessions or CELLS
     recording = with_active_cells(record_rat("rat", 2 * count, seconds=seconds, seed=task.first), count)
     rates = recording.activity * float(np.prod(recording.shape))
@@ -137,11 +141,11 @@ FIGURE = CellFigure(
     "Agreement with other packages", compare_scores, lambda result: list(agreement_table(result)), None
 )
 
-
 HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
+"""How each package is installed."""
 
 
-def load_package(name: str) -> ModuleType:
+def _load_package(name: str) -> ModuleType:
     """A package of `HOW`.
 
     Raises:
