@@ -197,7 +197,7 @@ PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "s
 """Columns of parameter sets, and the ranges of a `CellPlan`."""
 
 
-class CellStudy(NamedTuple):
+class _CellStudy(NamedTuple):
     """A checked study. parameters: [sets, 6] in the order of `PARAMETERS`."""
 
     name: str
@@ -223,7 +223,7 @@ class _Chunk(NamedTuple):
         return content.hexdigest()[:16]
 
 
-def cell_study(path: Path, overrides: Sequence[str] = ()) -> CellStudy:
+def cell_study(path: Path, overrides: Sequence[str] = ()) -> _CellStudy:
     """The study of a configuration file; reads its session.
 
     Args:
@@ -237,7 +237,7 @@ def cell_study(path: Path, overrides: Sequence[str] = ()) -> CellStudy:
     plan = validate(override(empty, own), CellPlan)
     config = load_config(path, [text for text in overrides if text not in own])
     course = read_course(config, plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
-    return CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
+    return _CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
 
 
 def parameter_sets(plan: CellPlan) -> np.ndarray:
@@ -249,7 +249,7 @@ def parameter_sets(plan: CellPlan) -> np.ndarray:
 
 
 def run_cell_study(
-    study: CellStudy, folder: Path, executor: Executor, done: Callable[[int], object] = lambda sets: None
+    study: _CellStudy, folder: Path, executor: Executor, done: Callable[[int], object] = lambda sets: None
 ) -> _SetScores:
     """The scores of all parameter sets, in their order; each chunk is on disk before it counts as done.
 
@@ -280,7 +280,7 @@ def run_cell_study(
     return _SetScores(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def tasks_of(study: CellStudy) -> list[_Chunk]:
+def tasks_of(study: _CellStudy) -> list[_Chunk]:
     """The chunks of a study."""
     plan = study.plan
     first = range(0, len(study.parameters), plan.chunk)
@@ -384,7 +384,7 @@ decoding: mean distance on the torus. reseeded: share of steps at which activity
 of steps that needed more than the smallest window. Rank correlations are Spearman's, over all sets."""
 
 
-def render_cells(study: CellStudy, scores: _SetScores) -> str:
+def render_cells(study: _CellStudy, scores: _SetScores) -> str:
     """Best, median and worst set by drift, and the rank correlations, as Markdown."""
     table = [["", "set", *(f"{name} {unit}".strip() for name, unit in UNITS.items())]]
     columns = _columns(study, scores)
@@ -401,7 +401,7 @@ def render_cells(study: CellStudy, scores: _SetScores) -> str:
     return "\n".join([render_table(table), "", render_table(links), "", NOTE, _describe(study)])
 
 
-def save_cells(study: CellStudy, scores: _SetScores, folder: Path) -> list[Path]:
+def save_cells(study: _CellStudy, scores: _SetScores, folder: Path) -> list[Path]:
     """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
     decoding.png and maps.png."""
     columns = _columns(study, scores)
@@ -427,7 +427,7 @@ def save_cells(study: CellStudy, scores: _SetScores, folder: Path) -> list[Path]
     return paths
 
 
-def _figures(study: CellStudy, scores: _SetScores) -> dict:
+def _figures(study: _CellStudy, scores: _SetScores) -> dict:
     columns, line = _columns(study, scores), _describe(study)
     parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
     rows = {name: scores.maps[k] for name, k in _chosen(scores).items()}
@@ -453,12 +453,12 @@ def _chosen(scores: _SetScores) -> dict[str, int]:
     return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
 
 
-def _columns(study: CellStudy, scores: _SetScores) -> dict[str, np.ndarray]:
+def _columns(study: _CellStudy, scores: _SetScores) -> dict[str, np.ndarray]:
     parameters = dict(zip(PARAMETERS, study.parameters.T, strict=True))
     return {name: parameters[name] if name in parameters else getattr(scores, name) for name in UNITS}
 
 
-def _describe(study: CellStudy) -> str:
+def _describe(study: _CellStudy) -> str:
     course, config = study.course, study.course.config
     side = course.x_edges[-1] - course.x_edges[0]
     torus = config.cells_xy * config.cell_size

@@ -309,7 +309,7 @@ PACES = {"live": "one step at a time", "replay": "a chunk of steps at a time"}
 
 
 @dataclass(frozen=True)
-class Report:
+class _Report:
     """The outcome of a study."""
 
     name: str  # of the study
@@ -323,7 +323,7 @@ class Report:
 
 def make_report(
     name: str, plan: StudyPlan, records: Sequence[RunRecord], error: str | None = None, search: bool = False
-) -> Report:
+) -> _Report:
     """The report of a study's records.
 
     Args:
@@ -346,10 +346,10 @@ def make_report(
     seeds = len({record.seed for record in records})
     measured = describe_machines(machines, seeds) | {"pace": PACES[plan.pace]}
     columns = list(dict.fromkeys(columns))
-    return Report(name, kind, columns, rows, error, measured, [*remarks, *find_disturbances(machines)])
+    return _Report(name, kind, columns, rows, error, measured, [*remarks, *find_disturbances(machines)])
 
 
-def render(report: Report) -> str:
+def render(report: _Report) -> str:
     """The table and its notes as Markdown; Pareto-optimal rows are bold. Of a search only those are shown."""
     names = [name for name in report.columns if any(name in row.spreads for row in report.rows)]
     table = [["", "runs", "steps", *(f"{name} {METRICS[name].unit}".strip() for name in names)]]
@@ -374,7 +374,7 @@ def render_table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *others])
 
 
-def _draw(report: Report) -> Figure | None:
+def _draw(report: _Report) -> Figure | None:
     """Time per step against error; an error that is better high is taken from 1."""
     if report.error is None:
         return None
@@ -395,7 +395,7 @@ def _draw(report: Report) -> Figure | None:
     return draw_pareto(title, below, marks, "time per step (us), median", error_text)
 
 
-def save_report(report: Report, directory: Path) -> list[Path]:
+def save_report(report: _Report, directory: Path) -> list[Path]:
     """Writes table.csv, table.json and table.md, and pareto.png where there is something to _draw."""
     content = json.dumps(asdict(report), indent=1, allow_nan=False) + "\n"
     paths = [directory / f"table.{kind}" for kind in ("csv", "json", "md")]
@@ -433,7 +433,7 @@ def _title(name: str) -> str:
     return f"{name}: {METRICS[name].label.strip()}"
 
 
-def _note(report: Report) -> str:
+def _note(report: _Report) -> str:
     kind = "Means ± standard deviation" if report.kind in MEANS else "Medians"
     note = f"{kind} over runs (worst)" + ", and the difference from the first row" * (report.kind in COMPARED)
     note += f"; {'; '.join(report.measured.values())}."
@@ -496,7 +496,7 @@ def _kept(rows: Sequence[_Row], limit: float | None) -> list[str]:
     return [f"{kept} of {len(others)} rows ({kept / len(others):.0%}) end at an ATE of {most:.3g} m or less"]
 
 
-def _csv(report: Report) -> str:
+def _csv(report: _Report) -> str:
     lines = []
     for row in report.rows:
         cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}

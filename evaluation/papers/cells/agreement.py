@@ -46,7 +46,7 @@ CELLS, GOAL = 100, 1e-6
 COLUMNS = ("score", "package", "cells", "largest difference", "goal", "largest score")
 
 
-class Agreement(NamedTuple):
+class _Agreement(NamedTuple):
     """One score. mine, theirs: [n] of the same cells, NaN where undefined."""
 
     score: str
@@ -61,7 +61,7 @@ class Agreement(NamedTuple):
         return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
 
 
-def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
+def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[_Agreement]:
     """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps.
 
     Args:
@@ -80,7 +80,7 @@ def compare_scores(task: CellTask, seconds: float = SECONDS) -> list[Agreement]:
         return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
 
 
-def agreement_table(result: list[Agreement]) -> Iterator[str]:
+def agreement_table(result: list[_Agreement]) -> Iterator[str]:
     """The lines of the table."""
     yield (
         "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
@@ -93,7 +93,7 @@ def agreement_table(result: list[Agreement]) -> Iterator[str]:
         yield markdown_row([one.score, one.package, len(one.mine), found, f"{GOAL:.0e}", largest])
 
 
-def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
     analysis, maps, curves = opexebo.analysis, rate_maps(sums, 1.5), tuning_curves(sums)
     masked = [np.ma.masked_invalid(each) for each in maps]
     seconds = np.ma.masked_where(np.isnan(maps[0]), sums.seconds)
@@ -105,32 +105,32 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement
         "peak of the map": (peak_rate, "peak_rate"),
     }
     for name, (score, key) in named.items():
-        yield Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
+        yield _Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
     plain = np.nan_to_num(rate_maps(sums, 0.0))
     framed = neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
     theirs = _numbers(analysis.rate_map_coherence(np.ma.masked_invalid(each)) for each in plain)
-    yield Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
+    yield _Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
     tuned = [analysis.tuning_curve_stats(np.ma.masked_invalid(each)) for each in curves]
     vector = mean_vector_length(curves, sums.heading_seconds)
-    yield Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
+    yield _Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
     fields = find_fields(maps)
     own = np.unique(fields.cell)
     theirs = _numbers(border_score(opexebo, maps, fields, cell) for cell in own)
-    yield Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
+    yield _Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
     images = autocorrelogram(np.nan_to_num(maps))
     theirs = _numbers(grid_score(opexebo, image) for image in images)
-    yield Agreement("grid score", "opexebo", lattice_scores(images), theirs)
+    yield _Agreement("grid score", "opexebo", lattice_scores(images), theirs)
 
 
-def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
     for what, rates, seconds in (
         ("place", rate_maps(sums, 1.5), sums.seconds),
         ("heading", tuning_curves(sums), sums.heading_seconds),
     ):
         theirs = mutual_information(pynapple, rates, seconds)
         mine = information(rates, seconds), information_rate(rates, seconds)
-        yield Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
-        yield Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
+        yield _Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
+        yield _Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
 
 
 def _numbers(values: Iterator[Any]) -> np.ndarray:

@@ -296,7 +296,36 @@ def draw_result(result: _Boxes, png: Path) -> None:
         f"Box {side:g} m, torus {torus:g} m (ratio {side / torus:.2f}). Mean "
         f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
     )
-    _draw_boxes("Rate maps in two boxes", line, rows, torus, pairs, png)
+    step = SIDE + GAP
+    height = style.TOP + 0.2 + len(rows) * step + 0.75 + HEIGHT + LOW
+    figure = style.new_figure(height, "Rate maps in two boxes", line)
+    for k, (name, maps) in enumerate(rows.items()):
+        bottom = height - style.TOP - 0.2 - SIDE - k * step
+        figure.text(
+            (MARGIN - 0.12) / style.WIDTH, (bottom + SIDE / 2) / height, name, ha="right", va="center",
+            fontsize=9, color=style.INK,
+        )  # fmt: skip
+        for column, rates in enumerate(maps[:SHOWN]):
+            axes = style.add_axes(figure, MARGIN + column * step, bottom, SIDE, SIDE)
+            peak = max(np.nanmax(rates), np.finfo(float).tiny)
+            image = axes.imshow(
+                rates / peak, origin="lower", extent=(0, torus, 0, torus), cmap="viridis", vmin=0, vmax=1
+            )
+            axes.set(xticks=[], yticks=[])
+            if k == 0:
+                axes.set_title(f"column {column + 1}", fontsize=7.5, color=style.LABEL_GREY, pad=3)
+    top = height - style.TOP - 0.2 - len(rows) * step
+    bar = style.add_axes(figure, MARGIN + SHOWN * step - GAP + 0.06, top + GAP, 0.08, len(rows) * step - GAP)
+    figure.colorbar(image, cax=bar, ticks=(0, 1))
+    bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
+    figure.text(
+        MARGIN / style.WIDTH, (top - 0.08) / height,
+        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited or outside the box",
+        fontsize=7.5, color=style.LABEL_GREY,
+    )  # fmt: skip
+    axes = _draw_histograms(figure, pairs)
+    style.add_legend(figure, axes, columns=3)
+    figure.savefig(png)
 
 
 def _correlations(fits: list[_MapFit], field: str) -> np.ndarray:
@@ -326,51 +355,6 @@ HEIGHT, LOW = 1.7, 0.95
 """Inches: of a histogram, below it."""
 COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
 BINS = np.linspace(-1.0, 1.0, 41)
-
-
-def _draw_boxes(
-    title: str,
-    line: str,
-    rows: Mapping[str, np.ndarray],
-    torus: float,
-    pairs: Mapping[str, Mapping[str, np.ndarray]],
-    png: Path,
-) -> None:
-    """Draws rows of maps [n, N, N] on the torus and a histogram for each of the pairs.
-
-    Args:
-        torus: side of the torus, m. pairs: by title, correlations [n] of pairs of maps by name.
-    """
-    step = SIDE + GAP
-    height = style.TOP + 0.2 + len(rows) * step + 0.75 + HEIGHT + LOW
-    figure = style.new_figure(height, title, line)
-    for k, (name, maps) in enumerate(rows.items()):
-        bottom = height - style.TOP - 0.2 - SIDE - k * step
-        figure.text(
-            (MARGIN - 0.12) / style.WIDTH, (bottom + SIDE / 2) / height, name, ha="right", va="center",
-            fontsize=9, color=style.INK,
-        )  # fmt: skip
-        for column, rates in enumerate(maps[:SHOWN]):
-            axes = style.add_axes(figure, MARGIN + column * step, bottom, SIDE, SIDE)
-            peak = max(np.nanmax(rates), np.finfo(float).tiny)
-            image = axes.imshow(
-                rates / peak, origin="lower", extent=(0, torus, 0, torus), cmap="viridis", vmin=0, vmax=1
-            )
-            axes.set(xticks=[], yticks=[])
-            if k == 0:
-                axes.set_title(f"column {column + 1}", fontsize=7.5, color=style.LABEL_GREY, pad=3)
-    top = height - style.TOP - 0.2 - len(rows) * step
-    bar = style.add_axes(figure, MARGIN + SHOWN * step - GAP + 0.06, top + GAP, 0.08, len(rows) * step - GAP)
-    figure.colorbar(image, cax=bar, ticks=(0, 1))
-    bar.set_ylabel("rate / peak", fontsize=8, color=style.LABEL_GREY, labelpad=1)
-    figure.text(
-        MARGIN / style.WIDTH, (top - 0.08) / height,
-        f"each map: the torus, {torus:g} x {torus:g} m; white: not visited or outside the box",
-        fontsize=7.5, color=style.LABEL_GREY,
-    )  # fmt: skip
-    axes = _draw_histograms(figure, pairs)
-    style.add_legend(figure, axes, columns=3)
-    figure.savefig(png)
 
 
 def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:
