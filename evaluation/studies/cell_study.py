@@ -1,10 +1,8 @@
-"""A study of many networks: parameter sets over stated ranges, in chunks whose scores are kept on disk.
+"""A study of many networks of pose cells over one course: parameter sets, their scores, table and pictures.
 
-The scores of networks over a course: drift, decoding error, rate maps.
-
-Plots of a study of many networks: a score over the parameters, and rate maps of chosen sets.
-
-Table and pictures of a study of many networks.
+Parameter sets come from stated ranges and are simulated in chunks, whose scores are kept on disk. Scores are
+drift, decoding error and rate maps. The table has the best, the median and the worst set by drift and rank
+correlations; the pictures show scores over the parameters, and rate maps.
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ import hashlib
 import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -41,7 +40,7 @@ from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 
 
-class SetScores(NamedTuple):
+class _SetScores(NamedTuple):
     """The scores of B networks.
 
     Drift is the packet, followed round the torus, minus the pose that it would have without drift. The
@@ -102,7 +101,7 @@ class _Sums:
         weight = activity * self._study.seconds[None, rows, None]
         self._maps += np.bincount(at.ravel(), weight.ravel(), self._maps.size).reshape(self._maps.shape)
 
-    def scores(self) -> SetScores:
+    def scores(self) -> _SetScores:
         """The scores of all steps added."""
         study, steps = self._study, len(self._study.expected)
         seconds = np.bincount(study.bin, study.seconds, self._bins)
@@ -110,7 +109,7 @@ class _Sums:
         mean = np.divide(maps, seconds, out=np.full_like(maps, np.nan), where=seconds > 0)
         place = len(study.y_edges) - 1, len(study.x_edges) - 1
         rms, mean_error = np.sqrt(self._squares / steps), self._errors / steps
-        return SetScores(
+        return _SetScores(
             rms[:, 0], rms[:, 1], self._last[:, 0], self._last[:, 1], mean_error[:, 0], mean_error[:, 1],
             self._reseeded / steps, self._larger / steps,
             mean.astype(np.float32).reshape(*maps.shape[:2], *place),
@@ -125,7 +124,7 @@ class _Sums:
         return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
 
 
-def score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> SetScores:
+def score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> _SetScores:
     """Simulates B networks over the course in the given precision and scores them.
 
     Memory does not depend on the length of the course, apart from the course itself.
@@ -198,7 +197,7 @@ PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "s
 """Columns of parameter sets, and the ranges of a `CellPlan`."""
 
 
-class CellStudy(NamedTuple):
+class _CellStudy(NamedTuple):
     """A checked study. parameters: [sets, 6] in the order of `PARAMETERS`."""
 
     name: str
@@ -207,7 +206,7 @@ class CellStudy(NamedTuple):
     parameters: np.ndarray
 
 
-class CellTask(NamedTuple):
+class _Chunk(NamedTuple):
     """A chunk of n parameter sets [n, 6]. size: sets of a whole chunk, which are simulated together."""
 
     course: StudyCourse
@@ -224,7 +223,7 @@ class CellTask(NamedTuple):
         return content.hexdigest()[:16]
 
 
-def cell_study(path: Path, overrides: Sequence[str] = ()) -> CellStudy:
+def cell_study(path: Path, overrides: Sequence[str] = ()) -> _CellStudy:
     """The study of a configuration file; reads its session.
 
     Args:
@@ -238,7 +237,7 @@ def cell_study(path: Path, overrides: Sequence[str] = ()) -> CellStudy:
     plan = validate(override(empty, own), CellPlan)
     config = load_config(path, [text for text in overrides if text not in own])
     course = read_course(config, plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
-    return CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
+    return _CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
 
 
 def parameter_sets(plan: CellPlan) -> np.ndarray:
@@ -250,8 +249,8 @@ def parameter_sets(plan: CellPlan) -> np.ndarray:
 
 
 def run_cell_study(
-    study: CellStudy, folder: Path, executor: Executor, done: Callable[[int], object] = lambda sets: None
-) -> SetScores:
+    study: _CellStudy, folder: Path, executor: Executor, done: Callable[[int], object] = lambda sets: None
+) -> _SetScores:
     """The scores of all parameter sets, in their order; each chunk is on disk before it counts as done.
 
     Args:
@@ -272,41 +271,37 @@ def run_cell_study(
             missing.append(task)
     with closing(executor.completed(score_task, missing)) as completed:
         for index, scores in completed:
-            _write(files[missing[index].key], scores)
+            write_atomically(files[missing[index].key], partial(_save_scores, scores))
             done(len(missing[index].parameters))
-    parts = [_read(path) for path in files.values()]
-    return SetScores(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    parts = []
+    for path in files.values():
+        with np.load(path) as found:
+            parts.append(_SetScores(**found))
+    return _SetScores(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def tasks_of(study: CellStudy) -> list[CellTask]:
+def tasks_of(study: _CellStudy) -> list[_Chunk]:
     """The chunks of a study."""
     plan = study.plan
     first = range(0, len(study.parameters), plan.chunk)
     rows = [study.parameters[k : k + plan.chunk] for k in first]
-    return [CellTask(study.course, each, plan.chunk, plan.precision) for each in rows]
+    return [_Chunk(study.course, each, plan.chunk, plan.precision) for each in rows]
 
 
-def score_task(task: CellTask) -> SetScores:
+def score_task(task: _Chunk) -> _SetScores:
     """The scores of a chunk; a part of one is filled up, so that its bits do not depend on the number."""
     prepare_precision(task.precision)
     rows = np.arange(task.size).clip(max=len(task.parameters) - 1)
     columns = dict(zip(PARAMETERS, task.parameters[rows].T, strict=True))
     noise = columns.pop("speed_noise"), columns.pop("heading_noise")
     scores = score_sets(task.course, CellSets(Network(**columns), *noise), np.dtype(task.precision))
-    return SetScores(*(column[: len(task.parameters)] for column in scores))
+    return _SetScores(*(column[: len(task.parameters)] for column in scores))
 
 
-def _write(path: Path, scores: SetScores) -> None:
-    def write(temporary: Path) -> None:
-        np.savez_compressed(temporary, **scores._asdict())
-        flush_to_disk(temporary)
-
-    write_atomically(path, write)
-
-
-def _read(path: Path) -> SetScores:
-    with np.load(path) as found:
-        return SetScores(**found)
+def _save_scores(scores: _SetScores, path: Path) -> None:
+    """Writes the scores of a chunk; they are on the disk when this returns."""
+    np.savez_compressed(path, **scores._asdict())
+    flush_to_disk(path)
 
 
 _PANEL, _GAP_ACROSS, _GAP_UP = 1.9, 0.62, 0.75  # inches: height of a panel, between panels
@@ -314,14 +309,7 @@ _COLUMNS = 3
 _MAP_GAP = 0.12  # inches between rate maps
 
 
-class MapRow(NamedTuple):
-    """The rate maps of one network. name: of the row. maps: [C, H, W] mean activity, NaN where never."""
-
-    name: str
-    maps: np.ndarray
-
-
-def draw_scores(
+def _draw_scores(
     title: str, line: str, parameters: Mapping[str, np.ndarray], score: np.ndarray, label: str
 ) -> style.Figure:
     """Draws a score [B] against each parameter [B], a point for each network.
@@ -355,28 +343,29 @@ def draw_scores(
     return figure
 
 
-def draw_rate_maps(
-    title: str, line: str, rows: Sequence[MapRow], x_edges: np.ndarray, y_edges: np.ndarray
+def _draw_rate_maps(
+    title: str, line: str, rows: Mapping[str, np.ndarray], x_edges: np.ndarray, y_edges: np.ndarray
 ) -> style.Figure:
     """Draws the rate maps of networks, a row for each and a column for each cell; each map has a colour scale
     of its own, from 0 to the value above it.
 
     Args:
-        x_edges, y_edges: [W + 1], [H + 1] edges of the place bins, m.
+        rows: by name, maps [C, H, W] of mean activity, NaN where the robot never was. x_edges, y_edges:
+            [W + 1], [H + 1] edges of the place bins, m.
     """
-    columns = max(len(row.maps) for row in rows)
+    columns = max(map(len, rows.values()))
     side = (WIDTH - style.LEFT - style.RIGHT - (columns - 1) * _MAP_GAP) / columns
     step = side + 0.5
     height = style.TOP + len(rows) * step + 0.1
     figure = style.new_figure(height, title, line)
-    for k, row in enumerate(rows):
+    for k, (name, maps) in enumerate(rows.items()):
         bottom = height - style.TOP - side - 0.18 - k * step
-        for column, rates in enumerate(row.maps):
+        for column, rates in enumerate(maps):
             axes = style.add_axes(figure, style.LEFT + column * (side + _MAP_GAP), bottom, side, side)
             draw_rate_map(axes, rates, x_edges, y_edges)
             axes.set_title(f"{np.nanmax(rates):.2g}", fontsize=7, color=LABEL_GREY, pad=2)
         figure.text(
-            0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, row.name, rotation=90, fontsize=9,
+            0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, name, rotation=90, fontsize=9,
             ha="center", va="center", color=style.INK,
         )  # fmt: skip
     return figure
@@ -395,38 +384,35 @@ decoding: mean distance on the torus. reseeded: share of steps at which activity
 of steps that needed more than the smallest window. Rank correlations are Spearman's, over all sets."""
 
 
-class CellReport(NamedTuple):
-    """The scores of a study, with its sets in order of their drift [sets]."""
-
-    study: CellStudy
-    scores: SetScores
-    order: np.ndarray
-
-
-def make_cell_report(study: CellStudy, scores: SetScores) -> CellReport:
-    """The report of a study's scores."""
-    return CellReport(study, scores, np.argsort(scores.drift, kind="stable"))
-
-
-def render_cells(report: CellReport) -> str:
+def render_cells(study: _CellStudy, scores: _SetScores) -> str:
     """Best, median and worst set by drift, and the rank correlations, as Markdown."""
     table = [["", "set", *(f"{name} {unit}".strip() for name, unit in UNITS.items())]]
-    columns = _columns(report)
-    for name, k in _chosen(report).items():
+    columns = _columns(study, scores)
+    for name, k in _chosen(scores).items():
         table.append([name, str(k), *(format_number(float(column[k])) for column in columns.values())])
-    study = report.study
     links = [["rank correlation with", *PARAMETERS]]
     for name in ("drift", "drift_heading", "decoding", "decoding_heading"):
-        links.append([name, *(_rank_correlation(columns[each], columns[name]) for each in PARAMETERS)])
+        link = [name]
+        for parameter in PARAMETERS:
+            a, b = columns[parameter], columns[name]
+            known = np.ptp(a) and np.ptp(b)
+            link.append(f"{np.corrcoef(rankdata(a), rankdata(b))[0, 1]:+.2f}" if known else "-")
+        links.append(link)
     return "\n".join([render_table(table), "", render_table(links), "", NOTE, _describe(study)])
 
 
-def save_cells(report: CellReport, folder: Path) -> list[Path]:
+def save_cells(study: _CellStudy, scores: _SetScores, folder: Path) -> list[Path]:
     """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
     decoding.png and maps.png."""
-    study, scores = report.study, report.scores
-    write_text_atomically(folder / "table.csv", _csv(report))
-    write_text_atomically(folder / "table.md", f"{render_cells(report)}\n")
+    columns = _columns(study, scores)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["set", *columns])
+    writer.writerows(
+        [k, *(repr(float(column[k])) for column in columns.values())] for k in range(len(scores.drift))
+    )
+    write_text_atomically(folder / "table.csv", text.getvalue())
+    write_text_atomically(folder / "table.md", f"{render_cells(study, scores)}\n")
     course = study.course
     write_atomically(
         folder / "maps.npz",
@@ -435,24 +421,23 @@ def save_cells(report: CellReport, folder: Path) -> list[Path]:
         ),
     )
     paths = [folder / name for name in ("table.csv", "table.md", "maps.npz")]
-    for name, figure in _figures(report).items():
+    for name, figure in _figures(study, scores).items():
         write_atomically(folder / name, figure.savefig)
         paths.append(folder / name)
     return paths
 
 
-def _figures(report: CellReport) -> dict:
-    study, scores = report.study, report.scores
-    columns, line = _columns(report), _describe(study)
+def _figures(study: _CellStudy, scores: _SetScores) -> dict:
+    columns, line = _columns(study, scores), _describe(study)
     parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
-    rows = [MapRow(name, scores.maps[k]) for name, k in _chosen(report).items()]
+    rows = {name: scores.maps[k] for name, k in _chosen(scores).items()}
     course = study.course
     return {
-        "drift.png": draw_scores(f"Drift: {study.name}", line, parameters, scores.drift, "drift, rms (m)"),
-        "decoding.png": draw_scores(
+        "drift.png": _draw_scores(f"Drift: {study.name}", line, parameters, scores.drift, "drift, rms (m)"),
+        "decoding.png": _draw_scores(
             f"Decoding error: {study.name}", line, parameters, scores.decoding, "decoding error (m)"
         ),
-        "maps.png": draw_rate_maps(
+        "maps.png": _draw_rate_maps(
             f"Rate maps by drift: {study.name}",
             f"Least, median and most drift of {len(scores.drift)} sets; above each map its largest activity",
             rows,
@@ -462,24 +447,18 @@ def _figures(report: CellReport) -> dict:
     }
 
 
-def _chosen(report: CellReport) -> dict[str, int]:
+def _chosen(scores: _SetScores) -> dict[str, int]:
     """Indices of the best, the median and the worst set by drift."""
-    order = report.order
+    order = np.argsort(scores.drift, kind="stable")
     return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
 
 
-def _columns(report: CellReport) -> dict[str, np.ndarray]:
-    parameters = dict(zip(PARAMETERS, report.study.parameters.T, strict=True))
-    return {name: parameters[name] if name in parameters else getattr(report.scores, name) for name in UNITS}
+def _columns(study: _CellStudy, scores: _SetScores) -> dict[str, np.ndarray]:
+    parameters = dict(zip(PARAMETERS, study.parameters.T, strict=True))
+    return {name: parameters[name] if name in parameters else getattr(scores, name) for name in UNITS}
 
 
-def _rank_correlation(a: np.ndarray, b: np.ndarray) -> str:
-    if not np.ptp(a) or not np.ptp(b):
-        return "-"
-    return f"{np.corrcoef(rankdata(a), rankdata(b))[0, 1]:+.2f}"
-
-
-def _describe(study: CellStudy) -> str:
+def _describe(study: _CellStudy) -> str:
     course, config = study.course, study.course.config
     side = course.x_edges[-1] - course.x_edges[0]
     torus = config.cells_xy * config.cell_size
@@ -488,14 +467,3 @@ def _describe(study: CellStudy) -> str:
         f"{len(study.parameters)} sets, {len(course.expected)} steps, {course.seconds.sum():.0f} s, {how}, "
         f"{study.plan.precision}; path {side:.2f} m across, torus {torus:.2f} m."
     )
-
-
-def _csv(report: CellReport) -> str:
-    columns = _columns(report)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["set", *columns])
-    writer.writerows(
-        [k, *(repr(float(column[k])) for column in columns.values())] for k in range(len(report.order))
-    )
-    return text.getvalue()

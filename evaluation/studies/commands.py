@@ -73,7 +73,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
 
 
-class Progress:
+class _Progress:
     """A progress bar over runs, which collects the failed ones.
 
     Args:
@@ -121,7 +121,7 @@ class Progress:
         return INPUT_ERROR if self.failed else 0
 
 
-def limit_threads() -> None:
+def _limit_threads() -> None:
     """Limits NumPy to one thread in this process and its workers, so that results are equal.
 
     Call it before NumPy is loaded.
@@ -131,7 +131,7 @@ def limit_threads() -> None:
 
 
 def _study(arguments: argparse.Namespace) -> int:
-    limit_threads()
+    _limit_threads()
     prepare_jax()
     if arguments.preset == GROWTH:
         return _growth(arguments)
@@ -173,7 +173,7 @@ def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, rema
     jobs = study.jobs
     alone = study.plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
     with (
-        Progress(len({job.key for job in jobs}), log.path) as progress,
+        _Progress(len({job.key for job in jobs}), log.path) as progress,
         Executor(arguments.workers, arguments.scheduler) as executor,
     ):
         records = (
@@ -191,14 +191,14 @@ def _growth(arguments: argparse.Namespace) -> int:
             raise InputError(f"--{option}", found, "one session at a time, without search", "leave it out")
     from evaluation.studies.growth import growth_study, read_rows, render_growth, run_growth, save_growth
 
-    study = growth_study(find_config(arguments.config), arguments.set)
-    folder = _folder(arguments, study.name, "growth.jsonl")
+    name, tasks = growth_study(find_config(arguments.config), arguments.set)
+    folder = _folder(arguments, name, "growth.jsonl")
     require_new_file(folder / "growth.jsonl", parents=True)
     try:
-        run_growth(study, folder)
+        run_growth(tasks, folder)
     finally:  # an interrupted study has the table of what it measured
         if rows := read_rows(folder):
-            paths = save_growth(study.name, rows, folder)
+            paths = save_growth(name, rows, folder)
             print(render_growth(rows))
             print(f"\n{folder} holds {', '.join(path.name for path in paths)}")
     return 0
@@ -211,7 +211,6 @@ def _cells(arguments: argparse.Namespace) -> int:
     from evaluation.studies.cell_study import (
         FOLDER,
         cell_study,
-        make_cell_report,
         render_cells,
         run_cell_study,
         save_cells,
@@ -221,13 +220,12 @@ def _cells(arguments: argparse.Namespace) -> int:
     study = cell_study(find_config(arguments.config), arguments.set)
     folder = _folder(arguments, study.name, "sets")
     with (
-        Progress(study.plan.sets, folder / FOLDER, "set") as progress,
+        _Progress(study.plan.sets, folder / FOLDER, "set") as progress,
         Executor(arguments.workers, arguments.scheduler) as executor,
     ):
         scores = run_cell_study(study, folder, executor, progress.count)
-    report = make_cell_report(study, scores)
-    paths = save_cells(report, folder)
-    print(render_cells(report))
+    paths = save_cells(study, scores, folder)
+    print(render_cells(study, scores))
     print(f"\n{folder} holds {', '.join(path.name for path in paths)}")
     return 0
 
@@ -248,7 +246,7 @@ def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
     plan = study.plan.tune
     runs = len(study.plan.every_seed()) * max(study.plan.copies, 1)
     with (
-        Progress(plan.trials * runs, log.path) as progress,
+        _Progress(plan.trials * runs, log.path) as progress,
         Executor(arguments.workers, arguments.scheduler) as executor,
     ):
         records = search(study, log, executor, progress)
@@ -263,7 +261,7 @@ def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
 def _size(arguments: argparse.Namespace) -> int:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
-    limit_threads()
+    _limit_threads()
     prepare_jax()
     from evaluation.studies.recommendation import (
         changed_settings_yaml,

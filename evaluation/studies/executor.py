@@ -173,22 +173,30 @@ class Executor(ExitStack):
         environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
         pool = self._client.get_executor(pure=False)
         pending = {
-            pool.submit(call_in_worker, environment, pickle.dumps((function, task))): index
+            pool.submit(_call_in_worker, environment, pickle.dumps((function, task))): index
             for index, task in enumerate(tasks)
         }
         for future in futures.as_completed(pending):
             try:
                 result = future.result()
             except Exception as error:
-                if self._scheduler is not None:
-                    _check_cluster(error)
+                if self._scheduler is not None and isinstance(error, futures.CancelledError):
+                    cure = "what was done is kept; run it again"
+                    raise InputError(
+                        "--scheduler", "the scheduler went away", "one that stays", cure
+                    ) from None
+                unloadable = isinstance(error, ImportError) or "deserialization" in str(error)
+                if self._scheduler is not None and unloadable:
+                    found = f"its processes cannot load ratslam ({error})".splitlines()[0]
+                    wanted = "the same ratslam, installed there too"
+                    raise InputError("--scheduler", found, wanted) from None
                 if type(error).__name__ != "KilledWorker":
                     raise
             else:
                 yield pending[future], result
 
 
-def call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
+def _call_in_worker(environment: dict[str, str], packed: bytes) -> Any:
     """The result of a pickled (function, task), whose unpickling may load JAX."""
     for name, value in environment.items():
         os.environ.setdefault(name, value)
@@ -203,16 +211,6 @@ def _kill_workers(cluster: Any) -> None:
         if nanny.pid is not None:
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(nanny.pid, signal.SIGTERM)
-
-
-def _check_cluster(error: Exception) -> None:
-    """Raises an `InputError` where the cluster of a scheduler is at fault."""
-    if isinstance(error, futures.CancelledError):
-        cure = "what was done is kept; run it again"
-        raise InputError("--scheduler", "the scheduler went away", "one that stays", cure) from None
-    if isinstance(error, ImportError) or "deserialization" in str(error):
-        found = f"its processes cannot load ratslam ({error})".splitlines()[0]
-        raise InputError("--scheduler", found, "the same ratslam, installed there too") from None
 
 
 def _call_afresh(function: Callable[[Task], Result], task: Task) -> Result:

@@ -1,13 +1,9 @@
-"""A growth study: a long session on known ground and one on new ground, measured at growing lengths.
+"""A growth study: cost of a step, memory and error against the length of a session.
 
-A simulation of whiskers gives both. Another session whose true poses are known, a recording of views or ids,
-gives known ground: its course again and again, with noise of its own each time.
-
-Plot of the cost of a step against the length of a session.
-
-Measures a session of a growth study, one step at a time, at each of its lengths.
-
-Runs a growth study, each session in a process of its own, and writes its table and picture.
+One session is on known ground and one on new ground. A simulation of whiskers gives both. Another session
+whose true poses are known, a recording of views or ids, gives known ground: its course again and again, with
+noise of its own each time. Each session is played a step at a time in a process of its own and measured at
+growing lengths; every row is on disk as soon as it is measured.
 """
 
 from __future__ import annotations
@@ -106,15 +102,8 @@ class GrowthTask(NamedTuple):
     window: int = 0  # see `GrowthPlan`
 
 
-class GrowthStudy(NamedTuple):
-    """A checked growth study."""
-
-    name: str
-    tasks: list[GrowthTask]
-
-
-def growth_study(path: Path, overrides: Sequence[str] = ()) -> GrowthStudy:
-    """The growth study of a configuration file.
+def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[GrowthTask]]:
+    """Name and sessions of the growth study of a configuration file.
 
     Args:
         overrides: each `a.b=value`: a key of `GrowthPlan` where it is one, else of the configuration.
@@ -136,7 +125,7 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> GrowthStudy:
         tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
     if not tasks:
         raise InputError("--preset growth", "no session", "known_ground or new_ground above 0 steps")
-    return GrowthStudy(f"{path.stem}-growth", tasks)
+    return f"{path.stem}-growth", tasks
 
 
 def _with_laps(config: RunConfig, steps: int) -> RunConfig:
@@ -186,48 +175,13 @@ _COLORS = (BLUE, VERMILLION, GREEN, PURPLE)
 _DASHES = (("mean", "-", "o"), ("99 %", "--", "s"), ("largest", ":", "^"))
 
 
-class GrowthCurve(NamedTuple):
-    """The cost of a session's steps up to each of N lengths.
-
-    Attributes:
-        name: of the session. steps: [N] lengths. cost: [N, 3] mean, 99 % quantile and largest of the steps
-            since the length before, positive.
-    """
-
-    name: str
-    steps: np.ndarray
-    cost: np.ndarray
-
-
-def draw_growth(title: str, line: str, curves: Sequence[GrowthCurve], cost: str) -> style.Figure:
-    """Draws mean, 99 % quantile and largest cost of each session on logarithmic axes.
-
-    Args:
-        curves: 1 to 4. cost: axis label with unit.
-    """
-    inner = WIDTH - style.LEFT - style.RIGHT
-    figure = style.new_figure(style.TOP + _TALL + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _TALL)
-    every = np.concatenate([curve.cost.ravel() for curve in curves])
-    style.log_axes(axes, np.concatenate([curve.steps for curve in curves]), every)
-    for curve, color in zip(curves, _COLORS, strict=False):
-        for values, (name, dash, mark) in zip(curve.cost.T, _DASHES, strict=True):
-            axes.plot(
-                curve.steps, values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0,
-                label=f"{curve.name}, {name}",
-            )  # fmt: skip
-    style.name_axes(axes, "length of the session (steps)", cost)
-    style.add_legend(figure, axes, columns=len(curves))
-    return figure
-
-
 SEED = 0
 """Seed of the noise of a course that is repeated."""
 TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
 """Fields of a row that need a step that compiled nothing."""
 
 
-class GrowthRow(Settings):
+class _GrowthRow(Settings):
     """A session at one length. Times are of the steps since the length before, or of the window of
     `GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
 
@@ -253,16 +207,9 @@ class GrowthRow(Settings):
     machine: Machine
 
 
-class _Clocks(NamedTuple):
-    """Processor time of this thread and of the process, and wall time, s."""
-
-    own: float
-    process: float
-    wall: float
-
-    @classmethod
-    def now(cls) -> _Clocks:
-        return cls(thread_time(), process_time(), perf_counter())
+def _read_clocks() -> np.ndarray:
+    """[3] processor time of this thread and of the process, and wall time, s."""
+    return np.array([thread_time(), process_time(), perf_counter()])
 
 
 class _StepClock:
@@ -272,11 +219,11 @@ class _StepClock:
         self._compiled = compilations()
         self.restart()
 
-    def take(self, step: Callable[[], object]) -> None:
-        """Takes and times a step."""
-        compiled, before = len(self._compiled), _Clocks.now()
-        step()
-        own, process, wall = np.subtract(_Clocks.now(), before)
+    def take(self, session: Session, observation: Observation) -> None:
+        """Takes and times a step of a session."""
+        compiled, before = len(self._compiled), _read_clocks()
+        session.step(observation)
+        own, process, wall = _read_clocks() - before
         if len(self._compiled) == compiled:
             self._steps.append((own, wall))
         else:
@@ -284,27 +231,27 @@ class _StepClock:
             self._others += own - process  # threads that compile are no cost of a step
 
     def read(self) -> dict[str, float | None]:
-        """The times of `GrowthRow` since the last call or restart."""
-        now = _Clocks.now()
-        others = self._others + (now.process - self._began.process) - (now.own - self._began.own)
+        """The times of `_GrowthRow` since the last call or restart."""
+        own, process, _ = _read_clocks() - self._began
+        others = self._others + process - own
         steps, compiling = self._steps, self._compiling
         self.restart()
         if not steps:
             return {"compiling": compiling} | dict.fromkeys(TIMES)
-        own, wall = 1e6 * np.array(steps).T
+        each, wall = 1e6 * np.array(steps).T
         # Threads beside the session also work between its steps.
-        mean, beside = own.mean(), 1e6 * max(others, 0.0) / len(own)
-        found = mean, mean + beside, np.median(own), np.quantile(own, 0.99), own.max(), wall.max()
+        mean, beside = each.mean(), 1e6 * max(others, 0.0) / len(each)
+        found = mean, mean + beside, np.median(each), np.quantile(each, 0.99), each.max(), wall.max()
         times: dict[str, float | None] = {"compiling": compiling}
         return times | dict(zip(TIMES, map(float, found), strict=True))
 
     def restart(self) -> None:
         """Forgets the steps so far."""
         self._steps: list[tuple[float, float]] = []
-        self._compiling, self._others, self._began = 0.0, 0.0, _Clocks.now()
+        self._compiling, self._others, self._began = 0.0, 0.0, _read_clocks()
 
 
-def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[GrowthRow]:
+def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[_GrowthRow]:
     """Plays the session once, to its greatest length; yields a row at each length.
 
     Args:
@@ -326,7 +273,7 @@ def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) 
             for step, (sample, observation) in enumerate(islice(rows, length - before)):
                 if step == length - before - window:
                     clock.restart()
-                clock.take(_step(session, observation))
+                clock.take(session, observation)
                 assert sample.truth is not None
                 truth.append(sample.truth)
                 motion.append(np.asarray(observation.odometry[:3], float))
@@ -336,15 +283,11 @@ def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) 
             errors = _errors(session, np.array(truth), integrate(np.array(motion)))
             keyframes = session.backend.rows(session.state)
             found = {"keyframes": keyframes, "machine": here, **times, **errors}
-            yield GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
-
-
-def _step(session: Session, observation: Observation) -> Callable[[], object]:
-    return lambda: session.step(observation)
+            yield _GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
 
 
 def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[str, float]:
-    """The errors of `GrowthRow`, and the time of the final optimisation; the session stays as it is."""
+    """The errors of `_GrowthRow`, and the time of the final optimisation; the session stays as it is."""
     online = session.map.online_trajectory()
     began = thread_time()
     final, end = session.map.trajectory(), thread_time() - began
@@ -380,8 +323,8 @@ optimisation if the session ended here. final, closures, false: of the map after
 than 0.1 m apart."""
 
 
-def run_growth(study: GrowthStudy, folder: Path) -> None:
-    """Runs the sessions of a study one after another; each row is in `folder/FILE` as soon as it is measured.
+def run_growth(tasks: Sequence[GrowthTask], folder: Path) -> None:
+    """Runs sessions one after another; each row is in `folder/FILE` as soon as it is measured.
 
     Raises:
         InputError: the folder cannot be made, a session cannot be simulated, or its process was killed.
@@ -390,54 +333,75 @@ def run_growth(study: GrowthStudy, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / FILE).write_bytes(b"")
     with Executor(fresh=True) as executor:
-        for _ in executor.completed(partial(_append_rows, folder / FILE), study.tasks, _killed):
-            pass
+        measure = partial(_append_rows, folder / FILE)
+        for _, killed in executor.completed(measure, tasks, lambda task: task.ground):
+            if killed is not None:
+                raise InputError(killed, KILLED, "memory for the whole session", "measure a shorter one")
 
 
-def read_rows(folder: Path) -> list[GrowthRow]:
+def read_rows(folder: Path) -> list[_GrowthRow]:
     """The rows measured so far."""
     path, found = folder / FILE, []
     for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
-            found.append(GrowthRow.model_validate_json(line))
+            found.append(_GrowthRow.model_validate_json(line))
         except ValueError:  # cut off by a kill
             continue
     return found
 
 
-def render_growth(rows: Sequence[GrowthRow]) -> str:
+def render_growth(rows: Sequence[_GrowthRow]) -> str:
     """The table and its notes as Markdown."""
     table = [list(COLUMNS)]
-    table += [[_cell(getattr(row, name)) for name in COLUMNS.values()] for row in rows]
+    for row in rows:
+        values = [getattr(row, name) for name in COLUMNS.values()]
+        known = ["-" if value is None else value for value in values]
+        table.append([format_number(each) if isinstance(each, float) else str(each) for each in known])
     machines = [row.machine for row in rows]
     remarks = [f"{each[0].upper()}{each[1:]}." for each in find_disturbances(machines)]
     measured = describe_machines(machines, 1)
     return "\n".join([render_table(table), "", NOTE, "; ".join(measured.values()) + ".", *remarks])
 
 
-def draw(name: str, rows: Sequence[GrowthRow]) -> Figure | None:
-    """Cost of a step against length; None without a step that compiled nothing."""
+def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
+    """Mean, 99 % quantile and largest cost of a step against length; None without a step that compiled
+    nothing."""
     timed = [row for row in rows if row.largest]
-    curves = []
-    for ground in dict.fromkeys(row.ground for row in timed):
-        these = [row for row in timed if row.ground == ground]
-        cost = np.array([[row.mean, row.p99, row.largest] for row in these], float) / 1e3
-        curves.append(GrowthCurve(ground, np.array([row.steps for row in these]), cost))
-    if not curves:
+    if not timed:
         return None
+    grounds = dict.fromkeys(row.ground for row in timed)
+    cost = np.array([[row.mean, row.p99, row.largest] for row in timed], float) / 1e3
+    steps = np.array([row.steps for row in timed])
     measured = describe_machines([row.machine for row in rows], 1)
     line = "  ·  ".join(measured[part] for part in ("machine", "build"))
-    return draw_growth(
-        f"Cost of a step against length: {name}", line, curves, "processor time of a step (ms), own thread"
-    )
+    inner = WIDTH - style.LEFT - style.RIGHT
+    title = f"Cost of a step against length: {name}"
+    figure = style.new_figure(style.TOP + _TALL + _BOTTOM, title, line)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _TALL)
+    style.log_axes(axes, steps, cost.ravel())
+    for ground, color in zip(grounds, _COLORS, strict=False):
+        these = [row.ground == ground for row in timed]
+        for values, (statistic, dash, mark) in zip(cost[these].T, _DASHES, strict=True):
+            axes.plot(
+                steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0,
+                label=f"{ground}, {statistic}",
+            )  # fmt: skip
+    style.name_axes(axes, "length of the session (steps)", "processor time of a step (ms), own thread")
+    style.add_legend(figure, axes, columns=len(grounds))
+    return figure
 
 
-def save_growth(name: str, rows: Sequence[GrowthRow], folder: Path) -> list[Path]:
+def save_growth(name: str, rows: Sequence[_GrowthRow], folder: Path) -> list[Path]:
     """Writes table.csv, table.md and, if there is something to draw, growth.png."""
-    write_text_atomically(folder / "table.csv", _csv(rows))
+    lines = [row.model_dump(exclude={"machine"}) | {"other_load": row.machine.other_load} for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    write_text_atomically(folder / "table.csv", text.getvalue())
     write_text_atomically(folder / "table.md", f"{render_growth(rows)}\n")
     paths, picture = [folder / "table.csv", folder / "table.md"], folder / "growth.png"
-    figure = draw(name, rows)
+    figure = _draw(name, rows)
     if figure is None:
         picture.unlink(missing_ok=True)  # of an earlier call
         return paths
@@ -445,22 +409,7 @@ def save_growth(name: str, rows: Sequence[GrowthRow], folder: Path) -> list[Path
     return [*paths, picture]
 
 
-def _cell(value: str | float | None) -> str:
-    if value is None:
-        return "-"
-    return format_number(value) if isinstance(value, float) else str(value)
-
-
-def _csv(rows: Sequence[GrowthRow]) -> str:
-    lines = [row.model_dump(exclude={"machine"}) | {"other_load": row.machine.other_load} for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()
-
-
-def _append_rows(path: Path, task: GrowthTask) -> None:
+def _append_rows(path: Path, task: GrowthTask) -> str | None:
     """Measures a session, with a progress bar; appends its rows to a file."""
     from tqdm import tqdm
 
@@ -472,8 +421,4 @@ def _append_rows(path: Path, task: GrowthTask) -> None:
         for row in measure_growth(task, bar.update):
             file.write(row.model_dump_json() + "\n")
             file.flush()
-
-
-def _killed(task: GrowthTask) -> None:
-    """Raises an `InputError` for a session whose process was killed."""
-    raise InputError(task.ground, KILLED, "memory for the whole session", "measure a shorter one")
+    return None

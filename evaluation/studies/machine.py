@@ -1,8 +1,7 @@
-"""The machine of a run, and the times of its steps apart from compilation.
+"""The machine of a run: processor, versions, load of its cores, peak memory, and one core to measure on.
 
-Load of the machine's cores, peak memory of this process, and one core to measure on.
-
-This module loads without NumPy, so that `one_core` can be used before its threads start.
+`Stopwatch` times the steps of a run apart from compilation. This module loads without NumPy, so that
+`one_core` can be used before its threads start.
 """
 
 from __future__ import annotations

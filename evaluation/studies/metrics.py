@@ -1,8 +1,8 @@
 """The quantities of a run by name: label, unit, and which values are better; the columns of tables.
 
-Metrics of Salman & Pearson 2016 on a session held in memory; closures, and laps that end at the start.
-
-Whether views alone separate places: differences of views of the same place and of different places.
+Beside those of the scorecard: metrics of Salman & Pearson 2016 on a session held in memory, closures, laps
+that end at the start; and whether views alone separate places, by differences of views of the same place and
+of different places.
 """
 
 from __future__ import annotations

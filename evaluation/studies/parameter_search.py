@@ -7,7 +7,7 @@ its choices, which follow from the sampler's seed and the earlier outcomes, and 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import chain, islice
 from typing import Any
 
@@ -48,14 +48,22 @@ def search(
         for first in range(0, plan.trials, plan.batch):
             numbers = range(first, min(first + plan.batch, plan.trials))
             asked = [_ask(book, plan, number) for number in numbers]
-            jobs = [_jobs(study, number, trial) for number, trial in zip(numbers, asked, strict=True)]
+            jobs: list[list[Job]] = []
+            for number, trial in zip(numbers, asked, strict=True):
+                try:
+                    own = searched_jobs(study, dict(trial.params))
+                    jobs.append([job._replace(row=f"trial {number}") for job in own])
+                except InputError:  # parameters that contradict each other
+                    jobs.append([])
             records = run_jobs(list(chain.from_iterable(jobs)), log, executor, done)
             for trial, each in zip(asked, jobs, strict=True):
-                own = list(islice(records, len(each)))
-                values = _values(plan, own)
-                failed = {"state": optuna.trial.TrialState.FAIL} if values is None else {"values": values}
-                book.tell(trial, **failed)
-                found += own
+                ran = list(islice(records, len(each)))
+                columns: list[list[Any]] = [[run.value(name) for run in ran] for name in plan.directions()]
+                if not ran or any(None in column for column in columns):
+                    book.tell(trial, state=optuna.trial.TrialState.FAIL)
+                else:
+                    book.tell(trial, values=[statistics.fmean(map(float, column)) for column in columns])
+                found += ran
         return found
     finally:
         optuna.logging.set_verbosity(verbosity)
@@ -83,19 +91,3 @@ def _sampler(plan: SearchPlan, name: str) -> Any:
     if plan.sampler == "nsga2":
         return optuna.samplers.NSGAIISampler(seed=seed, population_size=plan.population)
     return optuna.samplers.TPESampler(seed=seed)
-
-
-def _jobs(study: Study, number: int, trial: Any) -> list[Job]:
-    """The runs of a trial; none if its parameters contradict each other."""
-    try:
-        return [job._replace(row=f"trial {number}") for job in searched_jobs(study, dict(trial.params))]
-    except InputError:
-        return []
-
-
-def _values(plan: SearchPlan, records: Sequence[RunRecord]) -> list[float] | None:
-    """The objectives as means over runs; None if a run lacks one."""
-    columns: list[list[Any]] = [[each.value(name) for each in records] for name in plan.directions()]
-    if not records or any(None in column for column in columns):
-        return None
-    return [statistics.fmean(map(float, column)) for column in columns]

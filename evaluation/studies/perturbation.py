@@ -53,7 +53,7 @@ def perturb(log: InMemorySource, seed: int) -> InMemorySource:
     stream = np.random.default_rng(seed)
     first = _draw_start(_looks(log), stream)
     changed = replace(_add_noise(log, stream), digest=f"{log.digest}+{seed}")
-    return _cut(changed, first, _draw_rows(log, first, DROPPED, stream))
+    return _drop_rows(changed, first, DROPPED, stream)
 
 
 def repeat_course(log: InMemorySource, length: int, seed: int) -> InMemorySource:
@@ -107,7 +107,7 @@ def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:
     motion[:, :2] *= (scale * (1 + LENGTH_NOISE * moved))[:, None]
     motion[:, 2] += bias * length + TURN_PER_RADIAN * turn * by_turn + TURN_PER_METRE * length * by_length
     changed = replace(log, digest=f"{log.digest}+miscalibrated {seed}", motion=motion)
-    return _cut(changed, first, _draw_rows(log, first, MISCALIBRATED_DROPPED, stream))
+    return _drop_rows(changed, first, MISCALIBRATED_DROPPED, stream)
 
 
 def lose_labels(log: InMemorySource, seed: int) -> InMemorySource:
@@ -160,38 +160,26 @@ def _draw_start(looks: np.ndarray, stream: np.random.Generator) -> int:
     return int(looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)]) if len(looks) else 0
 
 
-def _draw_rows(log: InMemorySource, first: int, share: float, stream: np.random.Generator) -> np.ndarray:
-    """The rows of a copy: `first` and those after it, without a share of those with a view or label."""
-    looks = _looks(log)
-    keep = np.ones(log.length, bool)
-    keep[looks] = stream.random(len(looks)) >= share
-    keep[:first] = False
-    keep[first] = True
-    return np.flatnonzero(keep)
-
-
 def _draw_share(rows: np.ndarray, stream: np.random.Generator) -> np.ndarray:
     """A random third of some rows, in order."""
     return np.sort(stream.permutation(rows)[: round(SPOILT_LABELS * len(rows))])
 
 
-def _cut(log: InMemorySource, first: int, rows: np.ndarray) -> InMemorySource:
-    """The remaining rows, each with the motion since the remaining row before it."""
-    motion = _merge_motions(log.motion, rows, first)
+def _drop_rows(log: InMemorySource, first: int, share: float, stream: np.random.Generator) -> InMemorySource:
+    """The rows from `first` on without a share of those after it that have a view or a place label; each has
+    the motion since the remaining row before it."""
+    looks = _looks(log)
+    keep = np.ones(log.length, bool)
+    keep[looks] = stream.random(len(looks)) >= share
+    keep[:first] = False
+    keep[first] = True
+    rows = np.flatnonzero(keep)
+    motion, since, at = np.zeros((len(rows), 4)), np.zeros(4), 0
+    for row in range(first, log.length):
+        since[:3] = compose(since[:3], log.motion[row, :3])
+        since[3] += log.motion[row, 3]
+        if keep[row]:
+            motion[at] = since
+            since, at = np.zeros(4), at + 1
     moved = log.moved[rows] | motion[:, :3].any(axis=1)
     return replace(select_rows(log, rows), motion=motion, moved=moved)
-
-
-def _merge_motions(motion: np.ndarray, rows: np.ndarray, first: int) -> np.ndarray:
-    """Motions [M, 4] between the remaining rows, composed of all motions in between."""
-    merged = np.zeros((len(rows), 4))
-    at = 0
-    since = np.zeros(4)
-    for row in range(first, len(motion)):
-        since[:3] = compose(since[:3], motion[row, :3])
-        since[3] += motion[row, 3]
-        if at < len(rows) and rows[at] == row:
-            merged[at] = since
-            since = np.zeros(4)
-            at += 1
-    return merged

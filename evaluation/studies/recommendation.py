@@ -1,6 +1,7 @@
-"""Recommended values, with reasons, of the settings that cost time or memory.
+"""Recommended values, with reasons, of the settings that cost time or memory; and short runs that try them.
 
-Short runs with the recommended settings and with each next cheaper setting.
+The settings follow from the path of odometry. The trial runs have the recommended settings, the configured
+ones and each next cheaper setting.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from evaluation.studies.study_report import make_report, plain, render, render_t
 from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.classic.levels import SETTLED, window_levels
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
-from ratslam.grid.config import DriftConfig
 from ratslam.grid.particles import LAYERS
 from ratslam.methods.grid import LIVE_SIDE
 from ratslam.runs.build_session import open_source
@@ -40,7 +40,7 @@ PARTICLES = 30, 3000  # smallest and largest number of particles
 MEMORY = 1024  # largest memory of all particles' maps, MiB
 
 
-class Recommendation(NamedTuple):
+class _Recommendation(NamedTuple):
     """A setting: key path, present value, recommended value, reason in one line."""
 
     key: str
@@ -54,7 +54,7 @@ class Recommendation(NamedTuple):
         return bool(self.value != self.now)
 
 
-def recommend(config: RunConfig, scene: Scene) -> list[Recommendation]:
+def recommend(config: RunConfig, scene: Scene) -> list[_Recommendation]:
     """Recommendations for a configuration that its source has completed."""
     own = _grid(config, scene) if config.backend == "grid" else _rat(config, scene)
     return [*own, *_tier(config)]
@@ -73,13 +73,13 @@ def cells_to_cover(span: float, cell: float) -> int:
     return max(FEWEST, int(np.ceil(span / cell)) + SETTLED) | 1
 
 
-def render_recommendations(found: Sequence[Recommendation]) -> str:
+def render_recommendations(found: Sequence[_Recommendation]) -> str:
     """A table of settings: present value, recommended value, reason."""
     rows = [[each.key, *map(plain, (each.now, each.value)), each.why] for each in found]
     return render_table([["setting", "now", "recommended", "why"], *rows])
 
 
-def changed_settings_yaml(found: Sequence[Recommendation]) -> str:
+def changed_settings_yaml(found: Sequence[_Recommendation]) -> str:
     """YAML of the settings to change; '' if there are none."""
     tree: dict[str, Any] = {}
     for each in found:
@@ -89,14 +89,14 @@ def changed_settings_yaml(found: Sequence[Recommendation]) -> str:
     return yaml.dump(tree, Dumper=Dumper, sort_keys=False) if tree else ""
 
 
-def _of(config: RunConfig, key: str, value: Any, why: str) -> Recommendation:
+def _of(config: RunConfig, key: str, value: Any, why: str) -> _Recommendation:
     now: Any = config
     for name in key.split("."):
         now = getattr(now, name)
-    return Recommendation(key, now, value, why)
+    return _Recommendation(key, now, value, why)
 
 
-def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
+def _rat(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     cells = config.pose_cells
     yield (size := _cell_size(config, scene))
     yield (across := _cells_xy(config, scene, size.value))
@@ -111,7 +111,7 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     yield _of(config, "session.precision", "float64", "what the published figures are of")
 
 
-def _cell_size(config: RunConfig, scene: Scene) -> Recommendation:
+def _cell_size(config: RunConfig, scene: Scene) -> _Recommendation:
     now = config.pose_cells.cell_size
     moved, most = scene.usual / now, scene.most / now
     why = (
@@ -126,7 +126,7 @@ def _cell_size(config: RunConfig, scene: Scene) -> Recommendation:
     return _of(config, "pose_cells.cell_size", value, why)
 
 
-def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Recommendation:
+def _cells_xy(config: RunConfig, scene: Scene, size: float) -> _Recommendation:
     now, span = config.pose_cells.cells_xy, max(scene.span)
     cover = min(cells_to_cover(span, size), MOST)
     # What recall and its map do is the same on any torus: then the one there is will do.
@@ -139,7 +139,7 @@ def _cells_xy(config: RunConfig, scene: Scene, size: float) -> Recommendation:
     return _of(config, "pose_cells.cells_xy", value, spanned + free)
 
 
-def _engine(config: RunConfig, proposed: NetworkConfig) -> Recommendation:
+def _engine(config: RunConfig, proposed: NetworkConfig) -> _Recommendation:
     levels = window_levels(proposed, np.dtype(float))
     shapes = ["x".join(map(str, level.window.shape[::-1])) for level in levels]
     if len(levels) == 1:
@@ -151,16 +151,21 @@ def _engine(config: RunConfig, proposed: NetworkConfig) -> Recommendation:
     return _of(config, "attractor.engine", "window", why)
 
 
-def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
+def _grid(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     grid, side = config.grid, config.grid.side or LIVE_SIDE
     blob, cell = grid.footprint.blob_sd, round_number(grid.footprint.blob_sd)
     across = int(np.ceil(side / cell))
-    off = _drifted(grid.drift, scene) / cell
+    # Standard deviation of odometry after crossing the scene, by the filter's drift model.
+    span, drift = max(scene.span), grid.drift
+    cycles = max(span / scene.usual, 1.0)
+    along = span * np.hypot(np.hypot(drift.session, drift.move), drift.step / np.sqrt(cycles))
+    aside = span * drift.heading * np.sqrt(cycles / 3)
+    off = float(np.hypot(along, aside)) / cell
     wanted = int(np.clip(round_number(max(PER_CELL * off, 1.0), steps=(1, 2, 3, 5)), *PARTICLES))
     each = LAYERS * across**2 * np.dtype(np.float32).itemsize / 2**20
     count = min(wanted, max(PARTICLES[0], int(MEMORY / each)))
     yield _of(config, "grid.cell", cell, f"as fine as the mark of a contact, {blob:g} m")
-    why = f"{max(scene.span):.3g} m of path and what whiskers reach from it: {across} cells"
+    why = f"{span:.3g} m of path and what whiskers reach from it: {across} cells"
     yield _of(config, "grid.side", side, why)
     why = (
         f"{PER_CELL} for each cell ({off:.2g}) that odometry is off across the scene; {count * each:.0f} MiB"
@@ -170,7 +175,7 @@ def _grid(config: RunConfig, scene: Scene) -> Iterator[Recommendation]:
     yield _of(config, "session.precision", "float32", "half the memory; evidence needs no more digits")
 
 
-def _tier(config: RunConfig) -> Iterator[Recommendation]:
+def _tier(config: RunConfig) -> Iterator[_Recommendation]:
     simulation = config.simulation
     if simulation is None:
         return
@@ -186,16 +191,6 @@ def _parts(cells: float) -> int:
     return max(1, int(np.ceil(cells / LARGEST_SUBSTEP - 1e-9)))
 
 
-def _drifted(drift: DriftConfig, scene: Scene) -> float:
-    """Standard deviation of odometry after crossing the scene by the filter's drift model, m."""
-    span = max(scene.span)
-    cycles = max(span / scene.usual, 1.0)
-    lasting = np.hypot(drift.session, drift.move)
-    along = span * np.hypot(lasting, drift.step / np.sqrt(cycles))
-    aside = span * drift.heading * np.sqrt(cycles / 3)
-    return float(np.hypot(along, aside))
-
-
 COARSER = 1.5  # factor on the size of a cell in a cheaper step
 FEWER = 3  # divisor of the number of particles in a cheaper step
 ENERGY = 0.05
@@ -204,7 +199,15 @@ ENERGY = 0.05
 
 def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
     """The next cheaper step in every direction: settings in place of the recommended ones, by name."""
-    steps = _cheaper_grid(config) if config.backend == "grid" else _cheaper_cells(config)
+    grid, steps = config.grid, dict[str, dict[str, Any]]()
+    if config.backend == "grid":
+        fewer = max(2, grid.particles // FEWER)
+        if fewer < grid.particles:
+            steps[f"{fewer} particles"] = {"grid.particles": fewer}
+        size = float(f"{grid.cell * COARSER:.3g}")
+        steps[f"cells of {size:g} m"] = {"grid.cell": size}
+    else:
+        steps = _cheaper_cells(config)
     if config.session.precision == "float64":
         steps["float32"] = {"session.precision": "float32"}
     if config.simulation is not None and (config.simulation.raw or config.simulation.fidelity == "dynamic"):
@@ -212,7 +215,7 @@ def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
     return steps
 
 
-def try_settings(config: RunConfig, found: Sequence[Recommendation], cycles: int) -> list[RunRecord]:
+def try_settings(config: RunConfig, found: Sequence[_Recommendation], cycles: int) -> list[RunRecord]:
     """Runs of the recommended settings, of the configured ones if they differ, and of every cheaper step.
 
     Args:
@@ -261,12 +264,3 @@ def _cheaper_cells(config: RunConfig) -> dict[str, dict[str, Any]]:
         if config.recording is None and "energy" not in config.templates.model_fields_set:
             steps["classic backend"]["templates.energy"] = ENERGY
     return steps
-
-
-def _cheaper_grid(config: RunConfig) -> dict[str, dict[str, Any]]:
-    grid, steps = config.grid, dict[str, dict[str, Any]]()
-    fewer = max(2, grid.particles // FEWER)
-    if fewer < grid.particles:
-        steps[f"{fewer} particles"] = {"grid.particles": fewer}
-    size = float(f"{grid.cell * COARSER:.3g}")
-    return steps | {f"cells of {size:g} m": {"grid.cell": size}}

@@ -1,8 +1,7 @@
-"""One run of a study: a session played in memory, scored and timed.
+"""Runs of a study: a session is played in memory, scored and timed, and its record is kept.
 
-The record of a run, and the file of a study that holds one record a line.
-
-Runs the jobs of a study; a job with a record is not run again.
+`runs.jsonl` holds one record a line; a job whose record is there is not run again. Jobs run in the processes
+of an executor, or, where their speed is compared, one at a time on one core.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ class RunRecord(Settings):
         return self.quantities[name].odometry if name in self.quantities else None
 
 
-def record_of(job: Job, error: str | None = None, machine: Machine | None = None) -> RunRecord:
+def _record_of(job: Job, error: str | None = None, machine: Machine | None = None) -> RunRecord:
     """The record of a job without an outcome."""
     names = {name: getattr(job, name) for name in ("hash", "seed", "copy_number", "row", "varied")}
     return RunRecord(**names, error=error, machine=machine)
@@ -125,24 +124,24 @@ class RunLog:
 SAME_PLACE = 2.5  # largest true distance between the ends of a true loop closure, pose cells
 
 
-def run_job(job: Job) -> RunRecord:
-    """Runs a job in this process. An `InputError` is recorded, so that the study continues."""
+def run_job(job: Job, kernels: Path | None = None) -> RunRecord:
+    """Runs a job in this process. An `InputError` is recorded, so that the study continues.
+
+    Args:
+        kernels: folder in which compiled kernels are kept, for each configuration its own.
+    """
+    if kernels is not None:
+        jax.config.update("jax_compilation_cache_dir", str(kernels / job.hash))
     load = watch_load()
     reset_peak_memory()
     try:
         with _precision(job.config.session.precision):
             found = _play(job)
     except InputError as error:
-        return record_of(job, str(error), machine())
+        return _record_of(job, str(error), machine())
     measured = found["measured"] | {"memory": peak_memory()}
     here = machine().model_copy(update={"other_load": load()})
-    return record_of(job).model_copy(update=found | {"measured": measured, "machine": here})
-
-
-def run_job_alone(kernels: Path, job: Job) -> RunRecord:
-    """Runs a job in a fresh process; compiled kernels are kept in the given folder for its configuration."""
-    jax.config.update("jax_compilation_cache_dir", str(kernels / job.hash))
-    return run_job(job)
+    return _record_of(job).model_copy(update=found | {"measured": measured, "machine": here})
 
 
 def _play(job: Job) -> dict[str, Any]:
@@ -166,7 +165,12 @@ def _play(job: Job) -> dict[str, Any]:
         exm = config.score.experience_metric
         quantities = score_run(run, source.name, exm=exm, relations=relations).quantities
         quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
-        quantities |= _closures(session, run.truth, config.pose_cells.cell_size)
+        closures, false = session.map.closures(), np.nan
+        if run.truth is not None:
+            apart = np.hypot(*(run.truth[closures[:, 0]] - run.truth[closures[:, 1]])[:, :2].T)
+            false = int((apart > SAME_PLACE * config.pose_cells.cell_size).sum())
+        quantities |= quantity("closures", Finding(len(closures)))
+        quantities |= quantity("false_closures", Finding(false))
         quantities |= quantity("lost_share", Finding(lost))
         for name, finding in anchored_errors(run).items():
             quantities |= quantity(name, finding)
@@ -207,15 +211,6 @@ def _take_steps(session: Session, source: Source, pace: str, watch: Stopwatch) -
         online_error=np.array(present.errors),
     )
     return run, float(np.mean([bool(step.estimate.lost) for step in estimates]))
-
-
-def _closures(session: Session, truth: np.ndarray | None, cell: float) -> dict[str, Quantity]:
-    """Number of loop closures and of false ones."""
-    closures, false = session.map.closures(), Finding(np.nan)
-    if truth is not None:
-        apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
-        false = Finding(int((apart > SAME_PLACE * cell).sum()))
-    return quantity("closures", Finding(len(closures))) | quantity("false_closures", false)
 
 
 def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:
@@ -264,7 +259,7 @@ def run_jobs(
         function: runs a job; default `run_job`.
     """
     found, done = dict(log.records), done or (lambda record: None)
-    killed = partial(record_of, error=KILLED)
+    killed = partial(_record_of, error=KILLED)
     wanted: dict[str, Job] = {}
     for job in jobs:
         wanted.setdefault(job.key, job)
@@ -292,7 +287,7 @@ def measure_jobs(jobs: Sequence[Job], log: RunLog, done: Done | None = None) -> 
     """
     order = sorted(range(len(jobs)), key=lambda k: (jobs[k].seed, jobs[k].copy_number))
     with TemporaryDirectory(ignore_cleanup_errors=True) as kernels, one_core(), Executor(fresh=True) as fresh:
-        alone = partial(run_job_alone, Path(kernels))
+        alone = partial(run_job, kernels=Path(kernels))
         records = dict(zip(order, run_jobs([jobs[k] for k in order], log, fresh, done, alone), strict=True))
     return [records[k] for k in range(len(jobs))]
 

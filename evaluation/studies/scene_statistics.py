@@ -1,6 +1,6 @@
-"""Statistics of a scene that settings follow from, and a short version of its session.
+"""Statistics of a scene that settings follow from; short versions of its session; tiers of its simulation.
 
-Cost of simulation, and how images differ between its tiers of fidelity; shortened sessions.
+A tier is a fidelity of simulation; compared are its cost, and how its images differ from another tier's.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A study: a base configuration, its variations, and the runs that follow from them.
 
-Settings of a study are put into a configuration so that error messages name their place in the study.
-
-The keys of a study file.
+`StudyPlan` has the keys of a study file. Its settings are put into the base so that error messages name their
+place in the study; a run is known by a hash of its configuration, by its seed and by its copy.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import partial
 from itertools import combinations, product
 from math import prod
 from pathlib import Path
@@ -39,16 +38,13 @@ from tactile.base.errors import InputError, InputErrors
 from tactile.base.settings import Settings
 
 
-def _known(name: str) -> str:
+def _quantity_name(name: str, *, directed: bool = False) -> str:
+    """The name of a quantity, with `directed` of one of which large or small values are better."""
     if name not in METRICS:
         near = get_close_matches(name, METRICS, n=1)
         cure = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COLUMNS['means'])} and others"
         raise ValueError(f"no quantity of that name; {cure}")
-    return name
-
-
-def _directed(name: str) -> str:
-    if METRICS[name].direction is None:
+    if directed and METRICS[name].direction is None:
         raise ValueError("neither large nor small is better; list it in minimise or maximise")
     return name
 
@@ -56,8 +52,8 @@ def _directed(name: str) -> str:
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 Seeds = Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
 Copies = Annotated[int, Field(ge=0, le=10_000)]
-Known = Annotated[str, AfterValidator(_known)]
-Directed = Annotated[Known, AfterValidator(_directed)]
+Known = Annotated[str, AfterValidator(_quantity_name)]
+Directed = Annotated[str, AfterValidator(partial(_quantity_name, directed=True))]
 
 
 class Parameter(Settings):
@@ -214,12 +210,8 @@ class Job(NamedTuple):
         return run_key(self.hash, self.seed, self.copy_number)
 
 
-class Setting(NamedTuple):
-    """A dotted key of a configuration, its value, and the path in the study where that is written."""
-
-    key: str
-    value: Any
-    at: KeyPath
+_Setting = tuple[str, Any, KeyPath]
+"""A dotted key of a configuration, its value, and the path in the study where that is written."""
 
 
 class Study(NamedTuple):
@@ -259,7 +251,7 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
     file = find_config(plan.base, folder)
     base = load(file)
     for key in _outermost_first(plan.set):
-        base = _put(base, Setting(key, plan.set[key], ("set", key)), document)
+        base = _put(base, (key, plan.set[key], ("set", key)), document)
     study = Study(name, plan, document, override(base, of_runs), file.parent, keys, ())
     parameters = plan.tune.parameters if plan.tune else {}
     first = {key: parameter.extremes[0] for key, parameter in parameters.items()}
@@ -271,7 +263,9 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
 
 def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
     """The runs of the study's base with parameters by key path; an `InputError` if they are contradictory."""
-    settings = [Setting(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
+    settings: list[_Setting] = [
+        (key, value, ("tune", "parameters", key)) for key, value in parameters.items()
+    ]
     return list(_runs_of(study, settings, "tune", RowPlan(), parameters))
 
 
@@ -281,14 +275,14 @@ def _jobs(study: Study) -> Iterator[Job]:
     total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
     if total > MOST:
         raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
-    alternatives = [
-        [Setting(key, value, ("vary", key, k)) for k, value in enumerate(values)]
+    alternatives: list[list[_Setting]] = [
+        [(key, value, ("vary", key, k)) for k, value in enumerate(values)]
         for key, values in plan.vary.items()
     ]
     wrong: dict[str, InputError] = {}
     for name, row in rows.items():
         keys = _outermost_first(row.settings)
-        fixed = [Setting(key, row.settings[key], ("rows", name, key)) for key in keys]
+        fixed: list[_Setting] = [(key, row.settings[key], ("rows", name, key)) for key in keys]
         for varied in product(*alternatives):
             try:
                 yield from _runs_of(study, [*fixed, *varied], name, row, {key: v for key, v, _ in varied})
@@ -300,7 +294,7 @@ def _jobs(study: Study) -> Iterator[Job]:
 
 
 def _runs_of(
-    study: Study, settings: Sequence[Setting], name: str, row: RowPlan, varied: dict[str, Any]
+    study: Study, settings: Sequence[_Setting], name: str, row: RowPlan, varied: dict[str, Any]
 ) -> Iterator[Job]:
     """The study's base with further settings, under every seed and copy."""
     plan, document = study.plan, study.base
@@ -309,7 +303,7 @@ def _runs_of(
     config = validate(document, RunConfig).with_absolute_paths(study.folder.resolve())
     keys = {key: study.document.at_key(("set", key)) for key in plan.set}
     keys |= {key: f"--set {key}" for key in study.overridden}
-    keys |= {each.key: study.document.at_key(_without_index(each.at)) for each in settings}
+    keys |= {key: study.document.at_key(_without_index(at)) for key, _, at in settings}
     if seed_key(config) in keys:
         raise InputError(keys[seed_key(config)], "a seed", "the study's `seeds`")
     parts = (plan.pace, plan.reference_tier, "" if row.ablation == FULL else repr(row.ablation))
@@ -320,7 +314,7 @@ def _runs_of(
         yield Job(name, varied, seeded, digest, seed, copy_number, *how)
 
 
-def _put(document: Document, setting: Setting, study: Document) -> Document:
+def _put(document: Document, setting: _Setting, study: Document) -> Document:
     """The document with a setting of the study; raises an `InputError` if there is no such key."""
     key, value, at = setting
     where = study.at_key(at)
@@ -406,17 +400,20 @@ def _digest_of(config: RunConfig, how: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+_CONTENT: dict[tuple[Path, int, int], str] = {}
+"""Digests of files by path, time of modification and size."""
+
+
 def _content(path: Path) -> str:
-    """The digest of a file's content; the path of what is not a file."""
+    """The sha256 of a file's content; the path of what is not a file."""
     try:
         stat = path.stat()
-        return _digest(path, stat.st_mtime_ns, stat.st_size) if path.is_file() else str(path)
+        if not path.is_file():
+            return str(path)
+        key = path, stat.st_mtime_ns, stat.st_size
+        if key not in _CONTENT:
+            with path.open("rb") as file:
+                _CONTENT[key] = hashlib.file_digest(file, "sha256").hexdigest()
+        return _CONTENT[key]
     except OSError:
         return str(path)
-
-
-@lru_cache(maxsize=256)
-def _digest(path: Path, modified: int, size: int) -> str:
-    """sha256 of a file; `modified` and `size` distinguish its versions in the cache."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

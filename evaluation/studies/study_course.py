@@ -47,17 +47,6 @@ class StudyCourse(NamedTuple):
     chosen: np.ndarray
 
 
-class _Session(NamedTuple):
-    """truth: [T, 3] m, m, rad. seconds: [T] of each step. template: [T] int32, -1 before the first view.
-    relative: [T] heading minus that of the template, rad. energy: [T] injected."""
-
-    truth: np.ndarray
-    seconds: np.ndarray
-    template: np.ndarray
-    relative: np.ndarray
-    energy: np.ndarray
-
-
 def read_course(
     config: RunConfig, steps: int, views: bool, bins: int, chosen: tuple[int, ...], seed: int
 ) -> StudyCourse:
@@ -77,25 +66,81 @@ def read_course(
     """
     config = config.model_copy(update={"backend": "classic"})
     with open_observations(config) as (config, source):
-        session = _watch(config, source, steps) if views else _drive(source, steps)
+        truth, seconds, template, relative, energy = _read_session(config, source, steps, views)
         name = source.name
     network = network_of(config.pose_cells, config.attractor)
-    _check(name, network, session, views)
-    expected = expected_poses(network, session.truth)
-    unit = stream(seed, "cells.noise").standard_normal((len(expected), 2))
-    unit[:, 1] *= np.sqrt(session.seconds)
-    template = np.maximum(session.template, 0)
-    newest = np.maximum.accumulate(np.r_[-1, session.template])
+    motion = _checked_motion(name, network, truth, seconds)
+    if views and template.max() < 0:
+        raise InputError(name, "no views", "views that the classic backend can match", "views=false")
+    expected = expected_poses(network, truth)
+    noise = stream(seed, "cells.noise").standard_normal((len(expected), 2))
+    noise[:, 1] *= np.sqrt(seconds)
+    newest = np.maximum.accumulate(np.r_[-1, template])
     course = CellCourse(
-        _motions(session), unit, template, session.template > newest[:-1],
-        session.relative / units(network, np.dtype(float))[2], session.energy,
+        motion, noise, np.maximum(template, 0), template > newest[:-1],
+        relative / units(network, np.dtype(float))[2], energy,
     )  # fmt: skip
-    bin, x_edges, y_edges = place_bins(session.truth, bins)
-    cells = np.array(chosen, np.int32) if chosen else cells_on_the_way(network, expected)
+    bin, x_edges, y_edges = place_bins(truth, bins)
+    cells = np.array(chosen, np.int32)
+    if not chosen:  # the cells nearest to the undisturbed packet at equally spaced times
+        at = ((np.arange(CELLS) + 0.5) / CELLS * len(expected)).astype(int)
+        x, y, heading = (np.round(expected[at]).astype(int) % rings(network, np.dtype(int))).T
+        cells = ((heading * network.cells_xy + y) * network.cells_xy + x).astype(np.int32)
     most = network.cells_heading * network.cells_xy**2
     if cells.max() >= most:
         raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, session.seconds, x_edges, y_edges, cells)
+    return StudyCourse(name, network, course, expected, bin, seconds, x_edges, y_edges, cells)
+
+
+def _read_session(
+    config: RunConfig, source: Source, steps: int, views: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Truth [T, 3] m, m, rad, duration [T] of each step, s, and what the views show, if wanted: template
+    [T], -1 before the first view, heading [T] minus that of the template, rad, and energy [T] injected."""
+    rows = []
+
+    def observations() -> Iterator[Observation]:
+        for sample, observation in islice(read_observations(source), steps):
+            rows.append((sample.truth, observation.odometry[3]))
+            yield observation
+
+    if views:
+        seen = [step.evidence for step in build_session(config, source).replay(observations())]
+        template, relative, energy = (
+            np.array([getattr(each, name) for each in seen]) for name in ("template", "relative", "energy")
+        )
+    else:
+        template = np.full(sum(1 for _ in observations()), -1, np.int32)
+        relative = energy = np.zeros(len(template))
+    if len(rows) < 2:
+        raise InputError(source.name, f"{len(rows)} steps", "at least two", "a longer session")
+    unknown = np.full(3, np.nan)
+    truth = np.array([unknown if pose is None else pose for pose, _ in rows], float)
+    if np.isnan(truth).all():
+        raise InputError(source.name, "no true poses", "a source whose true poses are known", "a simulation")
+    return truth, np.array([seconds for _, seconds in rows], float), template, relative, energy
+
+
+def _checked_motion(name: str, config: PoseCellConfig, truth: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[T, 3] body-frame motions between the true poses, each of less than half the torus."""
+    for what, values in (("true pose", truth), ("duration", seconds[:, None])):
+        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(wrong):
+            raise InputError(f"{name}, step {wrong[0]}", f"its {what} is unknown or not finite", "numbers")
+    if seconds.min() < 0 or seconds.sum() <= 0:
+        raise InputError(name, "steps without duration", "durations in s from 0 on")
+    if not np.ptp(truth[:, :2], axis=0).any():
+        raise InputError(name, "the robot stays in one place", "a path through an arena")
+    motion = from_poses(np.cumsum(seconds), truth)[:, :3]
+    reach = np.hypot(*motion[1:, :2].T)
+    turn, half = np.abs(motion[1:, 2]), config.cells_xy * config.cell_size / 2
+    fast = np.flatnonzero((reach >= half) | (turn >= np.pi))
+    if len(fast):
+        k = fast[0]
+        found = f"a motion of {reach[k]:.3g} m and {turn[k]:.3g} rad"
+        expected = f"less than half the torus, {half:.3g} m and 3.14 rad, in a step"
+        raise InputError(f"{name}, step {k + 1}", found, expected, "larger pose_cells, or shorter steps")
+    return motion
 
 
 def expected_poses(config: PoseCellConfig, truth: np.ndarray) -> np.ndarray:
@@ -117,73 +162,3 @@ def place_bins(truth: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np
     edges = middle[:, None] + side * (np.arange(bins + 1) / bins - 0.5)
     at = np.clip(((truth[:, :2] - edges[:, 0]) / side * bins).astype(int), 0, bins - 1)
     return at[:, 1] * bins + at[:, 0], edges[0], edges[1]
-
-
-def cells_on_the_way(config: PoseCellConfig, expected: np.ndarray) -> np.ndarray:
-    """[8] flat indices of the cells nearest to the undisturbed packet at eight equally spaced times."""
-    at = ((np.arange(CELLS) + 0.5) / CELLS * len(expected)).astype(int)
-    x, y, heading = (np.round(expected[at]).astype(int) % rings(config, np.dtype(int))).T
-    return ((heading * config.cells_xy + y) * config.cells_xy + x).astype(np.int32)
-
-
-def _drive(source: Source, steps: int) -> _Session:
-    """The session without its views."""
-    rows = [
-        (sample.truth, observation.odometry[3])
-        for sample, observation in islice(read_observations(source), steps)
-    ]
-    nothing = np.zeros(len(rows))
-    return _Session(*_poses(source.name, rows), np.full(len(rows), -1, np.int32), nothing, nothing)
-
-
-def _watch(config: RunConfig, source: Source, steps: int) -> _Session:
-    """The session with the templates that it sees."""
-    rows = []
-
-    def observations() -> Iterator[Observation]:
-        for sample, observation in islice(read_observations(source), steps):
-            rows.append((sample.truth, observation.odometry[3]))
-            yield observation
-
-    seen = [step.evidence for step in build_session(config, source).replay(observations())]
-    columns = [
-        np.array([getattr(each, name) for each in seen]) for name in ("template", "relative", "energy")
-    ]
-    return _Session(*_poses(source.name, rows), *columns)
-
-
-def _poses(name: str, rows: list) -> tuple[np.ndarray, np.ndarray]:
-    if len(rows) < 2:
-        raise InputError(name, f"{len(rows)} steps", "at least two", "a longer session")
-    unknown = np.full(3, np.nan)
-    truth = np.array([unknown if pose is None else pose for pose, _ in rows], float)
-    if np.isnan(truth).all():
-        raise InputError(name, "no true poses", "a source whose true poses are known", "a simulation")
-    return truth, np.array([seconds for _, seconds in rows], float)
-
-
-def _motions(session: _Session) -> np.ndarray:
-    """[T, 3] body-frame motions between the true poses."""
-    return from_poses(np.cumsum(session.seconds), session.truth)[:, :3]
-
-
-def _check(name: str, config: PoseCellConfig, session: _Session, views: bool) -> None:
-    for what, values in (("true pose", session.truth), ("duration", session.seconds[:, None])):
-        wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(wrong):
-            raise InputError(f"{name}, step {wrong[0]}", f"its {what} is unknown or not finite", "numbers")
-    if session.seconds.min() < 0 or session.seconds.sum() <= 0:
-        raise InputError(name, "steps without duration", "durations in s from 0 on")
-    if not np.ptp(session.truth[:, :2], axis=0).any():
-        raise InputError(name, "the robot stays in one place", "a path through an arena")
-    motion = _motions(session)[1:]
-    reach = np.hypot(*motion[:, :2].T)
-    turn, half = np.abs(motion[:, 2]), config.cells_xy * config.cell_size / 2
-    fast = np.flatnonzero((reach >= half) | (turn >= np.pi))
-    if len(fast):
-        k = fast[0]
-        found = f"a motion of {reach[k]:.3g} m and {turn[k]:.3g} rad"
-        expected = f"less than half the torus, {half:.3g} m and 3.14 rad, in a step"
-        raise InputError(f"{name}, step {k + 1}", found, expected, "larger pose_cells, or shorter steps")
-    if views and session.template.max() < 0:
-        raise InputError(name, "no views", "views that the classic backend can match", "views=false")

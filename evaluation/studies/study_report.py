@@ -1,8 +1,7 @@
-"""The table of a study as text, Markdown, CSV and JSON, and its picture of speed against error.
+"""The report of a study: statistics over runs, the Pareto front, tables and the picture of speed and error.
 
-The rows of a study: statistics over seeds and copies, and which rows are Pareto-optimal.
-
-Plot of error against time per cycle for several configurations, with the Pareto front.
+Rows are statistics over the seeds and copies of a configuration. The table is text, Markdown, CSV and JSON;
+the picture shows error against time per step with the Pareto front.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -39,7 +38,7 @@ DEAD_RECKONING = "dead reckoning"  # name of the row of raw odometry
 
 
 @dataclass(frozen=True)
-class Spread:
+class _Spread:
     """Statistics of a quantity over the runs of a row."""
 
     values: tuple[float | None, ...]  # by run, None where it has none
@@ -52,7 +51,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Row:
+class _Row:
     """One configuration of a study."""
 
     row: str  # name
@@ -60,7 +59,7 @@ class Row:
     runs: int  # number of runs with an outcome
     failed: int  # number of the others
     steps: float  # median number of observations
-    spreads: dict[str, Spread]  # by quantity, without those that no run has
+    spreads: dict[str, _Spread]  # by quantity, without those that no run has
     optimal: bool = False  # no other row is at least as fast and as good and better in one of both
 
     @property
@@ -82,7 +81,7 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[Row]:
+def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
     """A row for each name and combination, in their order; last that of raw odometry if asked for."""
     groups: dict[str, list[RunRecord]] = {}
     for record in records:
@@ -93,24 +92,29 @@ def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[Row]
     return rows
 
 
-def default_error(rows: Sequence[Row]) -> str | None:
+def default_error(rows: Sequence[_Row]) -> str | None:
     """The first default error that most rows have in all of their runs; None if no row has any."""
     whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
     best = max(DEFAULT_ERRORS, key=whole.count)
     return best if best in whole else None
 
 
-def mark_optimal(rows: Sequence[Row], objectives: Mapping[str, Direction], statistic: str) -> list[Row]:
+def mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
     """The rows with `optimal` set by the mean or median of each objective.
 
     Only a row whose runs all have all objectives can be optimal.
     """
-    costs = np.array([[_cost(row, each, objectives[each], statistic) for each in objectives] for row in rows])
-    best = pareto_optimal(costs.reshape(-1, len(objectives)))
+    costs = []  # low values are better; NaN where a run lacks an objective
+    for row, (name, direction) in product(rows, objectives.items()):
+        found = row.spreads.get(name)
+        known = not row.failed and found is not None and None not in found.values
+        value: float = getattr(found, statistic) if known else np.nan
+        costs.append(-value if direction == "high" else value)
+    best = pareto_optimal(np.array(costs).reshape(-1, len(objectives)))
     return [replace(row, optimal=bool(each)) for row, each in zip(rows, best, strict=True)]
 
 
-def spread(values: Sequence[float | None], name: str) -> Spread | None:
+def spread(values: Sequence[float | None], name: str) -> _Spread | None:
     """Statistics of a quantity's values; None if there is no value."""
     known = [float(value) for value in values if value is not None]
     if not known:
@@ -119,10 +123,10 @@ def spread(values: Sequence[float | None], name: str) -> Spread | None:
     worst = {"low": high, "high": low, None: None}[METRICS[name].direction if name in METRICS else None]
     deviation = statistics.stdev(known) if len(known) > 1 else None
     mean, median = statistics.fmean(known), statistics.median(known)
-    return Spread(tuple(values), mean, deviation, median, low, high, worst)
+    return _Spread(tuple(values), mean, deviation, median, low, high, worst)
 
 
-def _row(group: Sequence[RunRecord], odometry: bool = False) -> Row:
+def _row(group: Sequence[RunRecord], odometry: bool = False) -> _Row:
     fine = [record for record in group if record.error is None]
     names = dict.fromkeys([metric.name for metric in MEASURED])
     names |= dict.fromkeys(each for record in fine for each in record.quantities)
@@ -130,7 +134,7 @@ def _row(group: Sequence[RunRecord], odometry: bool = False) -> Row:
         each: spread([run.odometry(each) if odometry else run.value(each) for run in fine], each)
         for each in names
     }
-    return Row(
+    return _Row(
         row=DEAD_RECKONING if odometry else group[0].row,
         varied={} if odometry else group[0].varied,
         runs=len(fine),
@@ -138,15 +142,6 @@ def _row(group: Sequence[RunRecord], odometry: bool = False) -> Row:
         steps=statistics.median([record.steps for record in fine]) if fine else 0.0,
         spreads={each: found for each, found in spreads.items() if found is not None},
     )
-
-
-def _cost(row: Row, name: str, direction: Direction, statistic: str) -> float:
-    """An objective of a row, low values better; NaN where a run lacks it."""
-    found = row.spreads.get(name)
-    if row.failed or found is None or None in found.values:
-        return np.nan
-    value: float = getattr(found, statistic)
-    return -value if direction == "high" else value
 
 
 _TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
@@ -314,13 +309,13 @@ PACES = {"live": "one step at a time", "replay": "a chunk of steps at a time"}
 
 
 @dataclass(frozen=True)
-class Report:
+class _Report:
     """The outcome of a study."""
 
     name: str  # of the study
     kind: str  # of the table
     columns: Sequence[str]  # quantities shown
-    rows: Sequence[Row]
+    rows: Sequence[_Row]
     error: str | None  # quantity of the Pareto front
     measured: dict[str, str]  # machine, versions, build, seeds and pace, by name
     remarks: Sequence[str]  # sentences
@@ -328,7 +323,7 @@ class Report:
 
 def make_report(
     name: str, plan: StudyPlan, records: Sequence[RunRecord], error: str | None = None, search: bool = False
-) -> Report:
+) -> _Report:
     """The report of a study's records.
 
     Args:
@@ -351,10 +346,10 @@ def make_report(
     seeds = len({record.seed for record in records})
     measured = describe_machines(machines, seeds) | {"pace": PACES[plan.pace]}
     columns = list(dict.fromkeys(columns))
-    return Report(name, kind, columns, rows, error, measured, [*remarks, *find_disturbances(machines)])
+    return _Report(name, kind, columns, rows, error, measured, [*remarks, *find_disturbances(machines)])
 
 
-def render(report: Report) -> str:
+def render(report: _Report) -> str:
     """The table and its notes as Markdown; Pareto-optimal rows are bold. Of a search only those are shown."""
     names = [name for name in report.columns if any(name in row.spreads for row in report.rows)]
     table = [["", "runs", "steps", *(f"{name} {METRICS[name].unit}".strip() for name in names)]]
@@ -379,7 +374,7 @@ def render_table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *others])
 
 
-def draw(report: Report) -> Figure | None:
+def _draw(report: _Report) -> Figure | None:
     """Time per step against error; an error that is better high is taken from 1."""
     if report.error is None:
         return None
@@ -400,13 +395,13 @@ def draw(report: Report) -> Figure | None:
     return draw_pareto(title, below, marks, "time per step (us), median", error_text)
 
 
-def save_report(report: Report, directory: Path) -> list[Path]:
-    """Writes table.csv, table.json and table.md, and pareto.png where there is something to draw."""
+def save_report(report: _Report, directory: Path) -> list[Path]:
+    """Writes table.csv, table.json and table.md, and pareto.png where there is something to _draw."""
     content = json.dumps(asdict(report), indent=1, allow_nan=False) + "\n"
     paths = [directory / f"table.{kind}" for kind in ("csv", "json", "md")]
     for path, text in zip(paths, (_csv(report), content, f"{render(report)}\n"), strict=True):
         write_text_atomically(path, text)
-    picture, figure = directory / "pareto.png", draw(report)
+    picture, figure = directory / "pareto.png", _draw(report)
     if figure is None:
         picture.unlink(missing_ok=True)  # of an earlier call
         return paths
@@ -414,7 +409,7 @@ def save_report(report: Report, directory: Path) -> list[Path]:
     return [*paths, picture]
 
 
-def _cell(found: Spread | None, kind: str, base: Spread | None) -> str:
+def _cell(found: _Spread | None, kind: str, base: _Spread | None) -> str:
     if found is None:
         return "-"
     text = format_number(found.mean if kind in MEANS else found.median)
@@ -438,7 +433,7 @@ def _title(name: str) -> str:
     return f"{name}: {METRICS[name].label.strip()}"
 
 
-def _note(report: Report) -> str:
+def _note(report: _Report) -> str:
     kind = "Means ± standard deviation" if report.kind in MEANS else "Medians"
     note = f"{kind} over runs (worst)" + ", and the difference from the first row" * (report.kind in COMPARED)
     note += f"; {'; '.join(report.measured.values())}."
@@ -459,20 +454,18 @@ def describe_machines(machines: Sequence[Machine], seeds: int) -> dict[str, str]
     def every(texts: Sequence[str]) -> str:
         return " and ".join(dict.fromkeys(texts)) or "unknown"
 
+    names = []
+    for each in machines:
+        at_once = "one run at a time" if each.workers == 1 else f"{each.workers} runs at a time"
+        where = f"{os.cpu_count()} cores, {at_once}" if each.device == "cpu" else each.device
+        names.append(f"{each.processor}, {where}")
     versions = [", ".join(f"{name} {value}" for name, value in each.versions.items()) for each in machines]
     return {
-        "machine": every([_machine_text(each) for each in machines]),
+        "machine": every(names),
         "versions": every(versions),
         "build": f"build {every([each.build for each in machines])}",
         "seeds": f"{seeds} seed{'s' if seeds != 1 else ''}",
     }
-
-
-def _machine_text(machine: Machine) -> str:
-    if machine.device != "cpu":
-        return f"{machine.processor}, {machine.device}"
-    at_once = "one run at a time" if machine.workers == 1 else f"{machine.workers} runs at a time"
-    return f"{machine.processor}, {os.cpu_count()} cores, {at_once}"
 
 
 def find_disturbances(machines: Sequence[Machine]) -> list[str]:
@@ -491,7 +484,7 @@ def find_disturbances(machines: Sequence[Machine]) -> list[str]:
     return found
 
 
-def _kept(rows: Sequence[Row], limit: float | None) -> list[str]:
+def _kept(rows: Sequence[_Row], limit: float | None) -> list[str]:
     """The share of rows after the first whose final error stays within a limit."""
     others = rows[1:-1]
     base = rows[0].spreads.get("ate_final") if rows else None
@@ -503,7 +496,7 @@ def _kept(rows: Sequence[Row], limit: float | None) -> list[str]:
     return [f"{kept} of {len(others)} rows ({kept / len(others):.0%}) end at an ATE of {most:.3g} m or less"]
 
 
-def _csv(report: Report) -> str:
+def _csv(report: _Report) -> str:
     lines = []
     for row in report.rows:
         cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}

@@ -1,4 +1,8 @@
-"""The table of agreement: scores of recorded cells beside those of opexebo and pynapple."""
+"""The table of agreement: scores of recorded pose cells beside those of opexebo and pynapple.
+
+Each package gets the same maps in its own convention; `grid_score`, `border_score` and `mutual_information`
+call the packages so. They are also what the tests of `evaluation/cells` compare its scores with.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +46,7 @@ CELLS, GOAL = 100, 1e-6
 COLUMNS = ("score", "package", "cells", "largest difference", "goal", "largest score")
 
 
-class Agreement(NamedTuple):
+class _Agreement(NamedTuple):
     """One score. mine, theirs: [n] of the same cells, NaN where undefined."""
 
     score: str
@@ -57,7 +61,7 @@ class Agreement(NamedTuple):
         return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
 
 
-def compare_scores(task: Task, seconds: float = SECONDS) -> list[Agreement]:
+def compare_scores(task: Task, seconds: float = SECONDS) -> list[_Agreement]:
     """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps.
 
     Args:
@@ -66,7 +70,7 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[Agreement]:
     Raises:
         InputError: a package is not installed.
     """
-    opexebo, pynapple = load_package("opexebo"), load_package("pynapple")
+    opexebo, pynapple = _load_package("opexebo"), _load_package("pynapple")
     count = task.sessions or CELLS
     recording = with_active_cells(record_rat("rat", 2 * count, seconds=seconds, seed=task.first), count)
     rates = recording.activity * float(np.prod(recording.shape))
@@ -76,7 +80,7 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[Agreement]:
         return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
 
 
-def agreement_table(result: list[Agreement]) -> Iterator[str]:
+def agreement_table(result: list[_Agreement]) -> Iterator[str]:
     """The lines of the table."""
     yield (
         "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
@@ -89,7 +93,7 @@ def agreement_table(result: list[Agreement]) -> Iterator[str]:
         yield markdown_row([one.score, one.package, len(one.mine), found, f"{GOAL:.0e}", largest])
 
 
-def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
     analysis, maps, curves = opexebo.analysis, rate_maps(sums, 1.5), tuning_curves(sums)
     masked = [np.ma.masked_invalid(each) for each in maps]
     seconds = np.ma.masked_where(np.isnan(maps[0]), sums.seconds)
@@ -101,32 +105,32 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[Agreement
         "peak of the map": (peak_rate, "peak_rate"),
     }
     for name, (score, key) in named.items():
-        yield Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
+        yield _Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
     plain = np.nan_to_num(rate_maps(sums, 0.0))
     framed = neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
     theirs = _numbers(analysis.rate_map_coherence(np.ma.masked_invalid(each)) for each in plain)
-    yield Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
+    yield _Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
     tuned = [analysis.tuning_curve_stats(np.ma.masked_invalid(each)) for each in curves]
     vector = mean_vector_length(curves, sums.heading_seconds)
-    yield Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
+    yield _Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
     fields = find_fields(maps)
     own = np.unique(fields.cell)
     theirs = _numbers(border_score(opexebo, maps, fields, cell) for cell in own)
-    yield Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
+    yield _Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
     images = autocorrelogram(np.nan_to_num(maps))
     theirs = _numbers(grid_score(opexebo, image) for image in images)
-    yield Agreement("grid score", "opexebo", lattice_scores(images), theirs)
+    yield _Agreement("grid score", "opexebo", lattice_scores(images), theirs)
 
 
-def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[Agreement]:
+def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
     for what, rates, seconds in (
         ("place", rate_maps(sums, 1.5), sums.seconds),
         ("heading", tuning_curves(sums), sums.heading_seconds),
     ):
         theirs = mutual_information(pynapple, rates, seconds)
         mine = information(rates, seconds), information_rate(rates, seconds)
-        yield Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
-        yield Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
+        yield _Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
+        yield _Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
 
 
 def _numbers(values: Iterator[Any]) -> np.ndarray:
@@ -135,11 +139,11 @@ def _numbers(values: Iterator[Any]) -> np.ndarray:
 
 FIGURE = Figure("Agreement with other packages", compare_scores, agreement_table, None)
 
-
 HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
+"""How each package is installed."""
 
 
-def load_package(name: str) -> ModuleType:
+def _load_package(name: str) -> ModuleType:
     """A package of `HOW`.
 
     Raises:

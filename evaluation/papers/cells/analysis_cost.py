@@ -1,10 +1,9 @@
-"""The analysis table: time of rate maps, scores and shuffles of recorded cells."""
+"""The table of costs: time of rate maps, scores and shuffles of recorded cells on one core."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import shuffled_scores
-from evaluation.papers.cells.panels import Taken, median, on_one_core, time_call
+from evaluation.papers.cells.panels import Taken, on_one_core, time_call
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells
-from evaluation.papers.cells.shuffles import PLACE_SCORES, place_bins
+from evaluation.papers.cells.shuffles import PLACE_SCORES, path_bins
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 
@@ -31,21 +30,10 @@ MAPS, ALL, GRID = (
 GOALS = {MAPS: "5", ALL: "", GRID: "60"}
 
 
-class AnalysisCost(NamedTuple):
-    """times: by row. cells: of each row. shuffles: of a cell. seconds: of the session.
-    circumstances: machine and load."""
-
-    times: dict[str, Taken]
-    cells: dict[str, int]
-    shuffles: int
-    seconds: float
-    circumstances: str
-
-
 def measure_analysis(
     cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS, seed: int = 0
-) -> AnalysisCost:
-    """Measures the analysis of a session of a rat.
+) -> tuple[str, dict[str, tuple[int, Taken]]]:
+    """What is measured, as sentences, and number of cells and time of each analysis of a session of a rat.
 
     Args:
         cells: with grid scores. shuffles: of each. seconds: of the session.
@@ -53,22 +41,31 @@ def measure_analysis(
     recording = record_rat("rat", 2 * cells, sums=True, seconds=seconds, seed=seed)
     chosen = with_active_cells(recording, cells)
     shuffle = partial(
-        shuffled_scores, chosen.activity, place_bins(chosen), PLACE_SCORES["grid score"], shuffles, seed
+        shuffled_scores,
+        chosen.activity,
+        path_bins(chosen, "place"),
+        PLACE_SCORES["grid score"],
+        shuffles,
+        seed,
     )
     calls: dict[str, Callable[[], object]] = {
-        MAPS: partial(map_and_tune, recording),
+        MAPS: partial(_map_and_tune, recording),
         ALL: partial(analyse_all_cells, recording),
     }
     with on_one_core() as found:
         repeats = [{name: time_call(call) for name, call in calls.items()} for _ in range(ROUNDS)]
-        times = {name: median([each[name] for each in repeats]) for name in calls}
+        times = {name: Taken(*np.median([each[name] for each in repeats], axis=0).tolist()) for name in calls}
         times[GRID] = time_call(shuffle)
     every = int(np.prod(recording.shape))
     counts = {MAPS: every, ALL: every, GRID: len(chosen.cell)}
-    return AnalysisCost(times, counts, shuffles, seconds, found.text)
+    note = (
+        f"A session of a rat of {seconds:.0f} s at 20 Hz in 20 x 20 place and 36 heading bins; "
+        f"{shuffles} shuffles of each cell. {found[0]}\n"
+    )
+    return note, {name: (counts[name], taken) for name, taken in times.items()}
 
 
-def map_and_tune(recording: CellRecording) -> None:
+def _map_and_tune(recording: CellRecording) -> None:
     """Rate maps, spatial information and head-direction tuning of all cells of the sums."""
     assert recording.sums is not None
     maps, curves = rate_maps(recording.sums), tuning_curves(recording.sums)
@@ -79,16 +76,13 @@ def map_and_tune(recording: CellRecording) -> None:
     rayleigh_p(curves * hz, recording.sums.heading_seconds)
 
 
-def analysis_table(result: AnalysisCost) -> Iterator[str]:
+def analysis_table(result: tuple[str, dict[str, tuple[int, Taken]]]) -> Iterator[str]:
     """The lines of the table."""
-    yield (
-        f"A session of a rat of {result.seconds:.0f} s at 20 Hz in 20 x 20 place and 36 heading bins; "
-        f"{result.shuffles} shuffles of each cell. {result.circumstances}\n"
-    )
+    note, rows = result
+    yield note
     yield markdown_header(COLUMNS)
-    for name, taken in result.times.items():
-        numbers = result.cells[name], f"{taken.processor:.2f}", f"{taken.wall:.2f}"
-        yield markdown_row([name, *numbers, GOALS[name]])
+    for name, (cells, taken) in rows.items():
+        yield markdown_row([name, cells, f"{taken.processor:.2f}", f"{taken.wall:.2f}", GOALS[name]])
 
 
 FIGURE = Figure(

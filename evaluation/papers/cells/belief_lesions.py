@@ -27,7 +27,7 @@ from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_
 from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
-from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, SessionResult, closure_errors
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, closure_errors
 from ratslam.core.backend import Backend
 from ratslam.core.session import Session
 from ratslam.methods.recall import RecallBackend
@@ -65,18 +65,16 @@ Functions = Mapping[str, Callable[..., Any]]
 """Functions of `pose_cells` by name."""
 
 
-def constant_prediction() -> Functions:
+def _predict_constant(
+    network: Network, belief: Belief, cells: ViewCells, motion: Array
+) -> tuple[Array, Array]:
     """Every view cell is reached by the same share of the activity, wherever that is."""
-
-    def predict(network: Network, belief: Belief, cells: ViewCells, motion: Array) -> tuple[Array, Array]:
-        del network, motion
-        share = jnp.sum(belief.activity) / jnp.maximum(jnp.sum(cells.used), 1.0)
-        return share * cells.used, jnp.zeros_like(share)
-
-    return {"predict": predict}
+    del network, motion
+    share = jnp.sum(belief.activity) / jnp.maximum(jnp.sum(cells.used), 1.0)
+    return share * cells.used, jnp.zeros_like(share)
 
 
-def permuted_together(seed: int) -> Functions:
+def _permuted_together(seed: int) -> Functions:
     """Cells change places, and all that is tied to them goes with them: a network of other names."""
     tie, excite = pose_cells.tie, pose_cells.excite
 
@@ -92,7 +90,7 @@ def permuted_together(seed: int) -> Functions:
     return {"tie": tie_moved, "excite": excite_moved}
 
 
-def permuted_cells(seed: int) -> Functions:
+def _permuted_cells(seed: int) -> Functions:
     """After every view the activities of all cells change places; the ties stay."""
     anchor = pose_cells.anchor
 
@@ -104,7 +102,7 @@ def permuted_cells(seed: int) -> Functions:
     return {"anchor": anchor_moved}
 
 
-def permuted_ties(seed: int) -> Functions:
+def _permuted_ties(seed: int) -> Functions:
     """Every view cell is tied to the cells around a random pose, always the same; the cells stay."""
     predict, anchor = pose_cells.predict, pose_cells.anchor
 
@@ -120,11 +118,6 @@ def permuted_ties(seed: int) -> Functions:
         "predict": lambda network, belief, cells, motion: predict(network, belief, elsewhere(cells), motion),
         "anchor": lambda network, belief, cells, mass: anchor(network, belief, elsewhere(cells), mass),
     }
-
-
-def no_path_integration() -> Functions:
-    """Odometry moves no cell."""
-    return {"integrate_path": lambda cells, motion: cells}
 
 
 def silent_cells(share: float, seed: int) -> Functions:
@@ -160,11 +153,12 @@ def foreign_activity(recorded: np.ndarray) -> Functions:
 
 LESIONS: dict[str, Callable[[int], Functions]] = {
     INTACT: lambda seed: {},
-    "prediction constant": lambda seed: constant_prediction(),
-    "cells and ties permuted together": permuted_together,
-    "cells permuted alone": permuted_cells,
-    "ties permuted alone": permuted_ties,
-    "no path integration": lambda seed: no_path_integration(),
+    "prediction constant": lambda seed: {"predict": _predict_constant},
+    "cells and ties permuted together": _permuted_together,
+    "cells permuted alone": _permuted_cells,
+    "ties permuted alone": _permuted_ties,
+    # Odometry moves no cell.
+    "no path integration": lambda seed: {"integrate_path": lambda cells, motion: cells},
     **{f"{share:.0%} silent": partial(silent_cells, share) for share in SILENT},
 }
 """The lesions by name; `EXCHANGED` needs a session of its own. Each makes functions from a seed."""
@@ -178,7 +172,7 @@ GOALS = {
 }
 
 
-class LesionTask(NamedTuple):
+class _LesionTask(NamedTuple):
     """A session with a lesion. row: of the touch table; "": Intel's recording."""
 
     lesion: str
@@ -186,7 +180,7 @@ class LesionTask(NamedTuple):
     maze: int
 
 
-class LesionFigures(NamedTuple):
+class _LesionFigures(NamedTuple):
     """Figures of a session. figures: None for Intel. closures: [K, 2] steps. true: closures that are true."""
 
     figures: SessionFigures | None
@@ -194,45 +188,43 @@ class LesionFigures(NamedTuple):
     true: int
 
 
-class LesionResult(NamedTuple):
-    """Figures of each session."""
-
-    found: Mapping[LesionTask, LesionFigures]
-
-    def of(self, lesion: str, row: str) -> list[tuple[LesionFigures, LesionFigures]]:
-        """The sessions of a row with a lesion, each beside that of the intact network."""
-        return [
-            (one, self.found[task._replace(lesion=INTACT)])
-            for task, one in self.found.items()
-            if (task.lesion, task.row) == (lesion, row)
-        ]
-
-
 def measure_lesions(
     task: Task, lesions: Sequence[str] = (*LESIONS, EXCHANGED), rows: Sequence[str] = ROWS
-) -> LesionResult:
-    """The sessions of all lesions; those on Intel where it is at hand."""
+) -> Mapping[_LesionTask, _LesionFigures]:
+    """The figures of the sessions of all lesions; those on Intel where it is at hand."""
     tasks = [
-        LesionTask(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions
+        _LesionTask(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions
     ]
     if not INTEL.missing(Path()):
-        tasks += [LesionTask(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
-    return LesionResult(dict(zip(tasks, run_tasks(run_lesion, tasks, workers=task.workers), strict=True)))
+        tasks += [_LesionTask(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
+    return dict(zip(tasks, run_tasks(_run_lesion, tasks, workers=task.workers), strict=True))
 
 
-def run_lesion(task: LesionTask) -> LesionFigures:
+def beside_intact(
+    found: Mapping[_LesionTask, _LesionFigures], lesion: str, row: str
+) -> list[tuple[_LesionFigures, _LesionFigures]]:
+    """The sessions of a row with a lesion, each beside that of the intact network."""
+    return [
+        (one, found[task._replace(lesion=INTACT)])
+        for task, one in found.items()
+        if (task.lesion, task.row) == (lesion, row)
+    ]
+
+
+def _run_lesion(task: _LesionTask) -> _LesionFigures:
     """Runs one session with its lesion."""
     if task.lesion == EXCHANGED:
-        functions = foreign_activity(record_activity(task._replace(maze=task.maze + AWAY)))
+        functions = foreign_activity(_record_activity(task._replace(maze=task.maze + AWAY)))
     else:
         functions = LESIONS[task.lesion](task.maze)
     with replaced(functions):
         if not task.row:
             claims = closure_claims(run_recording(INTEL.configuration(Path())))
-            true = claims.accepted & (claims.distance <= FALSE_DISTANCE)
-            return LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], int(true.sum()))
+            true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
+            return _LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], true)
         result, figures = run_and_measure(TouchTask(task.row, task.maze), new_session)
-    return LesionFigures(figures, result.closures, _true(result))
+    true = int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
+    return _LesionFigures(figures, result.closures, true)
 
 
 @contextmanager
@@ -244,7 +236,7 @@ def replaced(functions: Functions) -> Iterator[None]:
         yield
 
 
-def record_activity(task: LesionTask) -> np.ndarray:
+def _record_activity(task: _LesionTask) -> np.ndarray:
     """[n, H, Y, X] activity of the intact network after every `EVERY` steps of a session."""
     config, log = collect_session(task_config(TouchTask(task.row, task.maze)))
     session = new_session(config, log)
@@ -256,27 +248,23 @@ def record_activity(task: LesionTask) -> np.ndarray:
     return np.stack([one for one in recorded if one.shape == recorded[-1].shape])
 
 
-def _true(result: SessionResult) -> int:
-    return int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
-
-
 @cache
 def _order(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     """A permutation of the cells of a network."""
     return stream(seed, f"cells.permuted.{'x'.join(map(str, shape))}").permutation(int(np.prod(shape)))
 
 
-def same_closures(one: LesionFigures, other: LesionFigures) -> float:
+def same_closures(one: _LesionFigures, other: _LesionFigures) -> float:
     """Share of the closures of another session that are in this one, pair for pair; NaN if there are none."""
     pairs, others = ({tuple(pair) for pair in each.closures.tolist()} for each in (one, other))
     return len(pairs & others) / len(others) if others else np.nan
 
 
-def table_lesions(result: LesionResult) -> list[str]:
+def table_lesions(result: Mapping[_LesionTask, _LesionFigures]) -> list[str]:
     """The lines of the table, and what it does not show."""
-    lesions = list(dict.fromkeys(task.lesion for task in result.found))
-    rows = [row for row in dict.fromkeys(task.row for task in result.found) if row]
-    mazes = len(result.of(INTACT, rows[0]))
+    lesions = list(dict.fromkeys(task.lesion for task in result))
+    rows = [row for row in dict.fromkeys(task.row for task in result) if row]
+    mazes = len(beside_intact(result, INTACT, rows[0]))
     lines = [
         f"Medians over {mazes} mazes a row, closures are sums. Goal: "
         + "; ".join(f"{lesion}: {goal}" for lesion, goal in GOALS.items() if lesion in lesions)
@@ -296,12 +284,12 @@ NOT_SHOWN = (
 )
 
 
-def _cells(result: LesionResult, lesion: str, row: str) -> list[str]:
-    sessions = result.of(lesion, row)
+def _cells(result: Mapping[_LesionTask, _LesionFigures], lesion: str, row: str) -> list[str]:
+    sessions = beside_intact(result, lesion, row)
     figures = [one.figures for one, _ in sessions if one.figures is not None]
     same = [same_closures(*pair) for pair in sessions]
     closures = sum(one.metrics.closures for one in figures)
-    intel = result.of(lesion, "")
+    intel = beside_intact(result, lesion, "")
     return [
         f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
         f"{closures}, {sum(one.metrics.false_closures for one in figures)}",
@@ -312,10 +300,10 @@ def _cells(result: LesionResult, lesion: str, row: str) -> list[str]:
     ]
 
 
-def draw_lesions(result: LesionResult, png: Path) -> None:
+def draw_lesions(result: Mapping[_LesionTask, _LesionFigures], png: Path) -> None:
     """Share of revisits closed, and EM, of every lesion."""
-    lesions = list(dict.fromkeys(task.lesion for task in result.found))
-    rows = [row for row in dict.fromkeys(task.row for task in result.found) if row]
+    lesions = list(dict.fromkeys(task.lesion for task in result))
+    rows = [row for row in dict.fromkeys(task.row for task in result) if row]
     panels = (
         ("revisits closed", "share", lambda one: one.revisits_closed),
         ("EM", "m² + rad²", lambda one: one.metrics.em),
@@ -326,7 +314,9 @@ def draw_lesions(result: LesionResult, png: Path) -> None:
     for panel, (title, across, value) in zip(axes[0], panels, strict=True):
         for k, row in enumerate(rows):
             colour = COLOURS[k % len(COLOURS)]
-            found = [[value(one.figures) for one, _ in result.of(lesion, row)] for lesion in lesions]
+            found = [
+                [value(one.figures) for one, _ in beside_intact(result, lesion, row)] for lesion in lesions
+            ]
             up = at + 0.2 - 0.4 * k
             panel.barh(up, np.nanmedian(found, axis=1), 0.36, color=colour, alpha=0.35, label=row)
             for y, group in zip(up, found, strict=True):
@@ -353,7 +343,7 @@ CALLS = 20
 """Of which the fastest counts."""
 
 
-class SizeTask(NamedTuple):
+class _SizeTask(NamedTuple):
     """A session of a network of `side` cells of `size` m along x and y, and whether it grows with the map."""
 
     row: str
@@ -363,7 +353,7 @@ class SizeTask(NamedTuple):
     grows: bool
 
 
-class SizeFigures(NamedTuple):
+class _SizeFigures(NamedTuple):
     """figures: of the session. sides: cells along x and y at its end. update: time of the network's part of
     an update with the keyframes at its end, us."""
 
@@ -372,26 +362,20 @@ class SizeFigures(NamedTuple):
     update: float
 
 
-class SizeResult(NamedTuple):
-    """Figures of each session."""
-
-    found: Mapping[SizeTask, SizeFigures]
-
-
 def measure_sizes(
     task: Task,
     row: str = "exploration",
     sides: Sequence[int] = SIDES,
     sizes: Sequence[float] = SIZES,
-) -> SizeResult:
-    """Sessions of networks of all sides, growing and not, and of all sizes of a cell, growing."""
+) -> Mapping[_SizeTask, _SizeFigures]:
+    """The figures of networks of all sides, growing and not, and of all sizes of a cell, growing."""
     chosen = [(side, CELL, grows) for grows in (False, True) for side in sides]
     chosen += [(int(np.ceil(SIDE * CELL / size)), size, True) for size in sizes]
-    tasks = [SizeTask(row, maze, *each) for each in dict.fromkeys(chosen) for maze in task.seeds(1)]
-    return SizeResult(dict(zip(tasks, run_tasks(run_size, tasks, workers=task.workers), strict=True)))
+    tasks = [_SizeTask(row, maze, *each) for each in dict.fromkeys(chosen) for maze in task.seeds(1)]
+    return dict(zip(tasks, run_tasks(_run_size, tasks, workers=task.workers), strict=True))
 
 
-def run_size(task: SizeTask) -> SizeFigures:
+def _run_size(task: _SizeTask) -> _SizeFigures:
     """Runs one session. Only the network has other cells: the lengths of recall and of the map, which the
     product counts in cells, stay what they are with the usual ones."""
     unit = CELL / task.size  # so much longer is a length in the network's cells
@@ -416,7 +400,7 @@ def run_size(task: SizeTask) -> SizeFigures:
     with replaced(functions), patch.object(filter, "BASIN", filter.BASIN * unit):
         _, figures = run_and_measure(TouchTask(task.row, task.maze), start)
     _, y, x = sessions[0].state.belief.activity.shape
-    return SizeFigures(figures, (x, y), _update_time(sessions[0]))
+    return _SizeFigures(figures, (x, y), _update_time(sessions[0]))
 
 
 def _update_time(session: Session) -> float:
@@ -436,13 +420,13 @@ def _update_time(session: Session) -> float:
     return 1e6 * min(time_call(lambda: jax.block_until_ready(run())).processor for _ in range(CALLS))
 
 
-def table_sizes(result: SizeResult) -> list[str]:
+def table_sizes(result: Mapping[_SizeTask, _SizeFigures]) -> list[str]:
     """The lines of the table, and what it does not show."""
     columns = (
         "cells a side", "cell, m", "grows", "cells at the end", "revisits closed", "closures, false", "EM",
         "ARR", "us per update",
     )  # fmt: skip
-    mazes = len({task.maze for task in result.found})
+    mazes = len({task.maze for task in result})
     lines = [
         f"Free exploration, {mazes} maze{'s' * (mazes > 1)}: medians, closures are sums. The usual network"
         f" has {SIDE} cells of {CELL:g} m and grows. Goal: fewer cells than the map needs close less; finer"
@@ -471,15 +455,15 @@ def table_sizes(result: SizeResult) -> list[str]:
     ]
 
 
-def _networks(result: SizeResult) -> dict[tuple[int, float, bool], list[SizeFigures]]:
+def _networks(result: Mapping[_SizeTask, _SizeFigures]) -> dict[tuple[int, float, bool], list[_SizeFigures]]:
     """The sessions of each network: side, size of a cell, whether it grows."""
-    found: dict[tuple[int, float, bool], list[SizeFigures]] = {}
-    for task, figures in result.found.items():
+    found: dict[tuple[int, float, bool], list[_SizeFigures]] = {}
+    for task, figures in result.items():
         found.setdefault((task.side, task.size, task.grows), []).append(figures)
     return found
 
 
-def draw_sizes(result: SizeResult, png: Path) -> None:
+def draw_sizes(result: Mapping[_SizeTask, _SizeFigures], png: Path) -> None:
     """Share of revisits closed against the cells a side and against the time of an update."""
     networks = _networks(result)
     groups = {

@@ -22,7 +22,6 @@ from evaluation.papers.cells.belief_world import (
     CELLS,
     LOOKS,
     PARTICLES,
-    RoomClosures,
     World,
     additive,
     circles,
@@ -67,10 +66,14 @@ CANDIDATE = KeyframeMapConfig().candidate_posterior
 """Probability of a packet from which the keyframe map takes it for a candidate of a closure."""
 ADDITIVE = tuple(product((0.03, 0.1, 0.3, 1.0), (0.0, 0.5, 1.0), (0.05, 0.1, 0.2)))
 """Strength, inhibition and share that is unsure, of which the control has the best."""
+FINE_CELLS = PoseCellConfig(
+    cells_xy=2 * CELLS.cells_xy, cell_size=CELLS.cell_size / 2, cells_heading=2 * CELLS.cells_heading
+)
+"""Cells of half the side in x, y and heading."""
 
 
-class Scores(NamedTuple):
-    """Scores of n sessions by belief.
+class _Scores(NamedTuple):
+    """_Scores of n sessions by belief.
 
     Attributes:
         score: [n] mean over updates of the log probability of the true state over that of a uniform guess,
@@ -83,27 +86,17 @@ class Scores(NamedTuple):
     inside: np.ndarray
 
 
-class PosteriorResult(NamedTuple):
-    """By belief its scores; side of the histogram's cells, in those of the network, and the share of the
-    score by which the last halving moved it; settings of the control."""
-
-    scores: Mapping[str, Scores]
-    side: float
-    moved: float
-    control: tuple[float, ...]
-
-
-def measure_posterior(task: Task, updates: int = UPDATES) -> PosteriorResult:
-    """The scores of the network, of its references and of the control."""
+def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[Mapping[str, _Scores], str]:
+    """The scores of the network, of its references and of the control, and how the last two were set."""
     seeds = task.seeds(8)
     worlds = [random_world(seed, updates) for seed in seeds]
-    side, moved, best = converged(worlds)
+    side, moved, best = _converged(worlds)
     alone = [_packet(world, belief) > ONE_PACKET for world, belief in zip(worlds, best, strict=True)]
     novel = max(float(np.mean([world.truth < 0 for world in worlds])), 1 / updates)
 
-    def scores(beliefs: Sequence[np.ndarray]) -> Scores:
+    def scores(beliefs: Sequence[np.ndarray]) -> _Scores:
         gains = [log_gain(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]
-        return Scores(
+        return _Scores(
             np.array([gain.mean() for gain in gains]),
             np.array([gain[one].mean() for gain, one in zip(gains, alone, strict=True)]),
             np.array([inside(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]),
@@ -116,21 +109,20 @@ def measure_posterior(task: Task, updates: int = UPDATES) -> PosteriorResult:
     found = {
         EXACT: scores(best),
         MANY: scores([particles(world, seed) for world, seed in zip(worlds, seeds, strict=True)]),
-        NETWORK: scores([network(world).belief for world in worlds]),
-        FINER: scores([network(world, cells=finer()).belief for world in worlds]),
+        NETWORK: scores([network(world) for world in worlds]),
+        FINER: scores([network(world, cells=FINE_CELLS) for world in worlds]),
         CONTROL: controls[control],
     }
-    return PosteriorResult(found, side, moved, control)
-
-
-def finer() -> PoseCellConfig:
-    """Cells of half the side in x, y and heading."""
-    return PoseCellConfig(
-        cells_xy=2 * CELLS.cells_xy, cell_size=CELLS.cell_size / 2, cells_heading=2 * CELLS.cells_heading
+    strength, inhibition, unsure = control
+    note = (
+        f"The histogram's cells are {side:g} of the network's; half of that moves its score by"
+        f" {moved:.2%}. The control has the best of {len(ADDITIVE)} settings: injects {strength:g},"
+        f" subtracts {inhibition:g} of the mean, spreads {unsure:g}."
     )
+    return found, note
 
 
-def converged(worlds: Sequence[World]) -> tuple[float, float, list[np.ndarray]]:
+def _converged(worlds: Sequence[World]) -> tuple[float, float, list[np.ndarray]]:
     """Side of the cells of the histogram whose halving moves the score by less than `CLOSE_ENOUGH`, the share
     by which it moves it, and the beliefs at half the side."""
 
@@ -173,10 +165,10 @@ def _near(world: World, places: np.ndarray) -> np.ndarray:
     return apart < BASIN * CELLS.cell_size
 
 
-def table_posterior(result: PosteriorResult) -> list[str]:
+def table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
     """The lines of the table, and what it does not show."""
-    best = result.scores[EXACT]
-    strength, inhibition, unsure = result.control
+    found, note = result
+    best = found[EXACT]
     columns = (
         "belief", "score, nats", "loss", "loss while there is one packet", "truth in its 50 % region",
         "in its 90 % region",
@@ -185,13 +177,11 @@ def table_posterior(result: PosteriorResult) -> list[str]:
         f"{len(best.score)} sessions. Score: mean log probability of the true state over that of a uniform"
         " guess. Goal: the network loses 1 % at most, its regions hold what they say to 5 %; control: loses"
         " more.",
-        f"The histogram's cells are {result.side:g} of the network's; half of that moves its score by"
-        f" {result.moved:.2%}. The control has the best of {len(ADDITIVE)} settings: injects {strength:g},"
-        f" subtracts {inhibition:g} of the mean, spreads {unsure:g}.",
+        note,
         "",
         *markdown_header(columns).splitlines(),
     ]
-    for name, scores in result.scores.items():
+    for name, scores in found.items():
         loss = [
             1 - mine.mean() / its.mean()
             for mine, its in ((scores.score, best.score), (scores.single, best.single))
@@ -205,11 +195,12 @@ def table_posterior(result: PosteriorResult) -> list[str]:
     ]
 
 
-def draw_posterior(result: PosteriorResult, png: Path) -> None:
+def draw_posterior(result: tuple[Mapping[str, _Scores], str], png: Path) -> None:
     """Loss by session, and the regions."""
-    best = result.scores[EXACT].score
-    loss = {name: 100 * (1 - scores.score / best) for name, scores in result.scores.items() if name != EXACT}
-    overall = 1 - result.scores[NETWORK].score.mean() / best.mean()
+    found, _ = result
+    best = found[EXACT].score
+    loss = {name: 100 * (1 - scores.score / best) for name, scores in found.items() if name != EXACT}
+    overall = 1 - found[NETWORK].score.mean() / best.mean()
     line = f"The network loses {overall:.1%} of the score of exact inference. Dots: sessions."
     figure, axes = panel_grid("The activity as a posterior", line, 1, 2, height=2.6)
     for k, (name, values) in enumerate(loss.items()):
@@ -218,7 +209,7 @@ def draw_posterior(result: PosteriorResult, png: Path) -> None:
     axes[0][0].set_yscale("symlog", linthresh=1)
     head_panel(axes[0][0], "loss against exact inference")
     style.name_axes(axes[0][0], "", "loss (%)")
-    for name, scores in result.scores.items():
+    for name, scores in found.items():
         held = 100 * scores.inside.mean(axis=0)
         axes[0][1].plot(np.array(REGIONS) * 100, held, "o-", ms=4, color=COLOURS[name], label=name)
     axes[0][1].plot([40, 100], [40, 100], "--", color=style.GREY, lw=0.9)
@@ -243,17 +234,17 @@ class RoomsResult(NamedTuple):
 
     Attributes:
         share: by belief, [n, T] probability of the true room over that of both. packet: by belief, [n, T] of
-            the best packet. found: by belief, [n] probability of the true room at the end. told: [n, T] bool,
-            whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`. closures,
-            unlike: of sessions of the whole product, in rooms that look alike and in others.
+            the best packet. found: by belief, [n] probability of the true room at the end. evident: [n, T]
+            bool, whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`.
+            closures, unlike: see `room_closures`, of rooms that look alike and of others.
     """
 
     share: Mapping[str, np.ndarray]
     packet: Mapping[str, np.ndarray]
     found: Mapping[str, np.ndarray]
-    told: np.ndarray
-    closures: Sequence[RoomClosures]
-    unlike: Sequence[RoomClosures]
+    evident: np.ndarray
+    closures: Sequence[tuple[int, int, int]]
+    unlike: Sequence[tuple[int, int, int]]
 
 
 def alike_rooms(seed: int) -> World:
@@ -288,19 +279,19 @@ def measure_rooms(task: Task, sessions: int = 3) -> RoomsResult:
     share, packet, last = (
         {name: np.array([row[k] for row in rows]) for name, rows in found.items()} for k in range(3)
     )
-    told = np.cumsum(np.abs(share[EXACT] - 0.5) > SIGN, axis=1) > 0
+    evident = np.cumsum(np.abs(share[EXACT] - 0.5) > SIGN, axis=1) > 0
     seeds = range(task.first, task.first + sessions)
     closures, unlike = (
         list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
         for alike in (True, False)
     )
-    return RoomsResult(share, packet, last, told, closures, unlike)
+    return RoomsResult(share, packet, last, evident, closures, unlike)
 
 
 def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
     """Exact inference, the network, and the control at settings that suit `measure_posterior`."""
     yield EXACT, exact(world)
-    yield NETWORK, network(world).belief
+    yield NETWORK, network(world)
     yield CONTROL, additive(world, *USUAL_CONTROL)
 
 
@@ -315,7 +306,7 @@ def table_rooms(result: RoomsResult) -> list[str]:
         "at the end: median", "worst", "probability of the true room, median",
         "farthest from exact inference, any time",
     )  # fmt: skip
-    pairs, early = len(result.told), ~result.told
+    pairs, early = len(result.evident), ~result.evident
     lines = [
         f"{pairs} pairs of rooms, {COURSE} updates; the first difference is after {DIFFERENCE}. Share of the"
         f" true room in what the belief holds in both. Before: until exact inference leaves 1/2 by {SIGN:g}."
@@ -368,17 +359,12 @@ def draw_rooms(result: RoomsResult, png: Path) -> None:
 
 KIDNAP, AFTER = 40, 80
 """Updates before and after a kidnap."""
+_Kidnaps = tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
+"""By belief: [n] updates from the kidnap until more than half of the belief is at the true place, inf: not
+within `AFTER`; [n, T] probability of novelty."""
 
 
-class KidnapResult(NamedTuple):
-    """steps: by belief, [n] updates from the kidnap until more than half of the belief is at the true place;
-    inf: not within `AFTER`. novelty: by belief, [n, T]."""
-
-    steps: Mapping[str, np.ndarray]
-    novelty: Mapping[str, np.ndarray]
-
-
-def kidnap_world(seed: int) -> World:
+def _kidnap_world(seed: int) -> World:
     """A robot that knows where it is goes round a circle, and is then set down on another one."""
     random, poses = stream(seed, "cells.kidnap"), circles()
     rings = random.permutation(len(poses) // AROUND)[:2]
@@ -391,17 +377,17 @@ def kidnap_world(seed: int) -> World:
     return World(poses, pace(np.ones(len(truth))), likelihood, novelty, truth, start)
 
 
-def measure_kidnaps(task: Task) -> KidnapResult:
+def measure_kidnaps(task: Task) -> _Kidnaps:
     """Kidnaps of the network, of exact inference, and of both controls."""
     found: dict[str, list[tuple[float, np.ndarray]]] = {}
     for seed in task.seeds(40):
-        world = kidnap_world(seed)
+        world = _kidnap_world(seed)
         near = _near(world, world.poses[world.truth])
-        for name, belief in (*_beliefs(world), (NO_ENTRY, network(world, enter=0.0).belief)):
+        for name, belief in (*_beliefs(world), (NO_ENTRY, network(world, enter=0.0))):
             held = (belief[KIDNAP:, :-1] * near[KIDNAP:]).sum(axis=1) > 0.5
             steps = float(held.argmax()) + 1 if held.any() else np.inf
             found.setdefault(name, []).append((steps, belief[:, -1]))
-    return KidnapResult(
+    return (
         {name: np.array([steps for steps, _ in each]) for name, each in found.items()},
         {name: np.array([novelty for _, novelty in each]) for name, each in found.items()},
     )
@@ -410,21 +396,22 @@ def measure_kidnaps(task: Task) -> KidnapResult:
 NO_ENTRY = "network without re-entry (control)"
 
 
-def table_kidnaps(result: KidnapResult) -> list[str]:
+def table_kidnaps(result: _Kidnaps) -> list[str]:
     """The lines of the table, and what it does not show."""
+    found_after, novelties = result
     columns = (
         "belief", "found again", "updates until then: median", "slowest tenth", "novelty before", "its peak",
         "novelty at the end",
     )  # fmt: skip
-    count = len(result.steps[EXACT])
+    count = len(found_after[EXACT])
     lines = [
         f"{count} kidnaps, {AFTER} updates each. Found: more than half of the belief within two pose cells of"
         " the true place. Goal: as fast as exact inference; controls: later or never.",
         "",
         *markdown_header(columns).splitlines(),
     ]
-    for name, steps in result.steps.items():
-        novelty = np.median(result.novelty[name], axis=0)
+    for name, steps in found_after.items():
+        novelty = np.median(novelties[name], axis=0)
         late = [np.median(steps), np.quantile(steps, 0.9, method="higher")]
         cells = [f"{each:.0f}" if np.isfinite(each) else "never" for each in late]
         levels = [novelty[KIDNAP - 1], novelty[KIDNAP:].max(), novelty[-1]]
@@ -439,17 +426,18 @@ def table_kidnaps(result: KidnapResult) -> list[str]:
     ]
 
 
-def draw_kidnaps(result: KidnapResult, png: Path) -> None:
+def draw_kidnaps(result: _Kidnaps, png: Path) -> None:
     """Novelty over time, and how many are found again."""
-    line = f"Found again by the network: {np.isfinite(result.steps[NETWORK]).mean():.0%}. Dashed: the kidnap."
+    found_after, novelties = result
+    line = f"Found again by the network: {np.isfinite(found_after[NETWORK]).mean():.0%}. Dashed: the kidnap."
     figure, axes = panel_grid("Kidnap", line, 1, 2, height=2.6)
     colours = {**COLOURS, NO_ENTRY: style.PURPLE}
-    for name, steps in result.steps.items():
+    for name, steps in found_after.items():
         within = [(steps <= k).mean() for k in range(AFTER + 1)]
         axes[0][1].plot(range(AFTER + 1), within, color=colours[name], lw=1.6, label=name)
         if name == CONTROL:
             continue
-        novelty = np.median(result.novelty[name], axis=0)
+        novelty = np.median(novelties[name], axis=0)
         axes[0][0].plot(np.arange(len(novelty)) - KIDNAP, novelty, color=colours[name], lw=1.6)
     axes[0][0].axvline(0, color=style.GREY, ls="--", lw=0.9)
     head_panel(axes[0][0], "novelty, median")
@@ -472,16 +460,12 @@ CASES: Mapping[str, tuple[tuple[float, ...], bool]] = {
     "view 0.6 against view 0.3": ((0.6, 0.3), False),
 }
 """Reliabilities of views at the angle and at 0; whether the belief is at 0 before."""
+_Weights = Mapping[tuple[str, int, str], np.ndarray]
+"""By case, angle and belief, [n, LONG] share of what the belief holds that is nearer to the cue at the angle
+than to the one at 0, after each update."""
 
 
-class ConflictResult(NamedTuple):
-    """weight: by case, angle and belief, [n, LONG] share of what the belief holds that is nearer to the cue
-    at the angle than to the one at 0, after each update."""
-
-    weight: Mapping[tuple[str, int, str], np.ndarray]
-
-
-def conflict_world(seed: int, reliable: Sequence[float], sure: bool, angle: float) -> World:
+def _conflict_world(seed: int, reliable: Sequence[float], sure: bool, angle: float) -> World:
     """A robot that stands still, with view cells of all headings.
 
     Args:
@@ -503,23 +487,23 @@ def conflict_world(seed: int, reliable: Sequence[float], sure: bool, angle: floa
     return World(poses, still, likelihood, np.ones(LONG), np.zeros(LONG, int), start)
 
 
-def measure_conflicts(task: Task) -> ConflictResult:
+def measure_conflicts(task: Task) -> _Weights:
     """Weights of the cues in all cases and at all angles; seeds turn the headings against the cells."""
     found: dict[tuple[str, int, str], list[np.ndarray]] = {}
     for (case, (reliable, sure)), angle, seed in product(CASES.items(), ANGLES, task.seeds(4)):
-        world = conflict_world(seed, reliable, sure, np.radians(angle))
+        world = _conflict_world(seed, reliable, sure, np.radians(angle))
         away = np.abs(wrap(np.arange(HEADINGS) * 2 * np.pi / HEADINGS - np.radians(angle)))
         home = np.abs(wrap(np.arange(HEADINGS) * 2 * np.pi / HEADINGS))
         nearer = np.where(np.isclose(away, home), 0.5, away < home)
         for name, belief in _beliefs(world):
             held = belief[:, :-1]
             found.setdefault((case, angle, name), []).append(held @ nearer / held.sum(axis=1))
-    return ConflictResult({key: np.array(weights) for key, weights in found.items()})
+    return {key: np.array(weights) for key, weights in found.items()}
 
 
-def table_conflicts(result: ConflictResult) -> list[str]:
+def table_conflicts(result: _Weights) -> list[str]:
     """The lines of the table, and what it does not show."""
-    names = list(dict.fromkeys(name for *_, name in result.weight))
+    names = list(dict.fromkeys(name for *_, name in result))
     columns = (
         "cues, with their reliability", "degrees apart", *(f"weight of the first: {name}" for name in names),
         "network - exact, largest",
@@ -531,8 +515,8 @@ def table_conflicts(result: ConflictResult) -> list[str]:
         *markdown_header(columns).splitlines(),
     ]
     for case, angle in product(CASES, ANGLES):
-        weights = [result.weight[case, angle, name] for name in names]
-        apart = np.abs(result.weight[case, angle, NETWORK] - result.weight[case, angle, EXACT]).max()
+        weights = [result[case, angle, name] for name in names]
+        apart = np.abs(result[case, angle, NETWORK] - result[case, angle, EXACT]).max()
         cells = [f"{each[:, READ - 1].mean():.3f}" for each in weights]
         lines.append(markdown_row([case, angle, *cells, f"{apart:.3f}"]))
     return [
@@ -542,14 +526,14 @@ def table_conflicts(result: ConflictResult) -> list[str]:
     ]
 
 
-def draw_conflicts(result: ConflictResult, png: Path) -> None:
+def draw_conflicts(result: _Weights, png: Path) -> None:
     """Weight of the first cue against the angle, by case."""
-    names = list(dict.fromkeys(name for *_, name in result.weight))
+    names = list(dict.fromkeys(name for *_, name in result))
     line = f"Weight of the first cue after {READ} views; exact inference and the network beside the control."
     figure, axes = panel_grid("Cues in conflict", line, 1, len(CASES))
     for panel, case in zip(axes[0], CASES, strict=True):
         for name in names:
-            weights = [result.weight[case, angle, name][:, READ - 1].mean() for angle in ANGLES]
+            weights = [result[case, angle, name][:, READ - 1].mean() for angle in ANGLES]
             mark = "o" if name == NETWORK else "-"
             panel.plot(ANGLES, weights, mark, color=COLOURS[name], lw=1.6, ms=5, label=name)
         panel.set_ylim(-0.02, 1.02)

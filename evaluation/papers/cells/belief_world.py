@@ -74,22 +74,6 @@ class World(NamedTuple):
     start: np.ndarray
 
 
-class RoomClosures(NamedTuple):
-    """Loop closures of a session after the robot was set down in one of two rooms: those made before the
-    first difference, and at the end those into the room where it is and into the other."""
-
-    early: int
-    true: int
-    false: int
-
-
-class NetworkTrace(NamedTuple):
-    """belief: [T, N + 1]. posterior: [T] of the candidate, see `RecallResult`."""
-
-    belief: np.ndarray
-    posterior: np.ndarray
-
-
 def circles(centres: np.ndarray = CENTRES) -> np.ndarray:
     """[N, 3] poses of view cells along circles, counter-clockwise, `AROUND` on each."""
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
@@ -115,8 +99,8 @@ def random_looks(seed: int, count: int) -> np.ndarray:
 def see(looks: np.ndarray, truth: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Likelihoods [T, N] and [T] of random views along a course: of looks [N], at view cells [T] or -1."""
     any_look = random.integers(0, LOOKS, len(truth))
-    told = (random.random(len(truth)) < RELIABLE) & (truth >= 0)
-    seen = np.where(told, looks[truth], any_look)
+    informative = (random.random(len(truth)) < RELIABLE) & (truth >= 0)
+    seen = np.where(informative, looks[truth], any_look)
     other = (1 - RELIABLE) / LOOKS
     return other + RELIABLE * (looks[None] == seen[:, None]), np.full(len(truth), 1 / LOOKS)
 
@@ -150,7 +134,7 @@ def exact(world: World, cell: float = 0.0, enter: float = CONFIG.enter) -> np.nd
     """
     state, rows = _start(world), []
     for k in range(len(world.motion)):
-        state = _update(world, k, state, _table(world, k, cell), enter)
+        state = _update(world, k, state, cell, enter)
         rows.append(state)
     return np.array(rows)
 
@@ -162,7 +146,7 @@ def particles(world: World, seed: int, count: int = PARTICLES) -> np.ndarray:
     for k in range(len(world.motion)):
         drawn = np.searchsorted(np.cumsum(state), (np.arange(count) + random.random()) / count)
         held = np.bincount(np.minimum(drawn, len(state) - 1), minlength=len(state)) / count
-        state = _update(world, k, held, _table(world, k, 0.0), CONFIG.enter)
+        state = _update(world, k, held, 0.0, CONFIG.enter)
         rows.append(state)
     return np.array(rows)
 
@@ -179,7 +163,7 @@ def additive(world: World, strength: float, inhibition: float, unsure: float, no
     count, rows = len(world.poses), []
     activity = world.start / world.start.sum() if world.start.any() else np.full(count, 1 / count)
     for k in range(len(world.motion)):
-        moved = _table(world, k, 0.0) @ activity
+        moved = _table(world.poses.tobytes(), world.motion[k].tobytes(), 0.0) @ activity
         recalled = np.maximum(world.likelihood[k] - world.novelty[k], 0.0)
         activity = moved / moved.sum() + strength * recalled / max(recalled.sum(), np.finfo(float).tiny)
         left = np.maximum(activity - inhibition / count, 0.0)
@@ -188,23 +172,22 @@ def additive(world: World, strength: float, inhibition: float, unsure: float, no
     return np.array(rows)
 
 
-def network(world: World, enter: float = CONFIG.enter, cells: PoseCellConfig = CELLS) -> NetworkTrace:
-    """The network of the product with these cells; all lengths but theirs stay those of `CELLS`."""
+def network(world: World, enter: float = CONFIG.enter, cells: PoseCellConfig = CELLS) -> np.ndarray:
+    """[T, N + 1] the network of the product with these cells; all other lengths stay those of `CELLS`."""
     config = CONFIG.model_copy(update={"enter": enter})
     unit = CELLS.cell_size / cells.cell_size
     made = Network(cells, config.excite * unit, config.excite_heading, config.miss, config.leak)
     sides = pose_cells.sides_for(made, world.poses)
     run = _compiled(config, made, sides, len(world.poses))
-    mass, posterior = jax.tree.map(
-        lambda rows: np.asarray(rows, float),
-        run(world.poses, world.motion, world.likelihood, world.novelty, world.start),
-    )
-    belief = np.column_stack([mass, np.maximum(1 - mass.sum(axis=1), 0.0)])
-    return NetworkTrace(belief, posterior)
+    given = world.poses, world.motion, world.likelihood, world.novelty, world.start
+    mass = np.asarray(run(*given), float)
+    return np.column_stack([mass, np.maximum(1 - mass.sum(axis=1), 0.0)])
 
 
-def room_closures(seed: int, difference: int, alike: bool = True) -> RoomClosures:
-    """A session of the whole product, views, network and map, with given place ids.
+def room_closures(seed: int, difference: int, alike: bool = True) -> tuple[int, int, int]:
+    """Loop closures of a session of the whole product, views, network and map, with given place ids.
+
+    Those made before the first difference; at the end those into the room of the robot, and into the other.
 
     The robot maps a room by two laps of a circle, drives to another one and maps it likewise. It is then set
     down at the beginning of one of them, which the seed chooses, as a piece of the map of its own
@@ -241,13 +224,13 @@ def room_closures(seed: int, difference: int, alike: bool = True) -> RoomClosure
     early = closures(len(mapped), len(mapped) + difference)
     late = closures(len(mapped) + difference, len(label))
     inside = (late < len(ring)) if own else (late >= len(ring) + len(way))
-    return RoomClosures(len(early), int(inside.sum()), int((~inside).sum()))
+    return len(early), int(inside.sum()), int((~inside).sum())
 
 
 @lru_cache(maxsize=8)
 def _compiled(
     config: RecallConfig, made: Network, sides: tuple[int, ...], count: int
-) -> Callable[..., tuple[Array, Array]]:
+) -> Callable[..., Array]:
     """A course of a world of `count` view cells through `recognise`."""
     prepare_precision("float64")
     # The newest row is that of the robot, which the product does not recall.
@@ -265,15 +248,15 @@ def _compiled(
         mass = jnp.append(start, 0.0)[None].astype(jnp.float32)
         first = pose_cells.anchor(made, first, filter.view_cells(config, memory), mass)
 
-        def update(belief: Belief, given: tuple[Array, Array, Array]) -> tuple[Belief, tuple[Array, Array]]:
+        def update(belief: Belief, given: tuple[Array, Array, Array]) -> tuple[Belief, Array]:
             moved, likely, new = given
             true = jnp.asarray(True)
             seen = ObservationLikelihood(
                 jnp.append(likely, 0.0)[None], new, jnp.full(SAMPLES, jnp.nan), true, true
             )
             local = jnp.zeros((), dtype)
-            belief, result = filter.recognise(config, made, memory, belief, moved, seen, local)
-            return belief, (belief.mass[0, :-1], result.posterior)
+            belief, _ = filter.recognise(config, made, memory, belief, moved, seen, local)
+            return belief, belief.mass[0, :-1]
 
         return lax.scan(update, first, (motion, likelihood, novelty))[1]
 
@@ -284,8 +267,9 @@ def _start(world: World) -> np.ndarray:
     return np.append(world.start, 1 - world.start.sum())
 
 
-def _update(world: World, k: int, state: np.ndarray, table: np.ndarray, enter: float) -> np.ndarray:
-    """[N + 1] probabilities after update k."""
+def _update(world: World, k: int, state: np.ndarray, cell: float, enter: float) -> np.ndarray:
+    """[N + 1] probabilities after update k. cell, enter: see `exact`."""
+    table = _table(world.poses.tobytes(), world.motion[k].tobytes(), cell)
     moved, entered = table @ state[:-1], state[-1] * enter
     new = 1 - moved.sum() - entered
     known = world.likelihood[k] * (moved + entered / len(moved))
@@ -293,13 +277,9 @@ def _update(world: World, k: int, state: np.ndarray, table: np.ndarray, enter: f
     return weighed / weighed.sum()
 
 
-def _table(world: World, k: int, cell: float) -> np.ndarray:
-    """`transition` of update k, computed once for each motion."""
-    return _stored(world.poses.tobytes(), world.motion[k].tobytes(), cell)
-
-
 @lru_cache(maxsize=64)
-def _stored(poses: bytes, motion: bytes, cell: float) -> np.ndarray:
+def _table(poses: bytes, motion: bytes, cell: float) -> np.ndarray:
+    """`transition` of arrays given as bytes, computed once for each motion."""
     return transition(np.frombuffer(poses).reshape(-1, 3), np.frombuffer(motion), cell)
 
 

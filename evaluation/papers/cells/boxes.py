@@ -1,6 +1,6 @@
 """The figure of two boxes: rate maps of the same cells in box A, in A again, and in box B with other cues.
 
-The rat is carried from A to B and set down elsewhere, with another heading; odometry does not tell. Grid
+The rat is carried from A to B and set down elsewhere, with another heading, which odometry does not see. Grid
 cells of one module keep their phases to each other in another box and turn and shift as one (Fyhn et al.
 2007, Nature 446:190); place cells remap, each in its own way (Leutgeb et al. 2005, Science 309:619). The
 maps of all cells are therefore compared as they are and after the best turn and shift common to all.
@@ -56,7 +56,7 @@ _FLAT = 1e-12
 """A variance below this share of the mean square is rounding: the map is flat."""
 
 
-class Alignment(NamedTuple):
+class _Alignment(NamedTuple):
     """The turn and shift common to all cells at which the mean correlation of their maps is highest.
 
     Attributes:
@@ -69,7 +69,7 @@ class Alignment(NamedTuple):
     correlation: np.ndarray
 
 
-def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequence[float]) -> Alignment:
+def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequence[float]) -> _Alignment:
     """The best common turn and shift of the second maps onto the first.
 
     Args:
@@ -77,14 +77,14 @@ def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequenc
             in bins of the maps: shifts wrap round it. angles: to try, rad.
     """
     laid = lay_on_torus(first, bins, 0.0)
-    best = Alignment(np.nan, (0, 0), np.full(len(first), -np.inf))
+    best = _Alignment(np.nan, (0, 0), np.full(len(first), -np.inf))
     for angle in angles:
         fits = correlate_shifts(laid, lay_on_torus(second, bins, angle))
         known = np.isfinite(fits)
         mean = np.where(known, fits, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         y, x = np.unravel_index(mean.argmax(), mean.shape)
         if mean[y, x] > mean_correlation(best.correlation):
-            best = Alignment(float(angle), (int(x), int(y)), fits[:, y, x])
+            best = _Alignment(float(angle), (int(x), int(y)), fits[:, y, x])
     return best
 
 
@@ -142,17 +142,17 @@ def _parts(maps: np.ndarray) -> np.ndarray:
     return np.array([known.astype(float), values, values**2])
 
 
-class MapFit(NamedTuple):
+class _MapFit(NamedTuple):
     """How well maps of n cells fit. still: [n] correlation as they are. best: after the best common turn and
     shift. shuffled_still, shuffled_best: the same with the identities of the cells shuffled."""
 
     still: np.ndarray
-    best: Alignment
+    best: _Alignment
     shuffled_still: np.ndarray
-    shuffled_best: Alignment
+    shuffled_best: _Alignment
 
 
-class BoxSession(NamedTuple):
+class _BoxSession(NamedTuple):
     """One session.
 
     Attributes:
@@ -162,23 +162,18 @@ class BoxSession(NamedTuple):
     """
 
     maps: np.ndarray
-    again: MapFit
-    moved: MapFit
-    single_again: MapFit
-    single_moved: MapFit
+    again: _MapFit
+    moved: _MapFit
+    single_again: _MapFit
+    single_moved: _MapFit
     turn: float
 
 
-class BoxResult(NamedTuple):
-    """Sessions. side: of the box, m. torus: its side, m."""
-
-    sessions: list[BoxSession]
-    side: float
-    torus: float
+_Boxes = tuple[list[_BoxSession], float, float]
 
 
-def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) -> BoxResult:
-    """The fits of all sessions.
+def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) -> _Boxes:
+    """The fits of all sessions, and the sides of box and torus, m.
 
     Args:
         seconds: in A, in A again, and in B. columns: places on the torus.
@@ -197,11 +192,11 @@ def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) 
     for seed in task.seeds(USUAL):
         source = rat_source(config, seed, walk={}, seconds=3 * seconds, phases=[phase])
         side = source.config.box.width
-        sessions.append(fit_session(rats.run(source).recording, seconds, side, columns))
-    return BoxResult(sessions, side, network.cells_xy * network.cell_size)
+        sessions.append(_fit_session(rats.run(source), seconds, side, columns))
+    return sessions, side, network.cells_xy * network.cell_size
 
 
-def fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> BoxSession:
+def _fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> _BoxSession:
     """The fits of a recording of columns in three parts of equal duration: A, A again, and B of the same
     size, with bins of one cell."""
     count = round(side / recording.cell_size)
@@ -221,10 +216,10 @@ def fit_session(recording: CellRecording, seconds: float, side: float, columns: 
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
     maps = np.array(all_maps[0])
-    return BoxSession(maps, again, moved, single_again, single_moved, float(turn))
+    return _BoxSession(maps, again, moved, single_again, single_moved, float(turn))
 
 
-def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> MapFit:
+def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _MapFit:
     """The fit of maps [n, H, W] with others of the same cells on a torus of so many bins a side.
 
     Shuffled identities: each cell is compared with the next one; cells are drawn in no order.
@@ -235,12 +230,12 @@ def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> MapFit:
         for each in (second, other)
     ]
     best = [align_maps(first, each, bins, ANGLES.tolist()) for each in (second, other)]
-    return MapFit(still[0], best[0], still[1], best[1])
+    return _MapFit(still[0], best[0], still[1], best[1])
 
 
-def table_boxes(result: BoxResult) -> list[str]:
+def table_boxes(result: _Boxes) -> list[str]:
     """The lines of the table, and what it does not show."""
-    sessions = result.sessions
+    sessions, side, torus = result
     lines = [
         f"Sessions: {len(sessions)}, of {sessions[0].maps.shape[1]} columns. Correlations: mean over cells, "
         "then the lowest and the highest session.",
@@ -266,7 +261,7 @@ def table_boxes(result: BoxResult) -> list[str]:
     found = ", ".join(f"{np.degrees(wrap(each.moved.best.angle)):.0f}" for each in sessions)
     down = ", ".join(f"{np.degrees(each.turn):.0f}" for each in sessions)
     lines.append(markdown_row(["common turn, degrees", "that of setting down", found, f"{down} set down"]))
-    ratio = f"{result.side:.2f} / {result.torus:.2f} m = {result.side / result.torus:.2f}"
+    ratio = f"{side:.2f} / {torus:.2f} m = {side / torus:.2f}"
     lines.append(markdown_row(["box over torus", "-", ratio, "-"]))
     return [*lines, "", NOT_SHOWN]
 
@@ -278,79 +273,32 @@ NOT_SHOWN = (
 )
 
 
-def draw_result(result: BoxResult, png: Path) -> None:
-    """Maps of six columns in each box, and histograms of the correlations of all columns."""
-    sessions = result.sessions
+def draw_result(result: _Boxes, png: Path) -> None:
+    """Maps of some columns in each box, and histograms of the correlations of all columns."""
+    sessions, side, torus = result
     found = sessions[0].moved.best
-    pairs = []
+    pairs: dict[str, dict[str, np.ndarray]] = {}
     for title, field in (("as they are", "still"), ("after the best common turn and shift", "best")):
         fits = {
             "A with A": ([each.again for each in sessions], field),
             "A with B": ([each.moved for each in sessions], field),
             "A with B, identities shuffled": ([each.moved for each in sessions], f"shuffled_{field}"),
         }
-        pairs.append(MapPairs(title, {name: _correlations(*each) for name, each in fits.items()}))
-    bins = round(result.torus / result.side * sessions[0].maps.shape[2])
+        pairs[title] = {name: _correlations(*each) for name, each in fits.items()}
+    bins = round(torus / side * sessions[0].maps.shape[2])
     first, again, plain = (lay_on_torus(maps, bins, 0.0) for maps in sessions[0].maps)
     other = lay_on_torus(sessions[0].maps[2], bins, found.angle)
     fitted = np.roll(other, found.shift[::-1], axis=(1, 2))
     turned = f"B turned\n{np.degrees(found.angle):.0f}°, shifted"
     rows = {"A": first, "A again": again, "B": plain, turned: fitted}
-    still, best = (_mean(pair.correlations["A with B"]) for pair in pairs)
+    still, best = (_mean(each["A with B"]) for each in pairs.values())
     line = (
-        f"Box {result.side:g} m, torus {result.torus:g} m (ratio {result.side / result.torus:.2f}). Mean "
+        f"Box {side:g} m, torus {torus:g} m (ratio {side / torus:.2f}). Mean "
         f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
     )
-    draw_boxes("Rate maps in two boxes", line, rows, result.torus, pairs, png)
-
-
-def _correlations(fits: list[MapFit], field: str) -> np.ndarray:
-    values = [getattr(each, field) for each in fits]
-    joined = np.concatenate([each.correlation if isinstance(each, Alignment) else each for each in values])
-    return joined[np.isfinite(joined)]
-
-
-def _mean(values: np.ndarray) -> float:
-    """The mean; NaN of none, as in a short session."""
-    return float(values.mean()) if len(values) else np.nan
-
-
-def _range(fits: list[MapFit], field: str) -> str:
-    means = [_mean(_correlations([each], field)) for each in fits]
-    return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
-
-
-FIGURE = Figure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
-
-
-SHOWN = 7
-"""Columns whose maps are drawn."""
-SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
-"""Inches: of a map, between maps, left of them."""
-HEIGHT, LOW = 1.7, 0.95
-"""Inches: of a histogram, below it."""
-COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
-BINS = np.linspace(-1.0, 1.0, 41)
-
-
-class MapPairs(NamedTuple):
-    """Correlations [n] of pairs of maps, by name."""
-
-    title: str
-    correlations: Mapping[str, np.ndarray]
-
-
-def draw_boxes(
-    title: str, line: str, rows: Mapping[str, np.ndarray], torus: float, pairs: Sequence[MapPairs], png: Path
-) -> None:
-    """Draws rows of maps [n, N, N] on the torus and a histogram for each of the pairs.
-
-    Args:
-        torus: side of the torus, m.
-    """
     step = SIDE + GAP
     height = style.TOP + 0.2 + len(rows) * step + 0.75 + HEIGHT + LOW
-    figure = style.new_figure(height, title, line)
+    figure = style.new_figure(height, "Rate maps in two boxes", line)
     for k, (name, maps) in enumerate(rows.items()):
         bottom = height - style.TOP - 0.2 - SIDE - k * step
         figure.text(
@@ -380,18 +328,47 @@ def draw_boxes(
     figure.savefig(png)
 
 
-def _draw_histograms(figure: style.Figure, pairs: Sequence[MapPairs]) -> style.Axes:
+def _correlations(fits: list[_MapFit], field: str) -> np.ndarray:
+    values = [getattr(each, field) for each in fits]
+    joined = np.concatenate([each.correlation if isinstance(each, _Alignment) else each for each in values])
+    return joined[np.isfinite(joined)]
+
+
+def _mean(values: np.ndarray) -> float:
+    """The mean; NaN of none, as in a short session."""
+    return float(values.mean()) if len(values) else np.nan
+
+
+def _range(fits: list[_MapFit], field: str) -> str:
+    means = [_mean(_correlations([each], field)) for each in fits]
+    return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
+
+
+FIGURE = Figure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
+
+
+SHOWN = 7
+"""Columns whose maps are drawn."""
+SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
+"""Inches: of a map, between maps, left of them."""
+HEIGHT, LOW = 1.7, 0.95
+"""Inches: of a histogram, below it."""
+COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
+BINS = np.linspace(-1.0, 1.0, 41)
+
+
+def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:
     gap = 0.7
     width = (style.WIDTH - style.LEFT - style.RIGHT - (len(pairs) - 1) * gap) / len(pairs)
-    for k, pair in enumerate(pairs):
+    for k, (title, correlations) in enumerate(pairs.items()):
         axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
-        for (name, values), colour in zip(pair.correlations.items(), COLOURS, strict=True):
+        for (name, values), colour in zip(correlations.items(), COLOURS, strict=True):
             axes.hist(values, BINS.tolist(), color=colour, alpha=0.65, label=name)
             if len(values):
                 axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
         axes.grid(color=style.LINE_GREY, lw=0.7)
         axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
-        axes.set_title(f"{pair.title}", fontsize=9.5, color=style.INK, loc="left")
+        axes.set_title(title, fontsize=9.5, color=style.INK, loc="left")
         style.name_axes(
             axes, "correlation of two maps of a column (dashed: mean)", "columns" if k == 0 else ""
         )

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
-from evaluation.papers.cells.panels import Taken, on_one_core, time_call
+from evaluation.papers.cells.panels import on_one_core, time_call
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.cell_study import cell_study, score_task, tasks_of
@@ -23,24 +22,18 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class NetworkCost(NamedTuple):
-    """sets, steps: measured. taken: time by row. memory: most of the process meanwhile, MB. circumstances:
-    machine and load."""
-
-    sets: int
-    steps: int
-    taken: dict[str, Taken]
-    memory: dict[str, float]
-    circumstances: str
-
-
-def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> NetworkCost:
+def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, int, dict[str, list[float]]]:
     """Measures a study in float32 on a random walk in a box of 1 m, without its compiling.
 
     Args:
         sets: parameter sets. steps: at 50 Hz.
+
+    Returns:
+        what is measured, as sentences; sets; by row processor and wall time of a step and set, us, of the
+        goal, min, and the most memory of the process meanwhile, MB.
     """
-    taken, memory = {}, {}
+    rows: dict[str, list[float]] = {}
+    count = sets * steps
     with on_one_core() as found:
         for name in GOALS:
             own = [f"views={str(name == 'with views').lower()}", f"steps={steps}", f"sets={sets}"]
@@ -53,25 +46,27 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> NetworkCost:
             each = [
                 time_call(partial(score_task, task._replace(size=len(task.parameters)))) for task in tasks
             ]
-            taken[name] = Taken(*map(sum, zip(*each, strict=True)))
-            memory[name] = peak_memory() * 2**20 / 1e6
-    return NetworkCost(sets, steps, taken, memory, found.text)
-
-
-def network_table(result: NetworkCost) -> Iterator[str]:
-    """The lines of the table."""
-    count = result.sets * result.steps
-    how = "measured" if result.sets >= SETS else f"extrapolated from {result.sets} sets"
-    yield (
-        f"The study `--preset cells` in float32 on a random walk, {result.steps} steps at 50 Hz; views "
-        f"at 10 Hz. Compiling is not included. Minutes are {how}. {result.circumstances}\n"
+            times = [sum(column) for column in zip(*each, strict=True)]
+            rows[name] = [
+                *(1e6 * time / count for time in times),
+                *(time / count * SETS * STEPS / 60 for time in times),
+                peak_memory() * 2**20 / 1e6,
+            ]
+    how = "measured" if sets >= SETS else f"extrapolated from {sets} sets"
+    note = (
+        f"The study `--preset cells` in float32 on a random walk, {steps} steps at 50 Hz; views "
+        f"at 10 Hz. Compiling is not included. Minutes are {how}. {found[0]}\n"
     )
+    return note, sets, rows
+
+
+def network_table(result: tuple[str, int, dict[str, list[float]]]) -> Iterator[str]:
+    """The lines of the table."""
+    note, sets, rows = result
+    yield note
     yield markdown_header(COLUMNS)
-    for name, taken in result.taken.items():
-        each = [1e6 * time / count for time in taken]
-        minutes = [time / count * SETS * STEPS / 60 for time in taken]
-        row = [name, result.sets, *(f"{time:.1f}" for time in (*each, *minutes)), GOALS[name]]
-        yield markdown_row([*row, f"{result.memory[name]:.0f}"])
+    for name, (*times, memory) in rows.items():
+        yield markdown_row([name, sets, *(f"{time:.1f}" for time in times), GOALS[name], f"{memory:.0f}"])
 
 
 FIGURE = Figure(

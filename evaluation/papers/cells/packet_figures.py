@@ -1,13 +1,11 @@
-"""The figure of drift: the packet's error by path integration alone, against the noise of odometry.
+"""The figures of drift and of anchoring: the packet's error by path integration alone, and with views.
 
-Rats walk at random in a box of 1 m without views; networks differ in the noise on their odometry alone. The
-control is that odometry integrated without a network: the packet should add little to its error.
+Drift: rats walk at random in a box of 1 m without views; networks differ in the noise on their odometry.
+The control is that odometry integrated without a network: the packet should add little to its error.
 
-The figure of anchoring: the packet's error with views, in darkness, with shuffled views, and after them.
-
-Each session has a first part in light, in which places are learnt, a test and light again. Sessions differ in
-the test alone: light; darkness; or the views of the test in random order, the control. The path is a slice of
-a real rat's or a random walk.
+Anchoring: each session has a first part in light, in which places are learnt, a test, and light again.
+Sessions differ in the test alone: light; darkness; or the views of the test in random order, the control.
+The path is a slice of a real rat's or a random walk.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evaluation.cells.recording import CellRecording
 from evaluation.papers.cells.panels import (
     error_size,
     head_panel,
@@ -27,7 +26,7 @@ from evaluation.papers.cells.panels import (
     spread_dots,
     torus_error,
 )
-from evaluation.papers.cells.rat_sessions import RatRun, RatSessions, rat_config, rat_source, slice_start
+from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
@@ -36,12 +35,11 @@ from ratslam.classic.batch import CellSets, Network, walk
 from ratslam.classic.config import rings, units
 from ratslam.core.compilation import prepare_precision
 from robot.sources.in_memory import load_into_memory
-from robot.sources.source import Source
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 
 RATE = 10.0
-"""Steps per second."""
+"""Steps per second, and views where there are any."""
 TIMES = (60, 300, 600)
 """Times at which errors are read, s."""
 SPEED = (0.05, 0.1, 0.2, 0.4)
@@ -216,7 +214,6 @@ def _odometry(study: StudyCourse) -> np.ndarray:
 DRIFT = Figure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
 
 
-"""Steps and views per second."""
 PATHS = ("sargolini", "walk")
 """A real rat's path, of which each seed has a slice; a random walk."""
 TESTS = ("light", "dark", "shuffled")
@@ -275,18 +272,18 @@ def measure_anchoring(task: Task, schedule: Schedule | None = None) -> Anchoring
             for seed in task.seeds(ANCHORING_USUAL)
         ]
         for test in TESTS:
-            error[path, test] = np.array([error_size(torus_error(each[test].recording)) for each in runs])
+            error[path, test] = np.array([error_size(torus_error(each[test])) for each in runs])
             again[path, test] = np.array(
-                [anchored_after(each[test], each["light"], schedule) for each in runs]
+                [_anchored_after(each[test], each["light"], schedule) for each in runs]
             )
     return AnchoringResult(schedule, error, again)
 
 
-def anchored_after(run: RatRun, light: RatRun, schedule: Schedule) -> float:
+def _anchored_after(run: CellRecording, light: CellRecording, schedule: Schedule) -> float:
     """Time from the return of the light until the packet is and stays near to that of the session of the same
     seed in light throughout, s; inf if it does not."""
-    apart = run.recording.packet_pose - light.recording.packet_pose
-    far = np.any(error_size(shortest(run.recording, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
+    apart = run.packet_pose - light.packet_pose
+    far = np.any(error_size(shortest(run, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
     held = round(HELD * RATE)
     windows = np.lib.stride_tricks.sliding_window_view(far, held)
     near = np.flatnonzero(~windows.any(axis=1))
@@ -327,9 +324,9 @@ ANCHORING_NOT_SHOWN = (
 
 def draw_anchoring(result: AnchoringResult, png: Path) -> None:
     """Median errors over time, with the range of the middle half of the seeds."""
+    begins, back, end = result.schedule
     during = {
-        test: np.mean([result.median(path, test, *result.schedule[:2]) for path in PATHS], axis=0)
-        for test in TESTS
+        test: np.mean([result.median(path, test, begins, back) for path in PATHS], axis=0) for test in TESTS
     }
     line = "Median error in the test: " + ", ".join(
         f"{test} {m:.2f} m, {rad:.2f} rad" for test, (m, rad) in during.items()
@@ -340,7 +337,12 @@ def draw_anchoring(result: AnchoringResult, png: Path) -> None:
             panel = axes[quantity][column]
             for test in TESTS:
                 _draw_curve(panel, result.error[path, test][..., quantity], test)
-            _mark_test(panel, result.schedule)
+            panel.axvspan(begins, back, color=style.LINE_GREY, lw=0, zorder=0.5)
+            panel.text(
+                (begins + back) / 2, 1.0, "test", transform=panel.get_xaxis_transform(), ha="center",
+                va="top", fontsize=8.5, color=style.LABEL_GREY,
+            )  # fmt: skip
+            panel.set_xlim(0, end)
             panel.set_ylim(bottom=0)
             style.name_axes(panel, "time (s)", up)
         head_panel(axes[0][column], "path of a real rat" if path == "sargolini" else "random walk")
@@ -360,35 +362,24 @@ def _draw_curve(axes: style.Axes, error: np.ndarray, test: str) -> None:
     axes.plot(time, middle, color=ANCHORING_COLOURS[test], lw=1.6, label=f"{test} in the test")
 
 
-def _mark_test(axes: style.Axes, schedule: Schedule) -> None:
-    axes.axvspan(schedule.test, schedule.back, color=style.LINE_GREY, lw=0, zorder=0.5)
-    axes.text(
-        (schedule.test + schedule.back) / 2, 1.0, "test", transform=axes.get_xaxis_transform(), ha="center",
-        va="top", fontsize=8.5, color=style.LABEL_GREY,
-    )  # fmt: skip
-    axes.set_xlim(0, schedule.end)
-
-
-def _run(sessions: RatSessions, schedule: Schedule, path: str, test: str, seed: int) -> RatRun:
+def _run(sessions: RatSessions, schedule: Schedule, path: str, test: str, seed: int) -> CellRecording:
     changed: dict[str, Any] = {"seconds": schedule.end}
     if path == "walk":
         changed["walk"] = {}
     else:
-        start = slice_start(seed, schedule.end)
+        # Each seed has another slice of the recorded path, which lasts 600 s.
+        start = float(stream(seed, "cells.slice").uniform(0.0, 600.0 - schedule.end - 1.0))
         changed["path"] = {"file": path, "heading_smoothing": 0.25, "skip": start}
     if test == "dark":
         changed["phases"] = [{"start": schedule.test, "end": schedule.back, "dark": True}]
     source = rat_source(sessions.config, seed, **changed)
-    return sessions.run(_shuffled(source, schedule, seed) if test == "shuffled" else source)
-
-
-def _shuffled(source: Source, schedule: Schedule, seed: int) -> Source:
-    """The source with the views of the test in random order."""
+    if test != "shuffled":
+        return sessions.run(source)
     log = load_into_memory(source)
     rows = np.flatnonzero(log.seen & (log.time >= schedule.test) & (log.time < schedule.back))
     views = log.views.copy()
     views[rows] = log.views[stream(seed, "cells.shuffled_views").permutation(rows)]
-    return replace(log, views=views)
+    return sessions.run(replace(log, views=views))
 
 
 ANCHORING = Figure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)

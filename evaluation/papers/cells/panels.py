@@ -1,7 +1,8 @@
-"""Panels of a picture in rows and columns, the error of the packet on the torus, and the time of calls.
+"""One figure or table of pose cells, and what its modules share.
 
-The error is the decoded minus the true pose, the shortest way round. Times are taken on one core, beside the
-load of the machine meanwhile.
+The error of the packet on the torus: decoded minus true pose, the shortest way round. Panels in rows and
+columns under a title, in the style of all plots. Processor and wall time of calls on one core, and the load
+of the machine meanwhile.
 """
 
 from __future__ import annotations
@@ -94,12 +95,6 @@ class Taken(NamedTuple):
     wall: float
 
 
-class Circumstances:
-    """Where times are measured; `text` is complete after the block of `on_one_core`."""
-
-    text = ""
-
-
 def time_call(call: Callable[[], object]) -> Taken:
     """The time of a call."""
     wall, processor = perf_counter(), process_time()
@@ -107,17 +102,12 @@ def time_call(call: Callable[[], object]) -> Taken:
     return Taken(process_time() - processor, perf_counter() - wall)
 
 
-def median(times: list[Taken]) -> Taken:
-    """The median of each time."""
-    return Taken(*np.median(np.array(times), axis=0).tolist())
-
-
 @contextmanager
-def on_one_core() -> Iterator[Circumstances]:
-    """Keeps the process on its idlest core, and describes the machine and its load afterwards."""
-    found, load = Circumstances(), watch_load()
+def on_one_core() -> Iterator[list[str]]:
+    """Keeps the process on its idlest core; after the block the list has one sentence on machine and load."""
+    found, load = list[str](), watch_load()
     with one_core():
         yield found
     others = load()
     busy = "unknown" if others is None else f"{others:.1f} cores busy with other processes in the mean"
-    found.text = f"On one core of {processor_name()}; load of the machine: {busy}."
+    found.append(f"On one core of {processor_name()}; load of the machine: {busy}.")

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from ratslam.core.session import Session, Step
+from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session, open_observations, read_observations
-from ratslam.runs.cell_recorder import CellSums, RecordingPlan, plan_recording
+from ratslam.runs.cell_recorder import CellSums, plan_recording
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
-from robot.sources.source import Sample, Source
+from robot.sources.source import Source
 from tactile.base.errors import InputError
-from tactile.base.random_streams import stream
 
 PACKAGED = "rat_box"
 """The packaged configuration that the sessions begin with: a box of 1 m, RatSLAM as published."""
-
-
-class RatRun(NamedTuple):
-    """A finished session of T steps.
-
-    Attributes:
-        recording: of its cells. motion: [T, 4] odometry (dx m, dy m, dtheta rad, dt s).
-    """
-
-    recording: CellRecording
-    motion: np.ndarray
 
 
 class RatSessions:
@@ -42,8 +30,8 @@ class RatSessions:
         self.config = config
         self._session: Session | None = None
 
-    def run(self, source: Source) -> RatRun:
-        """The session over a source, from the start.
+    def run(self, source: Source) -> CellRecording:
+        """The recorded cells of T steps of a session over a source, from the start.
 
         Raises:
             InputError: no cells are to be recorded, or see `plan_recording`.
@@ -56,10 +44,26 @@ class RatSessions:
             raise InputError("cells", "null", "a section", "`cells: {chosen: 0}` records packets alone")
         rows = list(read_observations(source))
         samples = [sample for sample, _ in rows]
-        observations = [observation for _, observation in rows]
-        steps = list(self._session.replay(observations))
-        motion = np.array([each.odometry[:4] for each in observations], float)
-        return RatRun(_recording(plan, samples, steps), motion)
+        steps = list(self._session.replay([observation for _, observation in rows]))
+        cells, summed = plan.cells, None
+        if plan.sums is not None:
+            summed = CellSums(plan.sums, int(np.prod(cells.shape)), samples[0].time)
+            for sample, step in zip(samples, steps, strict=True):
+                if step.seldom is not None:
+                    summed.add(sample.time, sample.truth, *cells.active(step.seldom))
+        unknown = np.full(3, np.nan)
+        return CellRecording(
+            shape=cells.shape,
+            cell_size=cells.cell_size,
+            time=np.array([sample.time for sample in samples]),
+            truth=np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
+            packet=np.array([cells.packet(step.evidence) for step in steps]),
+            energy=np.array([cells.energy(step.evidence) for step in steps]),
+            place=np.array([step.estimate.place for step in steps], np.int32),
+            cell=plan.cell,
+            activity=np.array([step.probed for step in steps], np.float32),
+            sums=None if summed is None else summed.result(),
+        )
 
 
 def rat_config(*assignments: str) -> RunConfig:
@@ -76,36 +80,6 @@ def rat_source(config: RunConfig, seed: int, **changed: Any) -> RatSimulation:
     assert config.rat_simulation is not None
     given = {name: getattr(config.rat_simulation, name) for name in config.rat_simulation.model_fields_set}
     return RatSimulation(RatSimulationConfig.model_validate({**given, "seed": seed, **changed}))
-
-
-def slice_start(seed: int, seconds: float, whole: float = 600.0) -> float:
-    """Time at which the slice of a recorded path for a seed begins, s: anywhere that leaves `seconds`."""
-    return float(stream(seed, "cells.slice").uniform(0.0, whole - seconds - 1.0))
-
-
-def _recording(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellRecording:
-    unknown = np.full(3, np.nan)
-    return CellRecording(
-        shape=plan.cells.shape,
-        cell_size=plan.cells.cell_size,
-        time=np.array([sample.time for sample in samples]),
-        truth=np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
-        packet=np.array([plan.cells.packet(step.evidence) for step in steps]),
-        energy=np.array([plan.cells.energy(step.evidence) for step in steps]),
-        place=np.array([step.estimate.place for step in steps], np.int32),
-        cell=plan.cell,
-        activity=np.array([step.probed for step in steps], np.float32),
-        sums=None if plan.sums is None else _sums(plan, samples, steps).result(),
-    )
-
-
-def _sums(plan: RecordingPlan, samples: list[Sample], steps: list[Step]) -> CellSums:
-    assert plan.sums is not None
-    sums = CellSums(plan.sums, int(np.prod(plan.cells.shape)), samples[0].time)
-    for sample, step in zip(samples, steps, strict=True):
-        if step.seldom is not None:
-            sums.add(sample.time, sample.truth, *plan.cells.active(step.seldom))
-    return sums
 
 
 Way = Literal["rat", "random walk"]
@@ -127,8 +101,8 @@ def record_rat(
     own += [f"cells.chosen={chosen}", "session.reserve=1024"]
     own += ["cells.sums={}"] if sums else []
     own += ["rat_simulation.walk={}"] if way == "random walk" else []
-    with open_observations(load_config("rat_box", own)) as (config, source):
-        return RatSessions(config).run(source).recording
+    with open_observations(load_config(PACKAGED, own)) as (config, source):
+        return RatSessions(config).run(source)
 
 
 def with_active_cells(recording: CellRecording, cells: int) -> CellRecording:

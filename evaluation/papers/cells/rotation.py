@@ -38,7 +38,7 @@ LEAST = 0.01
 USUAL = 3
 """Seeds: each is a walk and a draw of the noise of odometry, common to the turns."""
 KINDS = {"heading": "packet heading", "place": "packet place", "cells": "cells"}
-"""Fields of `Rotation` with their labels."""
+"""Fields of `_Rotation` with their labels."""
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 """Of the kinds."""
 SHIFT = 5.0
@@ -66,7 +66,7 @@ class Schedule(NamedTuple):
     end: float = 140.0
 
 
-class Condition(NamedTuple):
+class _Condition(NamedTuple):
     """What happens at the turn.
 
     Attributes:
@@ -85,14 +85,14 @@ class Condition(NamedTuple):
 
 
 CONDITIONS = (
-    Condition("all", 0, {}),
-    *(Condition("all", each, {"rotate_cues_deg": each}) for each in ANGLES if each),
-    Condition("distal alone", CONFLICT, {"rotate_cues_deg": CONFLICT, "cues": "distal"}),
-    Condition("darkness", 0, DARK),
+    _Condition("all", 0, {}),
+    *(_Condition("all", each, {"rotate_cues_deg": each}) for each in ANGLES if each),
+    _Condition("distal alone", CONFLICT, {"rotate_cues_deg": CONFLICT, "cues": "distal"}),
+    _Condition("darkness", 0, DARK),
 )
 
 
-class Rotation(NamedTuple):
+class _Rotation(NamedTuple):
     """Rotations in a session, rad counter-clockwise, of the late part against the part before the turn.
 
     Attributes:
@@ -110,7 +110,7 @@ class RotationResult(NamedTuple):
     """The rotations of n seeds for each of `CONDITIONS`."""
 
     schedule: Schedule
-    found: list[list[Rotation]]
+    found: list[list[_Rotation]]
 
     def degrees(self, kind: str) -> np.ndarray:
         """[conditions, n] rotations of one kind, `heading`, `place` or `cells`, degrees."""
@@ -137,14 +137,14 @@ def measure_rotation(task: Task, schedule: Schedule | None = None) -> RotationRe
             for seed in task.seeds(USUAL)
         )
         turn = np.radians(condition.degrees)
-        found.append([rotation_of(sessions.run(each).recording, schedule, turn) for each in sources])
+        found.append([rotation_of(sessions.run(each), schedule, turn) for each in sources])
     return RotationResult(schedule, found)
 
 
-def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> Rotation:
+def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> _Rotation:
     """The rotations in a session whose cues turn by `turn`, rad.
 
-    Angles are told up to a whole turn; each is taken as the one nearest to half the turn of the cues.
+    Angles are known up to a whole turn; each is taken as the one nearest to half the turn of the cues.
     """
     time = recording.time
     before = (time >= schedule.turn / 2) & (time < schedule.turn)
@@ -159,7 +159,7 @@ def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> Ro
 
     base = phase[before].mean()
     course = turn / 2 + wrap(np.angle(phase * np.conj(base)) - turn / 2)
-    return Rotation(
+    return _Rotation(
         angle(phase[late].mean() * np.conj(base)),
         angle(place[late].mean() * np.conj(place[before].mean())),
         angle(cells) if np.isfinite(cells) else np.nan,

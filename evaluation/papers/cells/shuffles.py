@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -40,7 +41,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class ShuffledRow(NamedTuple):
+class _ShuffledRow(NamedTuple):
     """One score on one path. true_share: of the true cells above the percentile of their shuffles.
     true_mean: their mean score."""
 
@@ -51,29 +52,11 @@ class ShuffledRow(NamedTuple):
     true_mean: float
 
 
-class ShuffleCheck(NamedTuple):
-    """The rows, and the numbers that they are made with."""
-
-    rows: list[ShuffledRow]
-    true_cells: int
-    shuffles: int
-    seconds: float
-
-
-class _Task(NamedTuple):
-    recording: CellRecording
-    way: Way
-    kind: int
-    score: str
-    true_cells: int
-    shuffles: int
-    seed: int
-
-
 def check_shuffles(
     task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
-) -> ShuffleCheck:
-    """Compares cells of a session with their shuffles, for every score and path.
+) -> tuple[str, list[_ShuffledRow]]:
+    """Compares cells of a session with their shuffles, for every score and path; what is compared, as
+    sentences, and the rows.
 
     Args:
         task: its sessions are the cells of the calibration. cells: where the task does not say. shuffles: of
@@ -84,73 +67,72 @@ def check_shuffles(
     tasks = []
     for way in get_args(Way):
         recording = with_active_cells(record_rat(way, 2 * cells, seconds=seconds, seed=task.first), cells)
-        for kind, scores in enumerate(BINS.values()):
-            own = true_cells, shuffles, task.first
-            tasks += [_Task(recording, way, kind, score, *own) for score in scores]
-    rows = list(run_tasks(_compare, tasks, task.workers))
-    return ShuffleCheck(rows, true_cells, shuffles, seconds)
-
-
-def _compare(task: _Task) -> ShuffledRow:
-    recording = task.recording
-    bins_of, scores = list(BINS.items())[task.kind]
-    bins, score = bins_of(recording), scores[task.score]
-    checked = calibrate(recording.activity, bins, score, task.shuffles, task.seed)
-    true = shuffled_scores(recording.activity[:, : task.true_cells], bins, score, task.shuffles, task.seed)
-    known = np.isfinite(true.score) & np.isfinite(true.percentile)
-    share, mean = (float(each[known].mean()) if known.any() else np.nan for each in (true.above, true.score))
-    return ShuffledRow(task.way, task.score, checked, share, mean)
-
-
-def shuffle_table(result: ShuffleCheck) -> Iterator[str]:
-    """The lines of the table."""
-    yield (
-        f"Pose cells of sessions of {result.seconds:.0f} s in a box of 1 m, {result.shuffles} shuffles "
+        tasks += [(recording, way, kind, score) for kind, scores in SCORES.items() for score in scores]
+    compare = partial(_compare, true_cells=true_cells, shuffles=shuffles, seed=task.first)
+    rows = list(run_tasks(compare, tasks, task.workers))
+    note = (
+        f"Pose cells of sessions of {seconds:.0f} s in a box of 1 m, {shuffles} shuffles "
         "of each cell, with rates in units of activity. Goal: the share of shuffled cells above the "
         "95th percentile of their own shuffles lies in the binomial 95 % band round 5 %. Of 26 "
         "shares, one or two are outside by chance. Tied: share at the percentile, which is not above "
-        f"it. Control: of the first {result.true_cells} cells as recorded, the share above theirs.\n"
+        f"it. Control: of the first {true_cells} cells as recorded, the share above theirs.\n"
     )
+    return note, rows
+
+
+def _compare(
+    task: tuple[CellRecording, Way, str, str], true_cells: int, shuffles: int, seed: int
+) -> _ShuffledRow:
+    recording, way, kind, name = task
+    bins, score = path_bins(recording, kind), SCORES[kind][name]
+    checked = calibrate(recording.activity, bins, score, shuffles, seed)
+    true = shuffled_scores(recording.activity[:, :true_cells], bins, score, shuffles, seed)
+    known = np.isfinite(true.score) & np.isfinite(true.percentile)
+    share, mean = (float(each[known].mean()) if known.any() else np.nan for each in (true.above, true.score))
+    return _ShuffledRow(way, name, checked, share, mean)
+
+
+def shuffle_table(result: tuple[str, list[_ShuffledRow]]) -> Iterator[str]:
+    """The lines of the table."""
+    note, rows = result
+    yield note
     yield markdown_header(COLUMNS)
-    for row in result.rows:
+    for row in rows:
         found = row.calibration
+        share, low, high, tied, true = (
+            f"{100 * each:.1f} %" for each in (found.share, found.low, found.high, found.tied, row.true_share)
+        )
+        within = "yes" if found.low <= found.share <= found.high else "**no**"
         yield markdown_row(
             [
-                row.way, row.score, found.cells, _percent(found.share),
-                f"{_percent(found.low)} - {_percent(found.high)}",
-                "yes" if found.low <= found.share <= found.high else "**no**",
-                _percent(found.tied), f"{found.shuffled_mean:.3g}", _percent(row.true_share),
-                f"{row.true_mean:.3g}",
+                row.way, row.score, found.cells, share, f"{low} - {high}", within, tied,
+                f"{found.shuffled_mean:.3g}", true, f"{row.true_mean:.3g}",
             ]
         )  # fmt: skip
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
-
-
-FIGURE = Figure("Shuffled controls", check_shuffles, shuffle_table, None)
+FIGURE = Figure("Shuffled controls", check_shuffles, lambda result: list(shuffle_table(result)), None)
 
 
 SMOOTHING = 1.5
 """Standard deviation of the Gaussian over place, bins."""
 
 
-def smoothed(score: Score) -> Score:
+def _smoothed(score: Score) -> Score:
     """The score of the smoothed map."""
     return lambda rates, seconds: score(smooth_rates(rates, seconds, SMOOTHING), seconds)
 
 
 PLACE_SCORES: Mapping[str, Score] = {
-    "information": smoothed(information),
-    "information rate": smoothed(information_rate),
-    "1 - sparsity": smoothed(lambda rates, seconds: 1 - sparsity(rates, seconds)),
-    "selectivity": smoothed(selectivity),
+    "information": _smoothed(information),
+    "information rate": _smoothed(information_rate),
+    "1 - sparsity": _smoothed(lambda rates, seconds: 1 - sparsity(rates, seconds)),
+    "selectivity": _smoothed(selectivity),
     "coherence": coherence,
-    "largest field": smoothed(largest_field),
-    "border score": smoothed(border_score),
-    "grid score": smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), HEXAGONAL)),
-    "square score": smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), SQUARE)),
+    "largest field": _smoothed(largest_field),
+    "border score": _smoothed(border_score),
+    "grid score": _smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), HEXAGONAL)),
+    "square score": _smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), SQUARE)),
 }
 """Scores of maps of 20 x 20 bins."""
 HEADING_SCORES: Mapping[str, Score] = {
@@ -163,27 +145,24 @@ JOINT_SCORES: Mapping[str, Score] = {"conjunctive information": conjunctive_info
 """Scores of maps of 8 headings and 10 x 10 bins, not smoothed."""
 
 
-def place_bins(recording: CellRecording, bins: int = 20) -> PathBins:
-    """The place bin of each step, of `bins` x `bins` over the box that the path fills."""
-    flat = place_index(recording.truth, *arena_edges(recording.truth, bins))
-    return PathBins(flat, (bins, bins), sample_seconds(recording.time))
-
-
-def heading_bins(recording: CellRecording, bins: int = 36) -> PathBins:
-    """The heading bin of each step."""
-    return PathBins(heading_index(recording.truth, bins), (bins,), sample_seconds(recording.time))
-
-
-def joint_bins(recording: CellRecording) -> PathBins:
-    """The bin of heading and place of each step, 8 x 10 x 10."""
-    place, turn = place_bins(recording, 10), heading_bins(recording, 8)
-    flat = np.where((place.flat < 0) | (turn.flat < 0), -1, turn.flat * 100 + place.flat)
-    return PathBins(flat, (8, 10, 10), place.seconds)
-
-
-BINS: Mapping[Callable[[CellRecording], PathBins], Mapping[str, Score]] = {
-    place_bins: PLACE_SCORES,
-    heading_bins: HEADING_SCORES,
-    joint_bins: JOINT_SCORES,
+SCORES: Mapping[str, Mapping[str, Score]] = {
+    "place": PLACE_SCORES,
+    "heading": HEADING_SCORES,
+    "joint": JOINT_SCORES,
 }
 """The scores of each kind of bins."""
+
+
+def path_bins(recording: CellRecording, kind: str) -> PathBins:
+    """The bin of each step by a kind of `SCORES`: of place, 20 x 20 over the box that the path fills; of
+    heading, 36; or of both, 8 x 10 x 10."""
+    turns, across = (8, 10) if kind == "joint" else (36, 20)
+    seconds = sample_seconds(recording.time)
+    place = place_index(recording.truth, *arena_edges(recording.truth, across))
+    heading = heading_index(recording.truth, turns)
+    if kind == "place":
+        return PathBins(place, (across, across), seconds)
+    if kind == "heading":
+        return PathBins(heading, (turns,), seconds)
+    both = np.where((place < 0) | (heading < 0), -1, heading * across**2 + place)
+    return PathBins(both, (turns, across, across), seconds)

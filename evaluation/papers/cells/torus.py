@@ -8,7 +8,7 @@ of the torus. The grid cells of the entorhinal cortex lie on a hexagonal one (Ha
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -55,7 +55,7 @@ DARK = {"speed_white": 0.0, "heading_white": 0.0}
 """Exact odometry."""
 
 
-class LatticeFigures(NamedTuple):
+class _LatticeFigures(NamedTuple):
     """Figures of n cells in one box.
 
     Attributes:
@@ -72,18 +72,13 @@ class LatticeFigures(NamedTuple):
     fields: np.ndarray
 
 
-class TorusResult(NamedTuple):
-    """Columns in the large box, one cell of each, and columns in the small box. torus: its side, m."""
-
-    large: LatticeFigures
-    single: LatticeFigures
-    small: LatticeFigures
-    torus: float
+_Torus = tuple[_LatticeFigures, _LatticeFigures, _LatticeFigures, float]
+"""Columns in the large box, one cell of each, and columns in the small box; side of the torus, m."""
 
 
 def measure_torus(
     task: Task, seconds: tuple[float, float] = SECONDS, columns: int = COLUMNS, shuffles: int = SHUFFLES
-) -> TorusResult:
+) -> _Torus:
     """The figures of a session in each box; the path is that of the first seed.
 
     Args:
@@ -100,12 +95,12 @@ def measure_torus(
                 config, task.first, walk={"speed": 0.3, "speed_sd": 0.15}, seconds=time, odometry=DARK,
                 box={"width": size[0], "height": size[1]}, phases=[{"start": 0, "dark": True}],
             )
-        ).recording
+        )
         for size, time in zip((LARGE, SMALL), seconds, strict=True)
     ]  # fmt: skip
     measure = partial(measure_cells, shuffles=shuffles, seed=task.first)
     large, small = recordings
-    return TorusResult(
+    return (
         measure(large, sum_columns(large.activity, columns), LARGE, BINS[0]),
         measure(large, one_of_each(large.activity, columns), LARGE, BINS[0]),
         measure(small, sum_columns(small.activity, columns), SMALL, BINS[1]),
@@ -116,7 +111,7 @@ def measure_torus(
 def measure_cells(
     recording: CellRecording, activity: np.ndarray, size: tuple[float, float], bin: float, shuffles: int,
     seed: int,
-) -> LatticeFigures:  # fmt: skip
+) -> _LatticeFigures:  # fmt: skip
     """The figures of activity [T, n] along the path of a recording.
 
     Args:
@@ -137,31 +132,26 @@ def measure_cells(
         shuffled_scores(activity, bins, partial(score, lattice), shuffles, seed)
         for lattice in (HEXAGONAL, SQUARE)
     )
-    maps = _maps(activity, bins, bin)
-    lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
-    fields = find_fields(maps, least_bins=round(FIELD / bin**2))
-    return LatticeFigures(size, bin, maps, hexagonal, square, lattice, fields.number)
-
-
-def _maps(activity: np.ndarray, bins: PathBins, bin: float) -> np.ndarray:
-    """[n, H, W] smoothed rates."""
-    inside, count = bins.flat >= 0, int(np.prod(bins.shape))
-    at, weight = bins.flat[inside], bins.seconds[inside]
+    inside, count = place >= 0, int(np.prod(shape))
+    at, weight = place[inside], bins.seconds[inside]
     seconds = np.bincount(at, weight, count)
     sums = np.array([np.bincount(at, weight * cell, count) for cell in activity[inside].T])
-    rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *bins.shape)
-    return smooth_rates(rates, seconds.reshape(bins.shape), SMOOTHING / bin)
+    rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *shape)
+    maps = smooth_rates(rates, seconds.reshape(shape), SMOOTHING / bin)
+    lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
+    fields = find_fields(maps, least_bins=round(FIELD / bin**2))
+    return _LatticeFigures(size, bin, maps, hexagonal, square, lattice, fields.number)
 
 
-def table_torus(result: TorusResult) -> list[str]:
+def table_torus(result: _Torus) -> list[str]:
     """The lines of the table, and what it does not show."""
+    large, single, small, torus = result
     lines = [
-        f"{len(result.large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
+        f"{len(large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
         "control: median of the 95th percentile of each cell's shuffles, and the share above theirs.",
         "",
         *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
     ]
-    large, single, small, torus = result
     lines.append(markdown_row(["larger box over torus", "above 1", _ratio(large, torus), "-"]))
     for name, found in (("columns", large), ("single cells", single)):
         spacing = markdown_row([
@@ -191,8 +181,8 @@ NOT_SHOWN = (
 )
 
 
-def draw_result(result: TorusResult, png: Path) -> None:
-    """Maps and autocorrelograms in both boxes, and the scores beside their controls."""
+def draw_result(result: _Torus, png: Path) -> None:
+    """A row of maps and one of autocorrelograms for each box; histograms of the scores in the larger."""
     large, _, small, torus = result
     values = (large.shape.spacing, large.square.score, large.hexagonal.score)
     spacing, square, hexagonal = (float(np.nanmedian(each)) for each in values)
@@ -200,15 +190,38 @@ def draw_result(result: TorusResult, png: Path) -> None:
         f"Torus {torus:.2f} m. Larger box, medians: spacing {spacing:.2f} m, square score {square:.2f}, "
         f"grid score {hexagonal:.2f}."
     )
-    boxes = [
-        BoxMaps(f"box {_ratio(each, torus)} of the torus", each.size, each.bin, each.maps)
-        for each in (large, small)
-    ]
     scores = {"square score": large.square, "grid score": large.hexagonal}
-    draw_torus("A torus cell in boxes of two sizes", line, boxes, scores, large.shape.spacing, torus, png)
+    rows = [WIDE * box.size[1] / box.size[0] for box in (large, small) for _ in range(2)]
+    height = style.TOP + sum(rows) + HEAD * len(rows) + 0.6 + HEIGHT + LOW
+    figure = style.new_figure(height, "A torus cell in boxes of two sizes", line)
+    top = height - style.TOP
+    for box in (large, small):
+        tall = WIDE * box.size[1] / box.size[0]
+        shown = box.maps[:SHOWN]
+        peak = np.nanmax(shown, axis=(1, 2), keepdims=True)
+        rates = shown / np.maximum(peak, np.finfo(float).tiny)  # a silent column stays 0
+        lags = autocorrelogram(shown)
+        x, y = box.size
+        reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
+        for name, images, extent, colours in (
+            (f"rates, box {_ratio(box, torus)} of the torus", rates, (0, x, 0, y), ("viridis", 0, 1)),
+            (
+                "autocorrelograms over lags of x and y (m)",
+                lags,
+                (-reach_x, reach_x, -reach_y, reach_y),
+                ("RdBu_r", -1, 1),
+            ),
+        ):
+            top -= HEAD
+            figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
+            top -= tall
+            _draw_row(figure, top, tall, images, extent, colours)
+    axes = _draw_histograms(figure, scores, large.shape.spacing, torus)
+    style.add_legend(figure, axes, columns=2)
+    figure.savefig(png)
 
 
-def _ratio(found: LatticeFigures, torus: float) -> str:
+def _ratio(found: _LatticeFigures, torus: float) -> str:
     x, y = found.size
     return f"{x:g} x {y:g} m / {torus:.2f} m = {x / torus:.2f} x {y / torus:.2f}"
 
@@ -241,56 +254,8 @@ HEIGHT, LOW, HEAD = 1.6, 0.95, 0.42
 """Inches: of a histogram, below it, above a row of maps."""
 
 
-class BoxMaps(NamedTuple):
-    """Maps in a box. name: with its size. size: m. bin: m. maps: [n, H, W] rates."""
-
-    name: str
-    size: tuple[float, float]
-    bin: float
-    maps: np.ndarray
-
-
 SCORES = np.linspace(-1.5, 1.5, 61).tolist()
 """Limits of the bins of lattice scores."""
-
-
-def draw_torus(
-    title: str, line: str, boxes: Sequence[BoxMaps], scores: Mapping[str, ShuffledScores],
-    spacing: np.ndarray, torus: float, png: Path,
-) -> None:  # fmt: skip
-    """Draws for each box a row of maps and one of autocorrelograms, and histograms below.
-
-    Args:
-        scores: of the first box, by name. spacing: [n] in the first box, m. torus: its side, m.
-    """
-    rows = [WIDE * box.size[1] / box.size[0] for box in boxes for _ in range(2)]
-    height = style.TOP + sum(rows) + HEAD * len(rows) + 0.6 + HEIGHT + LOW
-    figure = style.new_figure(height, title, line)
-    top = height - style.TOP
-    for box in boxes:
-        tall = WIDE * box.size[1] / box.size[0]
-        shown = box.maps[:SHOWN]
-        peak = np.nanmax(shown, axis=(1, 2), keepdims=True)
-        rates = shown / np.maximum(peak, np.finfo(float).tiny)  # a silent column stays 0
-        lags = autocorrelogram(shown)
-        x, y = box.size
-        reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
-        for name, images, extent, colours in (
-            (f"rates, {box.name}", rates, (0, x, 0, y), ("viridis", 0, 1)),
-            (
-                "autocorrelograms over lags of x and y (m)",
-                lags,
-                (-reach_x, reach_x, -reach_y, reach_y),
-                ("RdBu_r", -1, 1),
-            ),
-        ):
-            top -= HEAD
-            figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
-            top -= tall
-            _draw_row(figure, top, tall, images, extent, colours)
-    axes = _draw_histograms(figure, scores, spacing, torus)
-    style.add_legend(figure, axes, columns=2)
-    figure.savefig(png)
 
 
 def _draw_row(

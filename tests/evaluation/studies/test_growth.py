@@ -49,8 +49,8 @@ def test_lengths_double_up_to_the_greatest():
 
 
 def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(config):
-    study = growth_study(config, ["first=100", "known_ground=300", "new_ground=300", "simulation.seed=3"])
-    known, new = (HeadSimulation(task.config.simulation) for task in study.tasks)
+    _, tasks = growth_study(config, ["first=100", "known_ground=300", "new_ground=300", "simulation.seed=3"])
+    known, new = (HeadSimulation(task.config.simulation) for task in tasks)
     for session in known, new:
         assert 300 <= session.length < 500  # no more than it needs
         assert session.config.seed == 3
@@ -64,7 +64,7 @@ def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(confi
 
 def test_the_course_of_a_recording_is_known_ground():
     settings = ["first=150", "known_ground=300", "window=40"]
-    (task,) = growth_study(ROOT / "configs" / "square.yaml", settings).tasks
+    _, (task,) = growth_study(ROOT / "configs" / "square.yaml", settings)
     assert (task.ground, task.lengths, task.window) == ("known ground", [150, 300], 40)
     rows, done = [], []
     for row in measure_growth(task, lambda: done.append(len(rows))):
@@ -100,8 +100,8 @@ def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
 
 
 def test_a_measurement_on_the_way_changes_nothing(config):
-    study = growth_study(config, ["first=32", "known_ground=96", "new_ground=0"])
-    ground, settings, lengths, _ = study.tasks[0]
+    _, tasks = growth_study(config, ["first=32", "known_ground=96", "new_ground=0"])
+    ground, settings, lengths, _ = tasks[0]
     steps = []
     rows = list(measure_growth(GrowthTask(ground, settings, lengths), lambda: steps.append(1)))
     assert [row.steps for row in rows] == lengths == [32, 64, 96]

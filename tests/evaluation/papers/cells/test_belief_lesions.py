@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from evaluation.papers.cells.belief_lesions import (
-    FIGURES,
     INTACT,
     LESIONS,
-    LesionResult,
-    SizeResult,
+    beside_intact,
     foreign_activity,
     measure_lesions,
     measure_sizes,
@@ -22,7 +21,7 @@ from evaluation.papers.cells.belief_lesions import (
     silent_cells,
     table_lesions,
 )
-from evaluation.papers.figure import Task
+from evaluation.papers.figure import CELLS, Task, find_figure
 from evaluation.papers.tables import touch_table as touch
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
@@ -34,62 +33,60 @@ CHOSEN = (INTACT, "cells and ties permuted together", "ties permuted alone", "pr
 
 
 @pytest.fixture(scope="module")
-def result() -> LesionResult:
+def result() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("RATSLAM_DATA", raising=False)
         patch.setitem(touch.ROWS, "short", SHORT)
         return measure_lesions(Task(31001, sessions=1), CHOSEN, ("short",))
 
 
-def test_the_intact_network_closes_loops_and_a_renamed_one_the_same(result: LesionResult) -> None:
-    ((intact, _),) = result.of(INTACT, "short")
-    ((renamed, beside),) = result.of("cells and ties permuted together", "short")
+def test_the_intact_network_closes_loops_and_a_renamed_one_the_same(result: Any) -> None:
+    ((intact, _),) = beside_intact(result, INTACT, "short")
+    ((renamed, beside),) = beside_intact(result, "cells and ties permuted together", "short")
     assert intact.true > 0
     assert beside is intact
     assert same_closures(renamed, intact) == 1
 
 
 @pytest.mark.parametrize("lesion", ["ties permuted alone", "prediction constant"])
-def test_a_network_that_knows_no_places_closes_nothing(result: LesionResult, lesion: str) -> None:
-    ((lesioned, intact),) = result.of(lesion, "short")
+def test_a_network_that_knows_no_places_closes_nothing(result: Any, lesion: str) -> None:
+    ((lesioned, intact),) = beside_intact(result, lesion, "short")
     assert len(lesioned.closures) == 0
     assert same_closures(lesioned, intact) == 0
 
 
-def test_table_and_picture(result: LesionResult, tmp_path: Path) -> None:
+def test_table_and_picture(result: Any, tmp_path: Path) -> None:
     rows = [line for line in table_lesions(result) if line.startswith(f"| {CHOSEN[2]}")]
     assert [row.split(" | ")[3:5] for row in rows] == [["0, 0", "0%"]]
-    figure = FIGURES["lesions"]
+    figure = find_figure(CELLS["lesions"])
     assert figure.draw is not None
     figure.draw(result, tmp_path / "lesions.png")
     assert (tmp_path / "lesions.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.fixture(scope="module")
-def sizes() -> SizeResult:
+def sizes() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(touch.ROWS, "short", SHORT)
         return measure_sizes(Task(31001, sessions=1), "short", sides=(7, 21), sizes=())
 
 
 @pytest.mark.soak
-def test_the_usual_size_is_the_product_and_a_tiny_network_closes_less(
-    sizes: SizeResult, result: LesionResult
-) -> None:
-    closed = {(task.side, task.grows): one.figures for task, one in sizes.found.items()}
-    ((intact, _),) = result.of(INTACT, "short")
+def test_the_usual_size_is_the_product_and_a_tiny_network_closes_less(sizes: Any, result: Any) -> None:
+    closed = {(task.side, task.grows): one.figures for task, one in sizes.items()}
+    ((intact, _),) = beside_intact(result, INTACT, "short")
     assert intact.figures is not None
     assert closed[21, True].metrics == intact.figures.metrics
     assert closed[7, False].metrics.closures < closed[21, True].metrics.closures
-    assert {task.side: one.sides for task, one in sizes.found.items() if not task.grows} == {
+    assert {task.side: one.sides for task, one in sizes.items() if not task.grows} == {
         7: (7, 7),
         21: (21, 21),
     }
 
 
 @pytest.mark.soak
-def test_table_and_picture_of_sizes(sizes: SizeResult, tmp_path: Path) -> None:
-    figure = FIGURES["scale"]
+def test_table_and_picture_of_sizes(sizes: Any, tmp_path: Path) -> None:
+    figure = find_figure(CELLS["scale"])
     assert sum(line.startswith(("| 7 ", "| 21 ")) for line in figure.table(sizes)) == 4
     assert figure.draw is not None
     figure.draw(sizes, tmp_path / "scale.png")
