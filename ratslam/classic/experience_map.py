@@ -18,9 +18,8 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from ratslam.classic.relaxation import relax
-from ratslam.core.arrays import GrowableArray
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.pose_graph import (
     Edges,

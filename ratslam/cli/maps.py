@@ -301,8 +301,8 @@ def _path(arguments: argparse.Namespace) -> int:
     start = None if arguments.start == "here" else read_place(arguments.start, "--from")
     goal = read_place(arguments.goal, "--to")
     prepare_jax()
+    from ratslam.live.goal_planner import draw_map_way, find_map_way
     from ratslam.places.route import NoWay
-    from ratslam.runs.goal_planner import draw_map_way, find_map_way
     from ratslam.runs.saved_map import read_map
 
     saved = read_map(arguments.map, tell)

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.estimates import Estimate, GridDrawing, PoseCellActivity
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation

@@ -10,8 +10,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from tactile.base.types import Array
 
 Scalar = Annotated[Array, "scalar"]

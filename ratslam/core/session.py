@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.arrays import Layout, PackedRecords, allocate, layout_of
+from ratslam.core.arrays import Layout, PackedRecords, allocate, layout_of, with_prefix
 from ratslam.core.backend import Backend, Evidence, Map, State
-from ratslam.core.checkpoint import with_prefix
 from ratslam.core.compilation import Precision
 from ratslam.core.estimates import Estimate
 from tactile.base.errors import InputError

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
 import ratslam
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed
 from ratslam.examples import own_arrays
 from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH, TouchEntry

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ratslam.core.arrays import Checkpointed
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import (
     Action,
     Estimate,

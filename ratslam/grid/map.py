@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
-from ratslam.core.arrays import GrowableArray
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Estimate, GridDrawing
 from ratslam.grid.config import DrawingConfig, GridConfig
 from ratslam.grid.particles import Genealogy

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.trajectory import read_tum
+from ratslam.live.goal_planner import GoalPlanner, contact_map
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
-from ratslam.runs.goal_planner import GoalPlanner, contact_map
 from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig

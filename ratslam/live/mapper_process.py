@@ -267,8 +267,8 @@ def run_mapper(line: Connection) -> None:
 
 def _map(line: Connection) -> None:
     from ratslam.core.estimates import Action
+    from ratslam.live.goal_planner import felt_points
     from ratslam.runs.build_session import build_session
-    from ratslam.runs.goal_planner import felt_points
     from ratslam.runs.runner import check_finished_map, open_runner
     from ratslam.runs.settings.completion import complete
     from ratslam.service.viewer_link import open_viewer

@@ -19,8 +19,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 from scipy.special import expit
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.archive import Archive
 from ratslam.mapping.closure_judge import AT_ONCE, judge_newest
 from ratslam.mapping.keyframe_graph import KeyframeGraph

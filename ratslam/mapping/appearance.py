@@ -14,9 +14,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Evidence
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import NEAR, GainPrior
 from ratslam.mapping.odometry_calibration import NO_ESTIMATE, BiasEstimate, SectorFan

@@ -15,8 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.closure_selection import MapHypotheses
 from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import KeyframeGraph

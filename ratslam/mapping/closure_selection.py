@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed
 from ratslam.mapping.merging import Merge
 from ratslam.mapping.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import between, compose, integrate, inverse, wrap

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.config import Ablation, KeyframeMapConfig
 from ratslam.mapping.loop_closures import ClosureLog

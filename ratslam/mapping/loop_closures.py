@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.optimizer import LoopClosures
 
 CSV_COLUMNS = (

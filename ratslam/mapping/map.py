@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ratslam.core.arrays import Checkpointed
 from ratslam.core.backend import NO_CLOSURE, Evidence, Map
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.acceptance import Acceptance
 from ratslam.mapping.appearance import Appearance

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.compiled import compiled
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, System

@@ -15,8 +15,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed, with_prefix
+from ratslam.core.arrays import Checkpointed, GrowableArray, with_prefix
 from ratslam.mapping.closure_selection import FINE, STEPS, MapHypotheses
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.compiled import compiled, wrapped
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate

@@ -6,8 +6,8 @@ import zipfile
 from pathlib import Path
 from typing import TypeVar
 
+from ratslam.core.arrays import fill_missing, with_prefix
 from ratslam.core.backend import Map
-from ratslam.core.checkpoint import fill_missing, with_prefix
 from ratslam.methods.config import LocaliseConfig
 from tactile.base.bounded import NPZ_SPOILT, malformed, read_arrays
 from tactile.base.errors import InputError

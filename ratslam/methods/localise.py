@@ -18,10 +18,10 @@ from ratslam.mapping.ground import SESSION_WEIGHTING
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig
 from ratslam.methods.finished_map import map_file, restore_map
-from ratslam.methods.map_views import MapViews
 from ratslam.methods.recall import RecallBackend
 from ratslam.network.pose_cells import Belief
 from ratslam.places.localiser import Localiser, Place
+from ratslam.places.map_views import MapViews
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError

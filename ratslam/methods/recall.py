@@ -36,10 +36,10 @@ from ratslam.mapping.config import FULL, Ablation
 from ratslam.mapping.keyframe_graph import KeyframeGraph, piece_start
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import RecallBackendConfig
-from ratslam.methods.map_views import MapViews, PieceTies
 from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
+from ratslam.places.map_views import MapViews, PieceTies
 from ratslam.recall import filter
 from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, sector_shifts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.core.checkpoint import with_prefix
+from ratslam.core.arrays import with_prefix
 from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import INTERRUPTED, KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog

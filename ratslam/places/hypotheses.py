@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
-from ratslam.core.checkpoint import Checkpointed
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.ground import LEAVING, GainOdds, Ground, Motion, PoseHypothesis, advance
 from tactile.base.se2 import wrap
 

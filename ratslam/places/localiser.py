@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
+from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Evidence, Map
-from ratslam.core.checkpoint import Checkpointed
 from ratslam.core.estimates import Action, Estimate, Localisation, LocalisedPose, pieces_of, write_course
 from ratslam.mapping.ground import (
     MAP_WEIGHTING,

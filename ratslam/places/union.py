@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.checkpoint import with_prefix
+from ratslam.core.arrays import with_prefix
 from ratslam.mapping.archive import Archive
 from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.keyframe_graph import INTERRUPTED

@@ -15,9 +15,9 @@ import numpy as np
 from evaluation.artifacts.run_reader import MERGE_REPORT as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
-from ratslam.methods.map_views import MapViews
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.joining import Join, Stretches, join_all
+from ratslam.places.map_views import MapViews
 from ratslam.places.union import Overlap, overlap, remembered, renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.core.checkpoint import fill_missing, with_prefix
+from ratslam.core.arrays import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.build_session import build_session

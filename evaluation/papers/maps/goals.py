@@ -32,8 +32,8 @@ from evaluation.papers.maps.pictures import (
 from evaluation.papers.maps.scenarios import Recipe, open_world, ten_circuits
 from evaluation.papers.maps.stored_maps import StoredMap
 from evaluation.papers.tables.comparison import Record
+from ratslam.live.goal_planner import GoalPlanner, contact_map, felt_points
 from ratslam.places.localiser import Localiser
-from ratslam.runs.goal_planner import GoalPlanner, contact_map, felt_points
 from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig

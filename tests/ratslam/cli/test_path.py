@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ratslam.cli import build_parser, main
 from ratslam.cli.maps import read_place
-from ratslam.runs.goal_planner import TOLERANCE, experience_at
+from ratslam.live.goal_planner import TOLERANCE, experience_at
 from ratslam.runs.saved_map import read_map
 from tactile.base.errors import InputError
 from tests.ratslam.places.test_route import TRAVEL, line_map, travel_graph

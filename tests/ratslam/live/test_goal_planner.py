@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evaluation.papers.maps.goals import VirtualArm
-from ratslam.runs.goal_planner import GoalPlanner, felt_points
+from ratslam.live.goal_planner import GoalPlanner, felt_points
 from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_config import GoalConfig, LiveConfig
 from robot.world.maze import Maze, cell_centre, random_maze, wall_boxes
