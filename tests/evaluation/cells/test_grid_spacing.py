@@ -17,9 +17,9 @@ from tests.evaluation.cells.lattice_maps import lattice_map
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_it_is_that_of_the_lattice(directions, lattice, spacing, turn):
     maps = autocorrelogram(lattice_map(directions, spacing, turn, (30, 30))[None])
-    spacing, orientation = measure_lattice(maps, 0.05, lattice)
+    found, orientation = measure_lattice(maps, 0.05, lattice)
     period = np.pi / directions
-    assert spacing[0] == pytest.approx(0.05 * spacing, rel=0.04)
+    assert found[0] == pytest.approx(0.05 * spacing, rel=0.04)
     error = (orientation[0] - turn + period / 2) % period - period / 2
     assert abs(error) < np.deg2rad(3)
     assert 0 <= orientation[0] <= period
