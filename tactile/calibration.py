@@ -137,31 +137,21 @@ class DirtyRecordConfig(Settings):
     whisker by this factor."""
 
 
-class DirtyWhisker(NamedTuple):
-    """A whisker that touched something during a free record.
-
-    Attributes:
-        whisker: its number. reason: what shows it, in words.
-    """
-
-    whisker: int
-    reason: str
-
-
 class FreeBaseline(NamedTuple):
     """Baseline of W whiskers with K channels.
 
     Attributes:
-        mean, noise: [W, K] in the unit of the signal. dirty: whiskers that had to be repaired, and why.
+        mean, noise: [W, K] in the unit of the signal. dirty: whiskers that had to be repaired,
+            and what shows that they touched something, in words.
     """
 
     mean: np.ndarray
     noise: np.ndarray
-    dirty: tuple[DirtyWhisker, ...]
+    dirty: Mapping[int, str]
 
 
-def _find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) -> list[DirtyWhisker]:
-    """Whiskers whose record holds more than noise, or more noise than the others'.
+def _find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) -> dict[int, str]:
+    """Whiskers, each with a reason, whose record holds more than noise, or more noise than the others'.
 
     Whisking itself deflects whiskers, so the ratio of standard deviation to noise is compared with that of
     the median whisker.
@@ -172,18 +162,18 @@ def _find_dirty_whiskers(sd: np.ndarray, noise: np.ndarray, max_ratio: float) ->
     """
     live = (noise > 0).all(axis=1)
     if not live.any():
-        return []
+        return {}
     ratio = np.divide(sd, noise, out=np.zeros_like(sd), where=noise > 0)
     above = ratio / np.median(ratio[live], axis=0), noise / np.median(noise[live], axis=0)
-    found = []
-    for whisker in np.flatnonzero(live):
+    found = {}
+    for whisker in np.flatnonzero(live).tolist():
         moves, noisy = (float(part[whisker].max()) for part in above)
         if moves > max_ratio:
             most = ratio[whisker].max()
             reason = f"its standard deviation is {most:.3g} times its noise, {moves:.2g} times the usual"
-            found.append(DirtyWhisker(int(whisker), reason))
+            found[whisker] = reason
         elif noisy > max_ratio:
-            found.append(DirtyWhisker(int(whisker), f"its noise is {noisy:.2g} times the median whisker's"))
+            found[whisker] = f"its noise is {noisy:.2g} times the median whisker's"
     return found
 
 
@@ -202,14 +192,14 @@ def calibrate_free(config: DirtyRecordConfig, record: np.ndarray, where: str = "
     if dirty and config.on_dirty == "refuse":
         raise _dirty_error(where, dirty, "record again with nothing within reach, or set on_dirty: repair")
     usual = np.median(noise, axis=0)
-    for whisker, reason in dirty:
+    for whisker, reason in dirty.items():
         rows = clean_stretch(record[:, whisker], config.max_ratio * usual)
         if rows is None:
-            hopeless = [DirtyWhisker(whisker, f"{reason}, and it has no clean stretch")]
+            hopeless = {whisker: f"{reason}, and it has no clean stretch"}
             raise _dirty_error(where, hopeless, "record again with nothing within reach")
         mean[whisker] = record[rows, whisker].mean(axis=0)
         noise[whisker] = estimate_noise(record[rows, whisker])
-    return FreeBaseline(mean, noise, tuple(dirty))
+    return FreeBaseline(mean, noise, dirty)
 
 
 def clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
@@ -232,9 +222,9 @@ def clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
     return slice(run.start * (WINDOW // 2), (run.stop - 1) * (WINDOW // 2) + WINDOW + LAG)
 
 
-def _dirty_error(where: str, dirty: list[DirtyWhisker], cure: str) -> InputError:
+def _dirty_error(where: str, dirty: Mapping[int, str], cure: str) -> InputError:
     """The error that names each dirty whisker with its reason."""
-    found = "; ".join(f"contacts of whisker {whisker}: {reason}" for whisker, reason in dirty)
+    found = "; ".join(f"contacts of whisker {whisker}: {reason}" for whisker, reason in dirty.items())
     return InputError(where, found, "free whiskers", cure)
 
 
@@ -349,7 +339,7 @@ def calibrate(
     if dirty and config.on_dirty == "refuse":
         cure = "record again with nothing within reach, or set on_dirty: repair"
         raise _dirty_error(where, dirty, cure)
-    for whisker, reason in dirty:
+    for whisker, reason in dirty.items():
         mean[whisker], sd[whisker] = _repair(config, record, whisker, reason, where)
     return Calibration(
         mean=np.where(alive[:, None], mean, 0.0),
@@ -361,18 +351,18 @@ def calibrate(
     )
 
 
-def _find_touched(config: CalibrationConfig, deflection: np.ndarray, alive: np.ndarray) -> list[DirtyWhisker]:
+def _find_touched(config: CalibrationConfig, deflection: np.ndarray, alive: np.ndarray) -> dict[int, str]:
     """Whiskers with contacts in deflections [T, W, 2]: outliers, more than noise, or more than the others."""
     outside = _outliers(config, deflection, deflection).mean(axis=0).max(axis=1)
     sd, noise = deflection.std(axis=0), np.where(alive[:, None], estimate_noise(deflection), 0.0)
     louder = (sd / np.maximum(np.median(sd[alive], axis=0), 1e-300)).max(axis=1)
-    found = {whisker: reason for whisker, reason in _find_dirty_whiskers(sd, noise, config.max_ratio)}
+    found = _find_dirty_whiskers(sd, noise, config.max_ratio)
     for whisker in np.flatnonzero(alive & (louder > config.max_sd_ratio)).tolist():
         found[whisker] = f"its standard deviation is {louder[whisker]:.2g} times the median whisker's"
     for whisker in np.flatnonzero(alive & (outside > config.max_outlier_share)).tolist():
         beyond = f"{config.outlier_sds:g} robust standard deviations"
         found[whisker] = f"{outside[whisker]:.2%} of its samples are further than {beyond} from the median"
-    return [DirtyWhisker(whisker, found[whisker]) for whisker in sorted(found)]
+    return dict(sorted(found.items()))
 
 
 def _outliers(config: CalibrationConfig, part: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -395,7 +385,7 @@ def _repair(
         and (_outliers(config, part, whole).mean(axis=0) <= config.max_outlier_share).all()
     ]
     if 2 * len(clean) <= len(parts):
-        found = [DirtyWhisker(whisker, f"{reason}, and most of its cycles are alike")]
+        found = {whisker: f"{reason}, and most of its cycles are alike"}
         raise _dirty_error(where, found, "record again with nothing within reach")
     return np.concatenate(clean).mean(axis=0), np.concatenate(clean).std(axis=0)
 

@@ -19,7 +19,6 @@ from tactile.base.errors import InputError
 from tactile.base.samples import robust_sd
 from tactile.calibration import (
     DirtyRecordConfig,
-    DirtyWhisker,
     calibrate_free,
     estimate_drift,
     estimate_noise,
@@ -174,7 +173,7 @@ class SignalFit(NamedTuple):
     correlation: np.ndarray
     drift: np.ndarray
     dead: np.ndarray
-    dirty: tuple[DirtyWhisker, ...]
+    dirty: dict[int, str]
 
 
 def fit_signals(record: SignalRecord) -> SignalFit:
@@ -187,7 +186,7 @@ def fit_signals(record: SignalRecord) -> SignalFit:
     live = ~dead
     shape = record.free.shape[1:]
     baseline, noise, white, drift = (np.zeros(shape) for _ in range(4))
-    dirty: tuple[DirtyWhisker, ...] = ()
+    dirty: dict[int, str] = {}
     if live.any():
         free = calibrate_free(REPAIR, record.free[:, live])
         baseline[live], noise[live] = free.mean, free.noise
@@ -198,6 +197,6 @@ def fit_signals(record: SignalRecord) -> SignalFit:
         )
         drift[live] = np.where(record.contact[live, None] > MOST_CONTACT, np.nan, walk)
         numbers = np.flatnonzero(live)
-        dirty = tuple(one._replace(whisker=int(numbers[one.whisker])) for one in free.dirty)
+        dirty = {int(numbers[whisker]): reason for whisker, reason in free.dirty.items()}
     correlation = 1 - np.divide(white, noise, out=np.ones(shape), where=noise > 0) ** 2
     return SignalFit(baseline, noise, white, correlation, drift, dead, dirty)

@@ -383,21 +383,9 @@ _CLOSE = np.deg2rad(15.0)
 """Peaks whose directions differ by less belong to one row; the nearest counts, as in opexebo."""
 
 
-class LatticeShape(NamedTuple):
-    """Spacing and orientation of lattices; NaN where too few peaks are found.
-
-    Attributes:
-        spacing: [n] m. orientation: [n] rad from the x axis to the next row of peaks anticlockwise, in
-            0 .. pi / 3 for a hexagonal and 0 .. pi / 2 for a square lattice.
-    """
-
-    spacing: np.ndarray
-    orientation: np.ndarray
-
-
 def measure_lattice(
     autocorrelograms: np.ndarray, bin_size: float, lattice: Lattice = HEXAGONAL
-) -> LatticeShape:
+) -> tuple[np.ndarray, np.ndarray]:
     """Spacing and orientation of lattices (Hafting et al. 2005, Nature 436:801; Sargolini et al. 2006).
 
     The peaks nearest to the centre, three for a hexagonal and two for a square lattice in each half, give the
@@ -408,6 +396,11 @@ def measure_lattice(
     Args:
         autocorrelograms: [n, h, w] as from `autocorrelogram`; rows rise with y, columns with x.
         bin_size: side of a bin, m. lattice: its symmetry.
+
+    Returns:
+        spacing: [n] m. orientation: [n] rad from the x axis to the next row of peaks anticlockwise, in
+            0 .. pi / 3 for a hexagonal and 0 .. pi / 2 for a square lattice. NaN where there are too few
+            peaks.
 
     Raises:
         InputError: the size of a bin is not positive.
@@ -422,7 +415,7 @@ def measure_lattice(
     spacing = [bin_size * np.abs(peaks).mean() for peaks in vectors]
     angles = [np.angle(peaks) * 2 * np.pi / period for peaks in vectors]
     turns = [float(np.arctan2(np.sin(each).mean(), np.cos(each).mean())) for each in angles]
-    return LatticeShape(np.array(spacing), np.array(turns) / (2 * np.pi) * period % period)
+    return np.array(spacing), np.array(turns) / (2 * np.pi) * period % period
 
 
 def _nearest_peaks(image: np.ndarray, inner: int, count: int) -> np.ndarray:

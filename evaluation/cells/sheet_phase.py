@@ -7,8 +7,6 @@ are angles: 2 pi times position over side.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from evaluation.cells.decoding import truth_in_sheet
@@ -22,20 +20,6 @@ from evaluation.cells.rate_map import (
 )
 from evaluation.cells.recording import CellRecording
 from tactile.base.se2 import wrap
-
-
-class SheetAgreement(NamedTuple):
-    """Phases of maps against those of the sheet, over x and y.
-
-    Attributes:
-        correlation: [2] circular correlation of Fisher & Lee 1983, in [-1, 1]; 1 for equal phases up to a
-            constant.
-        offset: [2] circular mean of map minus sheet, m. residual: [2] root mean square of the rest, m.
-    """
-
-    correlation: np.ndarray
-    offset: np.ndarray
-    residual: np.ndarray
 
 
 def sheet_phases(cell: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
@@ -81,18 +65,25 @@ def map_phases(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     return np.where(silent[:, None], np.nan, np.angle(vector) % (2 * np.pi))
 
 
-def compare_phases(sheet: np.ndarray, phase: np.ndarray, sides: tuple[float, float]) -> SheetAgreement:
+def compare_phases(
+    sheet: np.ndarray, phase: np.ndarray, sides: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compares phases of the sheet and of maps, [n, 2] rad over x and y; cells with NaN do not count.
 
     Args:
         sides: of the torus over x and y, m.
+
+    Returns:
+        correlation: [2] circular correlation of Fisher & Lee 1983, in [-1, 1]; 1 for equal phases up to a
+            constant. offset: [2] circular mean of map minus sheet, m. residual: [2] root mean square of the
+            rest, m.
     """
     known = np.isfinite(phase).all(axis=1)
     sheet, phase, metres = sheet[known], phase[known], np.asarray(sides) / (2 * np.pi)
     difference = phase - sheet
     offset = np.angle(np.exp(1j * difference).mean(axis=0))
     residual = np.sqrt((wrap(difference - offset) ** 2).mean(axis=0))
-    return SheetAgreement(circular_correlation(sheet, phase), offset * metres, residual * metres)
+    return circular_correlation(sheet, phase), offset * metres, residual * metres
 
 
 def circular_correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:

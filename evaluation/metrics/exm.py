@@ -39,23 +39,15 @@ _COLUMNS = {
 }
 
 
-class ExperienceLog(NamedTuple):
-    """One row per step (whisk cycle, frame) of any SLAM system that reports its current place.
-
-    Attributes:
-        time: [N] s. experience: [N] int ids, -1 where there was none. truth: [N, 3] true pose, m, m, rad.
-    """
-
-    time: np.ndarray
-    experience: np.ndarray
-    truth: np.ndarray
-
-
-def read_experience_log(path: str | Path) -> ExperienceLog:
-    """A log from a CSV of time (s), experience id, true x (m), y (m) and heading (rad).
+def read_experience_log(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The log of any SLAM system that reports its place: a CSV with a row per step of time (s), experience
+    id, true x (m), y (m) and heading (rad).
 
     Column names may be `t` or `time`, `id` or `experience`, `theta`, `th` or `heading`, and so on; without a
     header the columns are in this order.
+
+    Returns:
+        time: [N] s. experience: [N] ids, -1 where there was none. truth: [N, 3] true pose, m, m, rad.
 
     Raises:
         InputError: a line is malformed, or an id is not a whole number.
@@ -66,7 +58,7 @@ def read_experience_log(path: str | Path) -> ExperienceLog:
     if len(broken):
         where, found = f"{path}:{line[broken[0]]}", f"experience id {experience[broken[0]]:g}"
         raise InputError(where, found, "a whole number of at most 2^53, -1 for none")
-    return ExperienceLog(time, experience.astype(np.int64), np.stack([x, y, theta], axis=1))
+    return time, experience.astype(np.int64), np.stack([x, y, theta], axis=1)
 
 
 def change_rows(experience: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from evaluation.metrics.energy_metric import Relations
-from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig, ExperienceLog
+from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import (
@@ -116,14 +116,17 @@ def score_run(
     return Scorecard(name=name, exm=exm, quantities=quantities, health=health)
 
 
-def score_log(log: ExperienceLog, name: str = "log", *, exm: ExmConfig = DEFAULT_EXM) -> Scorecard:
-    """Scores the experience log of any SLAM system by the Experience Metric in all modes."""
+def score_log(
+    log: tuple[np.ndarray, np.ndarray, np.ndarray], name: str = "log", *, exm: ExmConfig = DEFAULT_EXM
+) -> Scorecard:
+    """Scores the experience log of any SLAM system (`read_experience_log`) by the Experience Metric."""
+    time, experience, truth = log
     findings = {
-        "steps": Finding(len(log.time)),
-        "duration": Finding(float(log.time[-1] - log.time[0])),
-        "path": Finding(path_length(log.truth)),
-        "experiences": Finding(len(np.unique(log.experience[log.experience != -1]))),
-        **experience_findings(log.experience, log.truth, exm),
+        "steps": Finding(len(time)),
+        "duration": Finding(float(time[-1] - time[0])),
+        "path": Finding(path_length(truth)),
+        "experiences": Finding(len(np.unique(experience[experience != -1]))),
+        **experience_findings(experience, truth, exm),
     }
     metrics = [metric for metric in RUN_METRICS if metric.name in findings]
     quantities = {metric.name: metric.quantity(findings[metric.name]) for metric in metrics}

@@ -110,7 +110,7 @@ def _tiers(config: RunConfig, seconds: float) -> tuple[dict[str, Any], list[str]
     if config.simulation is None:
         expected = "a scene to simulate"
         raise InputError("simulation", "missing", expected, "`simulation: {}` is a whole session")
-    chosen = choose_tier(config.simulation.model_copy(update={"fidelity": "auto"}))
+    tier, reason = choose_tier(config.simulation.model_copy(update={"fidelity": "auto"}))
     short = shortened(config, seconds).simulation
     assert short is not None
     length = {"explore": short.path.explore} if short.path.explore else {"circuits": short.path.circuits}
@@ -123,7 +123,7 @@ def _tiers(config: RunConfig, seconds: float) -> tuple[dict[str, Any], list[str]
         "set": {f"simulation.path.{key}": value for key, value in length.items() if value},
         "rows": rows, "report": "tiers", "reference_tier": TIERS[-1],
     }  # fmt: skip
-    return content, [f"fidelity: auto takes {chosen.name}: {chosen.why}"]
+    return content, [f"fidelity: auto takes {tier}: {reason}"]
 
 
 def variations(document: Document, by: float) -> list[tuple[str, float | int]]:

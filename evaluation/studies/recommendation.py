@@ -179,10 +179,10 @@ def _tier(config: RunConfig) -> Iterator[_Recommendation]:
     simulation = config.simulation
     if simulation is None:
         return
-    chosen = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
-    value = "auto" if simulation.fidelity == "auto" else chosen.name
-    named = f"{chosen.name}: " if value == "auto" else ""
-    why = f"{named}{chosen.why}; `study --preset tiers` compares them"
+    tier, reason = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
+    value = "auto" if simulation.fidelity == "auto" else tier
+    named = f"{tier}: " if value == "auto" else ""
+    why = f"{named}{reason}; `study --preset tiers` compares them"
     yield _of(config, "simulation.fidelity", value, why)
 
 

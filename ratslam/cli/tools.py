@@ -67,10 +67,10 @@ def _recover(arguments: argparse.Namespace) -> int:
     from robot.recordings.mcap_reader import recover
     from robot.recordings.mcap_scanner import UNCLOSED
 
-    report = recover(arguments.recording, arguments.output)
-    lost = f"; the rest is lost: {report.reason}" if report.reason else ""
-    lost = f"; all that was written: {UNCLOSED}" if report.reason == UNCLOSED else lost
-    print(f"{arguments.output}: {report.samples} samples{lost}")
+    samples, reason = recover(arguments.recording, arguments.output)
+    lost = f"; the rest is lost: {reason}" if reason else ""
+    lost = f"; all that was written: {UNCLOSED}" if reason == UNCLOSED else lost
+    print(f"{arguments.output}: {samples} samples{lost}")
     return 0
 
 

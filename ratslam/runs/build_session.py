@@ -95,7 +95,7 @@ def open_source(
     if config.simulation is not None:
         session = HeadSimulation(config.simulation, config.touch.head)
         if report is not None:
-            report(f"simulating in the {session.tier.name} tier: {session.tier.why}")
+            report(f"simulating in the {session.tier} tier: {session.tier_reason}")
         return session
     if config.source is not None:
         entry = SOURCES.get(config.source.plugin, "source.plugin")

@@ -107,7 +107,7 @@ def _signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
             for k in np.flatnonzero(np.isnan(fit.drift).any(axis=1))
         ),
     )
-    reasons = {one.whisker: f"dirty: {one.reason}" for one in fit.dirty}
+    reasons = {whisker: f"dirty: {reason}" for whisker, reason in fit.dirty.items()}
     reasons |= {int(k): "dead: no signal" for k in np.flatnonzero(fit.dead)}
     lines = [f"each channel: baseline; noise; correlation; drift ({record.unit}, {record.unit}/sqrt(s))"]
     for k, name in enumerate(record.names):
@@ -315,31 +315,29 @@ def _fit_stage(source: PluginConfig) -> Rig:
         InputError: the record cannot be read.
     """
     settings = read_settings(StageConfig, source.settings, "source.settings")
-    record = read_stage_calibration(settings.file)
+    position, signal, base = read_stage_calibration(settings.file)
     # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.
-    errors = np.zeros((2, len(record.signal)))
+    errors = np.zeros((2, len(signal)))
     try:
-        for fold in _folds(len(record.signal)):
-            known = fit_signal_map(record.position[~fold], record.signal[~fold], record.base)
+        for fold in _folds(len(signal)):
+            known = fit_signal_map(position[~fold], signal[~fold], base)
             for out, mean in zip(
                 errors,
-                (known.predict(record.position[fold]), record.signal[~fold].mean(axis=0)),
+                (known.predict(position[fold]), signal[~fold].mean(axis=0)),
                 strict=True,
             ):
-                out[fold] = np.sqrt(((record.signal[fold] - mean) ** 2).mean(axis=1))
+                out[fold] = np.sqrt(((signal[fold] - mean) ** 2).mean(axis=1))
     except InputError as reason:
         return Rig(unknown=(f"stage-to-signal map: {reason}",))
-    size = float(np.sqrt((record.signal**2).mean()))
+    size = float(np.sqrt((signal**2).mean()))
     error, control = (float(np.median(part)) for part in errors)
-    share = [100 * float(np.median(errors[0][fold])) / size for fold in _folds(len(record.signal))]
+    share = [100 * float(np.median(errors[0][fold])) / size for fold in _folds(len(signal))]
     quantities = (
         Quantity("signal, rms", None, size, None, "counts"),
         Quantity("error of the map, held out", None, 100 * error / size, float(np.std(share)), "% of rms"),
         Quantity("error without a map (the mean)", None, 100 * control / size, None, "% of rms"),
     )
-    note = (
-        f"map: {len(record.signal)} touches at known places; median error of rows held out, in {FOLDS} parts"
-    )
+    note = f"map: {len(signal)} touches at known places; median error of rows held out, in {FOLDS} parts"
     unknown = ("noise, drift: a stage rests between its rows, and the file has no time",)
     return Rig(quantities, notes=(note,), unknown=unknown)
 

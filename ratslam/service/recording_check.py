@@ -148,10 +148,10 @@ def _describe_bag(path: Path) -> _FileContents:
         )
         if topic.roles:
             notes += _clock_notes(topic.name, clock)
-    moving = [f"{link.parent} -> {link.child}" for link in found.links if not link.fixed]
+    moving = [f"{parent} -> {child}" for parent, child, fixed, _ in found.links if not fixed]
     if found.links:
-        fixed = len(found.links) - len(moving)
-        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {fixed} fixed link{'s' * (fixed != 1)}")
+        still = len(found.links) - len(moving)
+        notes.append(f"frames: {', '.join(moving) or 'none moves'}; {still} fixed link{'s' * (still != 1)}")
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")

@@ -31,7 +31,6 @@ from robot.live.polling import (
 from robot.simulation.create.state_machine import (
     CreateState,
     MachineState,
-    MotionEnd,
     WheelCommand,
     early_end,
     next_state,
@@ -284,13 +283,13 @@ def run_create_loop(
     try:
         while number < plan.reports if plan.reports else stamp < 60 * plan.minutes:
             _wait_for_mapper(rig, mapper)
-            end, contact, strain, sampled = _execute(rig, mapper, doing, touching)
+            moment, contact, strain, sampled = _execute(rig, mapper, doing, touching)
             odometry = rig.motion()
             stamp += odometry.dt
             report = Report(
                 odometry=odometry,
                 motion=int(doing.state.motion),
-                moment=int(end.moment),
+                moment=int(moment),
                 alive=rig.alive & sampled,
                 contact=contact,
                 time=np.arange(len(strain)) / plan.whiskers.rate,
@@ -300,7 +299,7 @@ def run_create_loop(
             if rig.recorder is not None:
                 rig.recorder.add_sample(sample)
             mapper.offer(sample)
-            tell(stamp, doing.state, end.moment)
+            tell(stamp, doing.state, moment)
             if not sampled:
                 # The robot rests; the reader limits the time.
                 rig.record_event("held", "the whiskers send no samples")
@@ -308,7 +307,7 @@ def run_create_loop(
                     lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the whiskers"
                 )
                 rig.record_event("resumed", "the whiskers send samples")
-            doing = next_state(plan.behaviour, doing, end.moment, odometry.dtheta, random, LEAST_TURN)
+            doing = next_state(plan.behaviour, doing, moment, odometry.dtheta, random, LEAST_TURN)
             touching, number = contact, number + 1
     finally:
         rig.robot.stop()
@@ -316,15 +315,15 @@ def run_create_loop(
 
 def _execute(
     rig: CreateRig, mapper: AsyncMapper, doing: MachineState, before: np.ndarray
-) -> tuple[MotionEnd, np.ndarray, np.ndarray, bool]:
+) -> tuple[StepEnd, np.ndarray, np.ndarray, bool]:
     """Drives until the planned end, an early one, or the last sample of whiskers that fall silent.
 
     Args:
         before: [W] contacts at the end of the previous motion.
 
     Returns:
-        the end of the motion; [W] contacts at its end; [T, W, 2] strain; whether the whiskers sent samples to
-        its end.
+        the kind of end of the motion; [W] contacts at its end; [T, W, 2] strain; whether the whiskers sent
+        samples to its end.
     """
     behaviour, monitor = rig.create.plan.behaviour, rig.monitor
     command = wheel_command(behaviour, doing)
@@ -349,7 +348,7 @@ def _execute(
             rig.robot.stop()
             whiskers = len(rig.alive)
             nothing = np.zeros(whiskers, bool), np.zeros((0, whiskers, 2))
-            return MotionEnd(0, StepEnd.FREE), *nothing, False
+            return StepEnd.FREE, *nothing, False
         rows = monitor.rows(last + 1)
         bumped += [rig.bumped] * (len(rows) - len(bumped))
         if len(rows):
@@ -358,12 +357,13 @@ def _execute(
                 end = planned_end(doing.state, last)
         if end is None and now - driven > RENEW:
             driven = _drive(rig, command)
-    if doing.state in (CreateState.FWD1, CreateState.TURN) and end.moment is StepEnd.FREE:
+    row, moment = end
+    if doing.state in (CreateState.FWD1, CreateState.TURN) and moment is StepEnd.FREE:
         rig.robot.refresh()  # the next motion probably goes on
     else:
         rig.robot.stop()
-    contact = np.abs(_known(rig, rows)[end.row, :, 0]) > behaviour.contact
-    return end, contact, _strain_series(rig, doing.state, end.row + 1), True
+    contact = np.abs(_known(rig, rows)[row, :, 0]) > behaviour.contact
+    return moment, contact, _strain_series(rig, doing.state, row + 1), True
 
 
 def _drive(rig: CreateRig, command: WheelCommand) -> float:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -120,14 +119,6 @@ class Recording(ClosedSource):
         raise InputError(str(self.path), found, "a file that does not change while it is read")
 
 
-class Recovery(NamedTuple):
-    """Result of `recover`. Attributes: samples: number of samples. reason: fault of the old file, '' if it
-    was complete."""
-
-    samples: int
-    reason: str
-
-
 def record_source(source: Source, path: Path) -> int:
     """Write all samples of a source to a new recording; returns their number."""
     shape, rate = source.view_shape, source.rate_hz
@@ -139,10 +130,13 @@ def record_source(source: Source, path: Path) -> int:
         return recorder.count
 
 
-def recover(path: Path, out: Path) -> Recovery:
+def recover(path: Path, out: Path) -> tuple[int, str]:
     """Copy every readable message of a truncated or damaged recording, unchanged, to a new, complete one.
 
     The new file appears under its name only when it is complete. Values are not checked.
+
+    Returns:
+        the number of samples, and the fault of the old file, '' if it was complete.
 
     Raises:
         InputError: `path` has no readable sample, or `out` exists.
@@ -170,7 +164,7 @@ def recover(path: Path, out: Path) -> Recovery:
         flush_to_disk(path)
 
     make_new_file(out, write)
-    return Recovery(scanner.count, scanner.broken)
+    return scanner.count, scanner.broken
 
 
 def _unreadable_recording_error(scanner: McapScanner) -> InputError:

@@ -232,15 +232,6 @@ class StageRecording(NamedTuple):
     digest: str
 
 
-class StageCalibration(NamedTuple):
-    """Contacts at known points: position [N, 3] and base [3] in stage coordinates, m; signal [N, 3] above
-    the signal at the base, counts."""
-
-    position: np.ndarray
-    base: np.ndarray
-    signal: np.ndarray
-
-
 class StageConfig(Settings):
     """A whisker on a stage as a source: one view of 1 x 1 x 3, the sizes of the three signals."""
 
@@ -270,10 +261,13 @@ def cut_sweep(recording: StageRecording) -> StageRecording:
     return recording._replace(position=recording.position[rows], signal=recording.signal[rows])
 
 
-def read_stage_calibration(path: Path) -> StageCalibration:
+def read_stage_calibration(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reads a calibration whose rays start at the whisker's base, as its first row does.
 
     The rows at the base give the signal of a free whisker; between them it drifts linearly.
+
+    Returns:
+        position: [N, 3] of the contacts, m. signal: [N, 3] above that at the base, counts. base: [3], m.
 
     Raises:
         InputError: as `read_stage`, or a single row at the base.
@@ -287,7 +281,7 @@ def read_stage_calibration(path: Path) -> StageCalibration:
     index = np.arange(len(free))
     baseline = [np.interp(index, index[free], channel[free]) for channel in recording.signal.T]
     above = recording.signal - np.stack(baseline, axis=1)
-    return StageCalibration(recording.position[~free], base, above[~free])
+    return recording.position[~free], above[~free], base
 
 
 def _open_stage(config: StageConfig) -> Source:
@@ -320,17 +314,6 @@ OBJECTS_WHISKERS = 8
 """Whiskers that feel the objects; each gives 16 displacements of its root."""
 
 
-class ObjectRecord(NamedTuple):
-    """The touches of one object.
-
-    Attributes:
-        images: [N, 8, 16] displacements, pixels. digest: sha256 (hex) of the file.
-    """
-
-    images: np.ndarray
-    digest: str
-
-
 class ObjectConfig(Settings):
     """The touches of one object as a source."""
 
@@ -338,8 +321,9 @@ class ObjectConfig(Settings):
     """The CSV file."""
 
 
-def read_object(path: Path) -> ObjectRecord:
-    """The record in a file without a header: a row per touch.
+def read_object(path: Path) -> tuple[np.ndarray, str]:
+    """The touches [N, 8, 16] of one object, displacements in pixels, and the sha256 (hex) of their file; it
+    has no header and a row per touch.
 
     The file does not say that rows are in the order of the touches, nor which values belong to one whisker;
     16 successive ones are taken to.
@@ -352,7 +336,7 @@ def read_object(path: Path) -> ObjectRecord:
         row, column = broken[0].tolist()
         found = f"{table[row, column]:g} in column {column + 1}"
         raise InputError(f"{path}:{row + 1}", found, "whole numbers of pixels")
-    return ObjectRecord(table.reshape(-1, OBJECTS_WHISKERS, 16), digest)
+    return table.reshape(-1, OBJECTS_WHISKERS, 16), digest
 
 
 def open_object(config: ObjectConfig) -> InMemorySource:
@@ -361,9 +345,9 @@ def open_object(config: ObjectConfig) -> InMemorySource:
     Raises:
         InputError: see `read_object`.
     """
-    record = read_object(config.file)
-    time, alive = np.arange(len(record.images), dtype=float), np.ones(OBJECTS_WHISKERS, bool)
-    return _source(config.file.stem, record.digest, time, record.images[:, None], alive=alive)
+    images, digest = read_object(config.file)
+    time, alive = np.arange(len(images), dtype=float), np.ones(OBJECTS_WHISKERS, bool)
+    return _source(config.file.stem, digest, time, images[:, None], alive=alive)
 
 
 OBJECTS = SourceEntry(ObjectConfig, lambda config, warn: open_object(config))

@@ -190,28 +190,19 @@ class Frame(NamedTuple):
     grey: np.ndarray
 
 
-class CameraRows(NamedTuple):
-    """What a recording keeps of N frames.
-
-    Attributes:
-        time: [N] s, as in the frames; not checked. view: [N, R, C, 1] in 0..1.
-        motion: [N, 4] (dx VO metres, dy, dtheta rad, dt s) since the previous frame, the first zero; None
-            without visual odometry.
-    """
-
-    time: np.ndarray
-    view: np.ndarray
-    motion: np.ndarray | None
-
-
 def camera_rows(
     frames: Iterable[Frame], views: ImageViewConfig, odometry: VisualOdometryConfig | None, where: str
-) -> CameraRows:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Reads frames one by one; of each only its view, and of the last one its profiles are kept.
 
     Args:
         odometry: visual odometry, or None if the recording has another.
         where: the file or topic of the frames, for errors.
+
+    Returns:
+        time: [N] s, as in the frames; not checked. view: [N, R, C, 1] in 0..1.
+        motion: [N, 4] (dx VO metres, dy, dtheta rad, dt s) since the previous frame, the first zero; None
+            without visual odometry.
 
     Raises:
         InputError: there are no frames, their size changes, or a crop does not fit them.
@@ -243,7 +234,7 @@ def camera_rows(
     if odometry is not None:
         distance, turn = np.array(moves).T
         motion = from_motions(clock, distance, 0.0, turn)
-    return CameraRows(clock, np.stack(pictures), motion)
+    return clock, np.stack(pictures), motion
 
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm")

@@ -10,7 +10,7 @@ from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
 from robot.recordings.input_judge import InputJudge, MotionTrack
 from robot.recordings.recording_config import RecordingConfig
-from robot.recordings.video import CameraRows, VideoConfig, camera_rows, stamp_errors, video_frames
+from robot.recordings.video import VideoConfig, camera_rows, stamp_errors, video_frames
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
 from tactile.base.errors import InputError
@@ -33,36 +33,39 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
     if stamps is not None:
         raise_errors(stamp_errors(stamps, video.time))
     visual = config.visual_odometry if wheels is None else None
-    rows = camera_rows(video_frames(path, video, stamps, judge.warn), config.image, visual, str(path))
+    time, view, motion = camera_rows(
+        video_frames(path, video, stamps, judge.warn), config.image, visual, str(path)
+    )
     digest = digest_of_files([path], b"" if stamps is None else stamps.content)
-    inside = judge.stretch.rows(rows.time, str(path))
-    rows = CameraRows(*(None if part is None else part[inside] for part in rows))  # type: ignore[arg-type]
+    inside = judge.stretch.rows(time, str(path))
+    time, view = time[inside], view[inside]
     if wheels is not None:
         source = replace(wheels, name=path.stem, digest=digest_of([digest.encode(), wheels.digest.encode()]))
-        return _with_views(source, rows.time, rows.view, video, str(path))
-    assert rows.motion is not None  # `_contradictions` requires visual odometry
-    rows.motion[:1] = 0.0
+        return _with_views(source, time, view, video, str(path))
+    assert motion is not None  # `_contradictions` requires visual odometry
+    motion = motion[inside]
+    motion[:1] = 0.0
     truth = None
     if config.table.truth is not None and config.table.truth.file is not None:
         file = read_csv(config.table.truth.file, config.table.units.time)
         raise_errors(file.absences(column_keys(config.table.truth, "table.truth")))
         truth, errors = align_truth(
-            file, config.table.truth, rows.time, config.limits, same_rows=False, warn=judge.warn
+            file, config.table.truth, time, config.limits, same_rows=False, warn=judge.warn
         )
         raise_errors(errors)
-    everywhere = np.ones(len(rows.time), bool)
+    everywhere = np.ones(len(time), bool)
     # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
-    track = MotionTrack(rows.time, everywhere, rows.motion)
+    track = MotionTrack(time, everywhere, motion)
     raise_errors(judge.errors(track, lambda row: f"{path}, frame {row * video.every}", str(path)))
     return InMemorySource(
         name=path.stem,
         digest=judge.stretch.digest(digest),
-        time=rows.time,
-        motion=rows.motion,
+        time=time,
+        motion=motion,
         moved=everywhere,
-        views=rows.view,
+        views=view,
         seen=everywhere,
-        label=np.full(len(rows.time), -1, np.int32),
+        label=np.full(len(time), -1, np.int32),
         truth=truth,
     )
 

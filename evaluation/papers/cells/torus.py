@@ -20,7 +20,6 @@ from evaluation.cells.grid_score import (
     HEXAGONAL,
     SQUARE,
     Lattice,
-    LatticeShape,
     autocorrelogram,
     lattice_scores,
     measure_lattice,
@@ -60,7 +59,7 @@ class _LatticeFigures(NamedTuple):
 
     Attributes:
         size: of the box, m. bin: m. maps: [n, H, W] rates. hexagonal, square: lattice scores and shuffles.
-            shape: spacing and orientation of the square lattice. fields: [n] number.
+            spacing: [n] of the square lattice, m. fields: [n] number.
     """
 
     size: tuple[float, float]
@@ -68,7 +67,7 @@ class _LatticeFigures(NamedTuple):
     maps: np.ndarray
     hexagonal: ShuffledScores
     square: ShuffledScores
-    shape: LatticeShape
+    spacing: np.ndarray
     fields: np.ndarray
 
 
@@ -138,9 +137,9 @@ def measure_cells(
     sums = np.array([np.bincount(at, weight * cell, count) for cell in activity[inside].T])
     rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *shape)
     maps = smooth_rates(rates, seconds.reshape(shape), SMOOTHING / bin)
-    lattice = measure_lattice(autocorrelogram(maps), bin, SQUARE)
+    spacing, _ = measure_lattice(autocorrelogram(maps), bin, SQUARE)
     fields = find_fields(maps, least_bins=round(FIELD / bin**2))
-    return _LatticeFigures(size, bin, maps, hexagonal, square, lattice, fields.number)
+    return _LatticeFigures(size, bin, maps, hexagonal, square, spacing, fields.number)
 
 
 def table_torus(result: _Torus) -> list[str]:
@@ -155,8 +154,8 @@ def table_torus(result: _Torus) -> list[str]:
     lines.append(markdown_row(["larger box over torus", "above 1", _ratio(large, torus), "-"]))
     for name, found in (("columns", large), ("single cells", single)):
         spacing = markdown_row([
-            f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.shape.spacing, 3),
-            f"shuffles have none; found in {np.isfinite(found.shape.spacing).sum()} of {len(found.maps)}",
+            f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.spacing, 3),
+            f"shuffles have none; found in {np.isfinite(found.spacing).sum()} of {len(found.maps)}",
         ])  # fmt: skip
         square, hexagonal = _control(found.square), _control(found.hexagonal)
         lines += [
@@ -184,7 +183,7 @@ NOT_SHOWN = (
 def draw_result(result: _Torus, png: Path) -> None:
     """A row of maps and one of autocorrelograms for each box; histograms of the scores in the larger."""
     large, _, small, torus = result
-    values = (large.shape.spacing, large.square.score, large.hexagonal.score)
+    values = (large.spacing, large.square.score, large.hexagonal.score)
     spacing, square, hexagonal = (float(np.nanmedian(each)) for each in values)
     line = (
         f"Torus {torus:.2f} m. Larger box, medians: spacing {spacing:.2f} m, square score {square:.2f}, "
@@ -216,7 +215,7 @@ def draw_result(result: _Torus, png: Path) -> None:
             figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
             top -= tall
             _draw_row(figure, top, tall, images, extent, colours)
-    axes = _draw_histograms(figure, scores, large.shape.spacing, torus)
+    axes = _draw_histograms(figure, scores, large.spacing, torus)
     style.add_legend(figure, axes, columns=2)
     figure.savefig(png)
 

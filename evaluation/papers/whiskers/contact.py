@@ -204,7 +204,7 @@ def _whisker_table(result: _ContactResult) -> list[str]:
 
 def _remark(result: _ContactResult, whisker: int) -> str:
     """What is to be said about a whisker: dirty, bent, away at the end, or never touching."""
-    parts = [f"dirty: {one.reason}" for one in result.free.dirty if one.whisker == whisker]
+    parts = [f"dirty: {result.free.dirty[whisker]}"] if whisker in result.free.dirty else []
     if result.bent[whisker]:
         parts.append("bent")
     if result.never[whisker]:
@@ -295,7 +295,7 @@ def _draw_rows(axes: Axes, result: _ContactResult) -> None:
         for w in range(len(result.whiskers)):
             bars = [(first / rate, (last - first) / rate) for first, last in true_runs(found[:, w])]
             axes.broken_barh(bars, (w + height - 0.17, 0.34), color=colour, lw=0)
-    dirty = [one.whisker for one in result.free.dirty]
+    dirty = result.free.dirty
     names = [f"{name}*" if w in dirty else name for w, name in enumerate(result.whiskers)]
     axes.set_yticks(range(len(names)), names)
     axes.set(xlim=(0, len(result.contact) / rate), ylim=(len(names) - 0.5, -0.5))
@@ -353,7 +353,7 @@ def _measure_contacts(data: Path) -> _ContactResult:
     free = calibrate_free(config.free, first)
     touch, baseline = _follow(config, free, signal)
     fixed = find_fixed_contacts(first, signal)
-    dirty = np.array([any(w == one.whisker for one in free.dirty) for w in range(len(WHISKERS))])
+    dirty = np.array([whisker in free.dirty for whisker in range(len(WHISKERS))])
     away = np.abs(signal - free.mean).max(axis=0) / free.noise
     never = (away < CONTACT_SDS).all(axis=1)
     contact = touch == Touch.CONTACT
@@ -439,7 +439,7 @@ def _score_hours(
     touching = np.flatnonzero(~never & ~dirty)
     snippets = [snippet for w in touching for snippet in _cut(signal[:, w], free.mean[w], free.noise[w])]
     whiskers = signal.shape[1]
-    known = FreeBaseline(np.zeros(signal.shape[1:]), np.tile(model.noise, (whiskers, 1)), ())
+    known = FreeBaseline(np.zeros(signal.shape[1:]), np.tile(model.noise, (whiskers, 1)), {})
     ends = [round(hours * 3600 * config.rate / BLOCK) for hours in HOURS]
     made = simulate_stream(model, snippets, whiskers, ends[-1], BLOCK, seed=1)
     rules = {name: _decide(config, known, name) for name in RULES}

@@ -177,7 +177,7 @@ def _whisker_lines(result: _FitResult) -> list[str]:
         "| in contact | |",
         "|---|---|---|---|---|---|---|",
     ]
-    reasons = {one.whisker: one.reason for one in fit.dirty}
+    reasons = fit.dirty
     for k, name in enumerate(names):
         noise, white, colour, drift = (
             float(np.median(column[k])) for column in (fit.noise, fit.white, fit.correlation, fit.drift)
@@ -286,7 +286,7 @@ def _draw_ate(axes: style.Axes, result: _FitResult) -> None:
 
 def _draw_whiskers(axes: style.Axes, result: _FitResult) -> None:
     fit, names = result.whiskers, result.signals.names
-    dirty = {one.whisker for one in fit.dirty}
+    dirty = fit.dirty
     at = np.arange(len(names))
     for channel, shift in enumerate((-0.25, 0.0, 0.25)):
         label = "noise" if channel == 0 else None

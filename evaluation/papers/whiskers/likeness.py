@@ -84,7 +84,7 @@ def _measure(folder: Path) -> _LikenessResult:
     """
     objects, taxels = require_recordings(folder, OBJECTS, TAXELS)
     # The touches of all objects, in runs of 30; and an image of each contact, its mean pressures.
-    views = [read_object(path).images.reshape(-1, 128) for path in sorted(objects.glob("*.csv"))]
+    views = [read_object(path)[0].reshape(-1, 128) for path in sorted(objects.glob("*.csv"))]
     count = [len(rows) for rows in views]
     run = np.concatenate([np.arange(rows) // BLOCK for rows in count])
     whiskers = _ImageSet(np.concatenate(views), np.repeat(np.arange(len(views)), count), run)

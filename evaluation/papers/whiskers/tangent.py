@@ -201,8 +201,7 @@ def measure(folder: Path) -> TangentResult:
     (bench,) = require_recordings(folder, BENCH)
     maps = {}
     for name in (SENSOR_1, *CURVED):
-        calibration = read_stage_calibration(bench / "calibration" / name)
-        maps[name] = fit_signal_map(calibration.position, calibration.signal, calibration.base)
+        maps[name] = fit_signal_map(*read_stage_calibration(bench / "calibration" / name))
     by_day = {day: _sweeps(bench, maps[SENSOR_1], which)[0] for day, which in CYLINDER_DAYS.items()}
     cylinder = {}
     for day, sweeps in by_day.items():

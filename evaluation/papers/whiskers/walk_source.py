@@ -8,6 +8,7 @@ object's recording, later visits give rows of the second half, and no row is giv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from pydantic import NonNegativeInt
 
 from evaluation.papers.tables.touch_table import TouchTask, task_config
-from robot.recordings.real_whiskers import OBJECTS_WHISKERS, ObjectRecord, read_object
+from robot.recordings.real_whiskers import OBJECTS_WHISKERS, read_object
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of
@@ -65,16 +66,16 @@ def open_walk(config: WalkConfig) -> InMemorySource:
     paths = sorted(config.folder.glob("*.csv"))
     if not paths:
         raise InputError(str(config.folder), "no CSV files", "the recorded objects")
-    records = [read_object(path) for path in paths]
+    objects, digests = zip(*(read_object(path) for path in paths), strict=True)
     session = HeadSimulation(config.simulation)
-    visits = plan_visits(session.truth, len(records), config.seed)
+    visits = plan_visits(session.truth, len(objects), config.seed)
     draw = draw_any if config.shuffled else draw_by_place
-    images = draw(records, visits, config.seed)
+    images = draw(objects, visits, config.seed)
     count = session.length
     settings = config.model_dump_json(exclude={"folder"})
     return InMemorySource(
         name="walk",
-        digest=digest_of([*(record.digest.encode() for record in records), settings.encode()]),
+        digest=digest_of([*(digest.encode() for digest in digests), settings.encode()]),
         time=session.time,
         motion=session.odometry,
         moved=np.ones(count, bool),
@@ -110,7 +111,7 @@ def most_needed(visits: Visits) -> int:
     )
 
 
-def draw_by_place(records: list[ObjectRecord], visits: Visits, seed: int) -> np.ndarray:
+def draw_by_place(objects: Sequence[np.ndarray], visits: Visits, seed: int) -> np.ndarray:
     """[N, 8, 16] a row of the object of each whisk: of the first half of its recording in first visits, else
     of the second.
 
@@ -118,9 +119,9 @@ def draw_by_place(records: list[ObjectRecord], visits: Visits, seed: int) -> np.
         InputError: there are too few rows.
     """
     random = stream(seed, "rows of objects")
-    images = np.zeros((len(visits.thing), *records[0].images.shape[1:]))
-    for number, record in enumerate(records):
-        half = len(record.images) // 2
+    images = np.zeros((len(visits.thing), *objects[0].shape[1:]))
+    for number, touches in enumerate(objects):
+        half = len(touches) // 2
         for later, rows in ((False, np.arange(half)), (True, np.arange(half, 2 * half))):
             whisks = np.flatnonzero((visits.thing == number) & (visits.later == later))
             if len(whisks) > half:
@@ -128,13 +129,13 @@ def draw_by_place(records: list[ObjectRecord], visits: Visits, seed: int) -> np.
                     f"object {number} is felt {len(whisks)} times in {'later' if later else 'first'} visits"
                 )
                 raise InputError("seed", found, f"at most {half} times", "choose another seed")
-            images[whisks] = record.images[random.permutation(rows)[: len(whisks)]]
+            images[whisks] = touches[random.permutation(rows)[: len(whisks)]]
     return images
 
 
-def draw_any(records: list[ObjectRecord], visits: Visits, seed: int) -> np.ndarray:
+def draw_any(objects: Sequence[np.ndarray], visits: Visits, seed: int) -> np.ndarray:
     """[N, 8, 16] rows of any object; the control."""
-    rows = np.concatenate([record.images for record in records])
+    rows = np.concatenate(objects)
     return rows[stream(seed, "rows of objects").permutation(len(rows))[: len(visits.thing)]]
 
 

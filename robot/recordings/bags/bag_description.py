@@ -146,25 +146,17 @@ class TopicDescription(NamedTuple):
     fault: str
 
 
-class FrameLink(NamedTuple):
-    """A link between frames. Attributes: fixed: it is on /tf_static. total: number of transforms."""
-
-    parent: str
-    child: str
-    fixed: bool
-    total: int
-
-
 class BagDescription(NamedTuple):
     """A bag.
 
     Attributes:
-        topics: by name, with messages. links: frames of /tf and /tf_static. notes: what is left out.
+        topics: by name, with messages. links: of /tf and /tf_static: parent, child,
+            whether it is fixed (on /tf_static) and the number of transforms. notes: what is left out.
     """
 
     path: Path
     topics: tuple[TopicDescription, ...]
-    links: tuple[FrameLink, ...]
+    links: tuple[tuple[str, str, bool, int], ...]
     notes: tuple[str, ...] = ()
 
 
@@ -184,7 +176,7 @@ def describe_bag(path: Path) -> BagDescription:
                 found = read_links(bag, name, "header")
             except InputError:
                 continue  # the fault of the topic says why
-            links += [FrameLink(*pair, name == STATIC, len(link)) for pair, link in found.items()]
+            links += [(*pair, name == STATIC, len(link)) for pair, link in found.items()]
     return BagDescription(path, topics, tuple(links), tuple(told))
 
 

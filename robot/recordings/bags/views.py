@@ -399,10 +399,9 @@ def read_image_views(
             stamps.append(stamp)
             yield Frame(stamp / 10**9, grey)
 
-    rows = camera_rows(frames(), image, visual_odometry, where)
-    views = as_series(where, numbers, stamps, rows.view, clock, report)
-    motion = None if rows.motion is None else rows.motion[np.isin(numbers, views.numbers)]
-    return views, motion
+    _, view, motion = camera_rows(frames(), image, visual_odometry, where)
+    views = as_series(where, numbers, stamps, view, clock, report)
+    return views, None if motion is None else motion[np.isin(numbers, views.numbers)]
 
 
 class _RangeReader:

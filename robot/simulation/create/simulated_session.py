@@ -282,15 +282,15 @@ class CreateRobot:
         if len(near):
             gap = segment_distance(near, np.vstack([last.pose, poses])[:, :2]).min(axis=1)
             bumped = (gap[1:] < config.body) & (np.diff(gap) < 0)
-        end = motion_end(config, state, known, bumped, last.contact)
-        duration = float(time[end.row])
+        row, moment = motion_end(config, state, known, bumped, last.contact)
+        duration = float(time[row])
         return CreateStep(
             state,
-            end.moment,
+            moment,
             duration,
-            poses[end.row],
-            bent.side[end.row],
-            np.abs(known[end.row, :, 0]) > config.contact,
+            poses[row],
+            bent.side[row],
+            np.abs(known[row, :, 0]) > config.contact,
             self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
         )
 

@@ -133,17 +133,10 @@ def drive(command: WheelCommand, pose: np.ndarray, time: np.ndarray) -> np.ndarr
     return np.column_stack([pose[0] + c * ahead, pose[1] + s * ahead, pose[2] + turned])
 
 
-class MotionEnd(NamedTuple):
-    """End of a motion: row of the monitored strain, and kind of end."""
-
-    row: int
-    moment: StepEnd
-
-
 def motion_end(
     config: BehaviourConfig, state: CreateState, strain: np.ndarray, bumped: np.ndarray, before: np.ndarray
-) -> MotionEnd:
-    """The end of a motion in a state.
+) -> tuple[int, StepEnd]:
+    """The end of a motion in a state: row of the monitored strain, and kind of end.
 
     Args:
         strain: [T, W, 2] and bumped: [T] bool, monitored every `period`; the last row is the planned end.
@@ -158,9 +151,9 @@ def planned_rows(config: BehaviourConfig, command: WheelCommand) -> int:
     return max(int(np.ceil(command.duration / config.period - 1e-9)), 1)
 
 
-def planned_end(state: CreateState, last: int) -> MotionEnd:
+def planned_end(state: CreateState, last: int) -> tuple[int, StepEnd]:
     """The end of a motion that nothing has ended before row `last`."""
-    return MotionEnd(last, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE)
+    return last, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE
 
 
 def early_end(
@@ -170,14 +163,14 @@ def early_end(
     bumped: np.ndarray,
     before: np.ndarray,
     last: int,
-) -> MotionEnd | None:
+) -> tuple[int, StepEnd] | None:
     """The end of a motion by whiskers or body; None if the rows so far have none.
 
     Args:
         strain, bumped, before: as in `motion_end`, rows so far. last: row of the planned end.
     """
     if state == CreateState.BACK:  # only a contact of the body ends BACK early
-        return MotionEnd(_first(bumped), StepEnd.FREE) if bumped.any() else None
+        return (_first(bumped), StepEnd.FREE) if bumped.any() else None
     level = np.abs(strain[..., 0])
     over = np.abs(strain).max(axis=2) > config.safety
     if state == CreateState.TURN:
@@ -198,7 +191,7 @@ def early_end(
     if not ends:
         return None
     row, _, moment = min(ends)
-    return MotionEnd(row, moment)
+    return row, moment
 
 
 def _first(flags: np.ndarray) -> int:

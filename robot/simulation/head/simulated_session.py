@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path as File
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeInt
@@ -193,15 +193,11 @@ class SimulationConfig(Settings):
         return self.model_copy(update={"maze": maze})
 
 
-class ChosenTier(NamedTuple):
-    """A fidelity and the reason for it."""
-
-    name: Literal["kinematic", "quasistatic", "dynamic"]
-    why: str
+Tier = Literal["kinematic", "quasistatic", "dynamic"]
 
 
-def choose_tier(config: SimulationConfig) -> ChosenTier:
-    """The fidelity in the configuration, or for `auto` the cheapest one that gives the requested data.
+def choose_tier(config: SimulationConfig) -> tuple[Tier, str]:
+    """The fidelity in the configuration, or for `auto` the cheapest one that gives the requested data; why.
 
     Raises:
         InputError: raw samples, or a baseline that acts on them, are requested, but the configured fidelity
@@ -212,12 +208,12 @@ def choose_tier(config: SimulationConfig) -> ChosenTier:
         found = "kinematic, which has no raw samples" + (" for mechanics.baseline to act on" if on else "")
         raise InputError("simulation.fidelity", found, "auto, quasistatic or dynamic")
     if config.fidelity != "auto":
-        return ChosenTier(config.fidelity, "set by simulation.fidelity")
+        return config.fidelity, "set by simulation.fidelity"
     if on:
-        return ChosenTier("quasistatic", "mechanics.baseline acts on raw samples")
+        return "quasistatic", "mechanics.baseline acts on raw samples"
     if config.raw:
-        return ChosenTier("quasistatic", "raw samples are wanted, without bending modes and overshoot")
-    return ChosenTier("kinematic", "only contact features are wanted")
+        return "quasistatic", "raw samples are wanted, without bending modes and overshoot"
+    return "kinematic", "only contact features are wanted"
 
 
 class HeadSimulation(SimulatedSource):
@@ -238,7 +234,8 @@ class HeadSimulation(SimulatedSource):
 
     def __init__(self, config: SimulationConfig, head_config: HeadConfig | None = None) -> None:
         head_config = head_config or HeadConfig()
-        self.config, self.head_config, self.tier = config, head_config, choose_tier(config)
+        self.config, self.head_config = config, head_config
+        self.tier, self.tier_reason = choose_tier(config)
         self.head = head = ur10_head(head_config)
         whisking, seed = config.whisking, config.seed
         check_amplitude(whisking, head)
@@ -266,7 +263,7 @@ class HeadSimulation(SimulatedSource):
             mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
         )
         self.calibration, self.features = None, None
-        if self.tier.name == "kinematic":
+        if self.tier == "kinematic":
             parts = []
             for surroundings, cycles in self._parts:
                 random = stream(seed, "sensor")  # noise of the whole session, independent of the maze
@@ -276,7 +273,7 @@ class HeadSimulation(SimulatedSource):
             self.features = WhiskColumns(*features)
         else:  # free whisking before the session
             whisks = int(np.ceil(config.calibration.min_duration * whisking.rate))
-            random, model = stream(seed, "calibration"), RAW_TIERS[self.tier.name]
+            random, model = stream(seed, "calibration"), RAW_TIERS[self.tier]
             record = simulate_free_cycles(model, self._setup, whisks, random, self._baseline)
             self.calibration = calibrate(config.calibration, record, where="simulation")
 
@@ -291,7 +288,7 @@ class HeadSimulation(SimulatedSource):
             calibration=self.calibration,
             maze=maze_info(self.scene.maze, config.maze, config.seed),
             simulation=SimulationInfo(
-                sha256=self.digest, seed=config.seed, tier=self.tier.name, why=self.tier.why
+                sha256=self.digest, seed=config.seed, tier=self.tier, why=self.tier_reason
             ),
             provenance={"simulation": plain},
         )
@@ -321,7 +318,7 @@ class HeadSimulation(SimulatedSource):
         """Raw samples of each cycle, without odometry."""
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
-        model, threshold = RAW_TIERS[self.tier.name], self.calibration.threshold[:, 1]
+        model, threshold = RAW_TIERS[self.tier], self.calibration.threshold[:, 1]
         for surroundings, rows in self._parts:
             path, start = self.scene.path, self.start[rows]
             yield from simulate_cycles(

@@ -23,17 +23,17 @@ ROWS = "0,7,0.1,0.2,3\n0.5,-1,0.1,0.2,-3\n"
 def test_column_names_in_a_header(tmp_path, head):
     path = tmp_path / "log.csv"
     path.write_text(head + ROWS)
-    log = read_experience_log(path)
-    assert log.time.tolist() == [0, 0.5]
-    assert log.experience.tolist() == [7, -1]
-    assert log.truth.tolist() == [[0.1, 0.2, 3], [0.1, 0.2, -3]]
+    time, experience, truth = read_experience_log(path)
+    assert time.tolist() == [0, 0.5]
+    assert experience.tolist() == [7, -1]
+    assert truth.tolist() == [[0.1, 0.2, 3], [0.1, 0.2, -3]]
 
 
 def test_columns_in_any_order_among_others(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("heading,gain,y,x,id,t\n3,9,0.2,0.1,7,0\n")
-    log = read_experience_log(path)
-    assert (log.time[0], log.experience[0], log.truth[0].tolist()) == (0, 7, [0.1, 0.2, 3])
+    time, experience, truth = read_experience_log(path)
+    assert (time[0], experience[0], truth[0].tolist()) == (0, 7, [0.1, 0.2, 3])
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ def test_kernel_gives_the_same_log_odds(dtype):
 def test_real_objects_are_told_apart():
     """Of the shipped slice, two rows a run; the other rows are learned from."""
     folder = Path(__file__).parents[2] / "data" / "real_touch" / "purdue"
-    views = np.stack([read_object(path).images.reshape(-1, 128) for path in sorted(folder.glob("*.csv"))])
+    views = np.stack([read_object(path)[0].reshape(-1, 128) for path in sorted(folder.glob("*.csv"))])
     thing = np.repeat(np.arange(len(views)), views.shape[1])
     images, held = stored_image(views.reshape(-1, 128), np.ones(128, bool)), np.arange(len(thing)) % 4 == 0
     known, places = images[~held], thing[~held]

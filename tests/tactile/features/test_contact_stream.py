@@ -20,7 +20,7 @@ from tactile.contact_stream import (
 )
 
 RATE = 200.0
-FREE = FreeBaseline(np.array([[5.0, -3.0, 0.0], [0.0, 1.0, 2.0]]), np.array([[1.0, 2.0, 0.5]] * 2), ())
+FREE = FreeBaseline(np.array([[5.0, -3.0, 0.0], [0.0, 1.0, 2.0]]), np.array([[1.0, 2.0, 0.5]] * 2), {})
 SEEDS = st.integers(0, 10_000)
 
 

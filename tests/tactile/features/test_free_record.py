@@ -28,7 +28,7 @@ def press(record: np.ndarray, whisker: int, first: int, last: int) -> None:
 @given(st.integers(0, 500))
 def test_a_clean_record_gives_mean_and_noise(seed: int) -> None:
     baseline = calibrate_free(DirtyRecordConfig(), free_record(seed))
-    assert baseline.dirty == ()
+    assert baseline.dirty == {}
     np.testing.assert_allclose(baseline.mean[:, 0], 100.0 * np.arange(5), atol=0.6)
     np.testing.assert_allclose(baseline.noise, 2.0, rtol=0.35)
 
@@ -49,7 +49,7 @@ def test_repair_takes_a_stretch_without_the_contact(seed: int, whisker: int, fir
     record = free_record(seed)
     press(record, whisker, first, first + 120)
     baseline = calibrate_free(REPAIR, record)
-    assert [one.whisker for one in baseline.dirty] == [whisker]
+    assert [*baseline.dirty] == [whisker]
     np.testing.assert_allclose(baseline.mean[whisker], 100 * whisker, atol=2.0)
     np.testing.assert_allclose(baseline.noise[whisker], 2.0, rtol=0.45)
 
@@ -73,4 +73,4 @@ def test_the_clean_stretch_leaves_the_contact_out() -> None:
 def test_a_whisker_without_a_signal_is_no_standard_for_the_others() -> None:
     record = free_record()
     record[:, :2] = 7.0
-    assert calibrate_free(DirtyRecordConfig(), record).dirty == ()
+    assert calibrate_free(DirtyRecordConfig(), record).dirty == {}

@@ -174,8 +174,7 @@ def test_a_sweep_without_contact_is_an_error() -> None:
 
 def test_real_sweeps_along_a_cylinder() -> None:
     """The centre comes from one sweep, the tangents from another at another depth of the same day."""
-    calibration = read_stage_calibration(SLICES / "stage_calibration.csv")
-    known = fit_signal_map(calibration.position, calibration.signal, calibration.base)
+    known = fit_signal_map(*read_stage_calibration(SLICES / "stage_calibration.csv"))
     tracks = []
     for number in (2, 5):
         sweep = cut_sweep(read_stage(SLICES / f"stage_cylinder_{number}.csv"))

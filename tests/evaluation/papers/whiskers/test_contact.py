@@ -23,7 +23,7 @@ def signal(reference_data: Path) -> np.ndarray:
 def contacts(signal: np.ndarray) -> np.ndarray:
     config = ReachConfig(file=Path("reach.csv"))
     free = calibrate_free(config.free, signal[: config.free_rows])
-    assert [WHISKERS[one.whisker] for one in free.dirty] == ["right5"]
+    assert [WHISKERS[whisker] for whisker in free.dirty] == ["right5"]
     return find_contacts(*start_stream(config.contact, free, config.rate), signal)[1] == Touch.CONTACT
 
 

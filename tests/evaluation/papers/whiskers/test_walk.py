@@ -28,7 +28,6 @@ from evaluation.papers.whiskers.walk_source import (
 )
 from ratslam.recall.config import sector_shifts
 from ratslam.runs.settings.completion import complete
-from robot.recordings.real_whiskers import ObjectRecord
 from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze import CELL_SIDE
@@ -47,7 +46,7 @@ def along(cells, heading=0.0, whisks=6):
 def records_of(rows=20, things=3):
     """Records in which every row is another number."""
     number = np.arange(things * rows, dtype=float).reshape(things, rows, 1, 1)
-    return [ObjectRecord(np.broadcast_to(one, (rows, 8, 16)).copy(), "") for one in number]
+    return [np.broadcast_to(one, (rows, 8, 16)).copy() for one in number]
 
 
 def test_a_place_is_a_cell_and_a_facing():

@@ -58,10 +58,10 @@ def test_black_is_zero_and_white_is_one() -> None:
 
 def test_a_panorama_turns_by_whole_columns_exactly() -> None:
     shifts = [0, 3, -5, 0, 9]  # things move to the right: the camera turns counter-clockwise
-    rows = camera_rows(turning(shifts), VIEW, PANORAMA, "turn")
-    assert rows.motion is not None
-    np.testing.assert_allclose(rows.motion[:, 2], np.array(shifts) * 2 * np.pi / 320, atol=1e-12)
-    np.testing.assert_allclose(rows.motion[:, :2], 0.0, atol=1e-12)
+    _, _, motion = camera_rows(turning(shifts), VIEW, PANORAMA, "turn")
+    assert motion is not None
+    np.testing.assert_allclose(motion[:, 2], np.array(shifts) * 2 * np.pi / 320, atol=1e-12)
+    np.testing.assert_allclose(motion[:, :2], 0.0, atol=1e-12)
 
 
 def test_turns_are_found_between_columns() -> None:
@@ -69,24 +69,24 @@ def test_turns_are_found_between_columns() -> None:
         Frame(f.time, f.grey.reshape(24, 80, 4).mean(axis=2).round().astype(np.uint8))
         for f in turning([0, 1, 2, 5])
     ]
-    rows = camera_rows(coarse, VIEW, PANORAMA, "turn")
-    assert rows.motion is not None
-    error = rows.motion[1:, 2] / (2 * np.pi / 80) - [0.25, 0.5, 1.25]
+    _, _, motion = camera_rows(coarse, VIEW, PANORAMA, "turn")
+    assert motion is not None
+    error = motion[1:, 2] / (2 * np.pi / 80) - [0.25, 0.5, 1.25]
     assert np.abs(error).max() < 0.08  # columns; whole ones would be off by 0.25 and 0.5
 
 
 def test_a_camera_with_edges_turns_by_its_field_of_view() -> None:
     frames = [Frame(f.time, f.grey[:, :200]) for f in turning([0, 4, 4, -6])]
-    rows = camera_rows(frames, VIEW, NARROW, "turn")
-    assert rows.motion is not None
-    np.testing.assert_allclose(np.rad2deg(rows.motion[:, 2]), np.array([0, 4, 4, -6]) * 60 / 200, atol=0.01)
+    _, _, motion = camera_rows(frames, VIEW, NARROW, "turn")
+    assert motion is not None
+    np.testing.assert_allclose(np.rad2deg(motion[:, 2]), np.array([0, 4, 4, -6]) * 60 / 200, atol=0.01)
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.6])
 def test_exposure_cancels_out(gain: float) -> None:
     frames = turning([0, 4, 4])
     dark = [Frame(f.time, np.round(f.grey * gain).astype(np.uint8)) for f in frames]
-    full, less = (camera_rows(part, VIEW, PANORAMA, "turn").motion for part in (frames, dark))
+    full, less = (camera_rows(part, VIEW, PANORAMA, "turn")[2] for part in (frames, dark))
     assert full is not None
     assert less is not None
     np.testing.assert_allclose(full, less, atol=2e-3)
@@ -97,7 +97,7 @@ def test_the_first_frame_is_silent_and_steps_follow_the_stamps() -> None:
     noise = [random.integers(0, 256, (24, 320), dtype=np.uint8) for _ in range(3)]
     config = VisualOdometryConfig(fov_deg=60, max_speed=0.01)  # the limit counts here: distance is 0.01 dt
     frames = [Frame(time, grey) for time, grey in zip((5.0, 5.1, 5.4), noise, strict=True)]
-    motion = camera_rows(frames, VIEW, config, "noise").motion
+    motion = camera_rows(frames, VIEW, config, "noise")[2]
     assert motion is not None
     assert (motion[0] == 0).all()
     np.testing.assert_allclose(np.hypot(motion[:, 0], motion[:, 1]), [0, 0.001, 0.003], rtol=1e-9)
@@ -106,14 +106,14 @@ def test_the_first_frame_is_silent_and_steps_follow_the_stamps() -> None:
 
 def test_turns_beyond_the_largest_rate_are_not_looked_for() -> None:
     config = VisualOdometryConfig(fov_deg=360, max_turn_rate_deg=30)  # 3 degrees, 2.7 columns, in 0.1 s
-    motion = camera_rows(turning([0, 40]), VIEW, config, "turn").motion
+    motion = camera_rows(turning([0, 40]), VIEW, config, "turn")[2]
     assert motion is not None
     assert abs(np.rad2deg(motion[1, 2])) <= 3.4
 
 
 def test_black_frames_and_repeated_stamps_move_nothing() -> None:
     frames = [Frame(time, np.zeros((24, 32), np.uint8)) for time in (0.0, 0.1, 0.1)]
-    motion = camera_rows(frames, VIEW, NARROW, "night").motion
+    motion = camera_rows(frames, VIEW, NARROW, "night")[2]
     assert motion is not None
     assert np.isfinite(motion).all()
     assert (motion[:, :3] == 0).all()
@@ -158,4 +158,4 @@ def test_faulty_frames_are_refused(case: str) -> None:
 
 
 def test_without_visual_odometry_there_is_no_motion() -> None:
-    assert camera_rows(turning([0, 1]), VIEW, None, "turn").motion is None
+    assert camera_rows(turning([0, 1]), VIEW, None, "turn")[2] is None

@@ -29,7 +29,7 @@ def damaged(tmp_path):
 
 
 def test_rows_are_whiskers_of_displacements():
-    images = read_object(CHERRY).images
+    images = read_object(CHERRY)[0]
     assert images.shape == (12, 8, 16)
     numbers = [int(cell) for cell in CHERRY.read_text().splitlines()[3].split(",")]
     np.testing.assert_array_equal(images[3].ravel(), numbers)
@@ -82,5 +82,5 @@ def test_whole_recording(reference_data):
     folder = reference_data / "real_touch" / "actuated_whisker_purdue" / "data" / "objCls"
     if not folder.is_dir():
         pytest.skip(f"no folder {folder}")
-    counts = [read_object(path).images.shape for path in sorted(folder.glob("*.csv"))]
+    counts = [read_object(path)[0].shape for path in sorted(folder.glob("*.csv"))]
     assert counts == [(180, 8, 16)] * 10

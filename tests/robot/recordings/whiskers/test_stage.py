@@ -38,13 +38,13 @@ def test_a_sweep_with_even_steps_is_left_whole() -> None:
 
 
 def test_a_calibration_is_above_the_signal_at_the_base() -> None:
-    calibration = read_stage_calibration(SLICES / "stage_calibration.csv")
-    reach = np.linalg.norm(calibration.position - calibration.base, axis=1)
+    position, signal, base = read_stage_calibration(SLICES / "stage_calibration.csv")
+    reach = np.linalg.norm(position - base, axis=1)
     assert reach.min() > 4e-3
     assert reach.max() < 43e-3
     raw = read_stage(SLICES / "stage_calibration.csv")
     # The first ray starts with the free signal.
-    np.testing.assert_allclose(calibration.signal[0], raw.signal[1] - raw.signal[0], atol=10.0)
+    np.testing.assert_allclose(signal[0], raw.signal[1] - raw.signal[0], atol=10.0)
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,7 @@ def quiet() -> np.ndarray:
 def end_of(
     state: CreateState, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
 ) -> tuple[int, StepEnd]:
-    end = motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
-    return end.row, end.moment
+    return motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
 
 
 @pytest.mark.parametrize(
