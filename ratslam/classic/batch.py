@@ -91,8 +91,8 @@ def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: 
         def step(cells: Any, row: Course) -> Any:
             odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
             energy = row.energy * network.energy
-            cells, info = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
-            return cells, (cells.pose, info.outcome, info.level)
+            cells, (_, outcome, level) = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
+            return cells, (cells.pose, outcome, level)
 
         return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
 
@@ -283,9 +283,9 @@ def _walk(
             packet = packet.at[row.template].set(jnp.where(row.novel, cells.pose, seen))
             turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
             recall, energy = (seen + turned) % ring, row.energy * network.energy
-            cells, info = pose_cells.step(config, tuned, cells, moved, recall, energy)
+            cells, (_, outcome, level) = pose_cells.step(config, tuned, cells, moved, recall, energy)
             active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
-            return (cells, packet), CellTrack(cells.pose, active, info.outcome, info.level)
+            return (cells, packet), CellTrack(cells.pose, active, outcome, level)
 
         return lax.scan(step, walker, rows)
 

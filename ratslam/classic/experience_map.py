@@ -339,15 +339,6 @@ class Places(NamedTuple):
     links: Array
 
 
-class Decision(NamedTuple):
-    """The current place after a step, the one before, an `Action`, and bool: the store was not full."""
-
-    place: Array
-    previous: Array
-    action: Array
-    room: Array
-
-
 def start(capacity: int, dtype: np.dtype) -> Places:
     """An empty store."""
     return Places(
@@ -370,8 +361,13 @@ def distance(config: PlaceConfig, rings: np.ndarray, store: Places, packet: Arra
 
 def decide(
     config: PlaceConfig, rings: np.ndarray, store: Places, packet: Array, template: Array, seen: Array
-) -> tuple[Places, Decision]:
-    """Keeps, reaches or creates a place, given the template and the packet [3] of a view."""
+) -> tuple[Places, tuple[Array, Array, Array, Array]]:
+    """Keeps, reaches or creates a place, given the template and the packet [3] of a view.
+
+    Returns:
+        the store; and the current place after the step, the one before, an `Action`, and bool: the store was
+        not full.
+    """
     capacity = store.template.shape[0]
     row = jnp.arange(capacity, dtype=jnp.int32)
     previous, origin = store.current, jnp.maximum(store.current, 0)
@@ -409,4 +405,4 @@ def decide(
         link=store.link.at[at].set(jnp.where(new_link, pair, store.link[at])),
         links=store.links + new_link.astype(jnp.int32),
     )
-    return store, Decision(place, previous, action.astype(jnp.int32), room | ~(act & ~reach))
+    return store, (place, previous, action.astype(jnp.int32), room | ~(act & ~reach))

@@ -165,14 +165,9 @@ class StepInput(NamedTuple):
     heading_lag: Array
 
 
-class StepResult(NamedTuple):
-    """pose, spread: [3] of the strongest packet, cells. died: bool, activity died out and was reseeded.
-    level: int32, at which the step was computed."""
-
-    pose: Array
-    spread: Array
-    died: Array
-    level: Array
+StepResult = tuple[Array, Array, Array, Array]
+"""Pose and spread [3] of the strongest packet, cells; bool, activity died out and was reseeded; and int32,
+the level at which the step was computed."""
 
 
 def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepResult, Array]:
@@ -199,7 +194,7 @@ def step_at(level: Level, block: Block, inputs: StepInput) -> tuple[Block, StepR
     _, block, exact, died = lax.while_loop(goes_on, substep, carry)
     block = _strongest_first(level, block)
     pose, spread = level.window.decode(block.activity[0], block.origin[0])
-    return block, StepResult(pose, spread, died, jnp.int32(0)), exact
+    return block, (pose, spread, died, jnp.int32(0)), exact
 
 
 def _equal_sums(a: Array, b: Array | float) -> Array:
@@ -323,9 +318,9 @@ def step_at_smallest_level(
     if len(levels) == 1:
         block, result, exact = step_at(levels[0], activity.blocks[0], inputs)
         missing = jnp.where(exact, activity.level, 1).astype(jnp.int32)
-        return Activity((block,), missing), result._replace(level=missing)
+        return Activity((block,), missing), (*result[:3], missing)
     zero = jnp.zeros_like(inputs.pose)
-    carry = (activity.level, activity.blocks[0], StepResult(zero, zero, jnp.bool_(False), jnp.int32(0)))
+    carry = (activity.level, activity.blocks[0], (zero, zero, jnp.bool_(False), jnp.int32(0)))
 
     # Loops of at most one round: XLA copies the results of a branch, but not the unchanged values of a loop.
     def at_smallest(carry: Any) -> Any:
@@ -365,14 +360,14 @@ def _attempt(
         low = jax.tree.map(lambda leaf: leaf[:1], block)
         fits = jnp.max(block.activity[1:]) <= 0
     else:
-        low = _transfer(level, block, levels[0], smallest_window.origin_centred_on(result.pose))
+        low = _transfer(level, block, levels[0], smallest_window.origin_centred_on(result[0]))
         fits = jnp.sum(low.activity > 0) == jnp.sum(block.activity > 0)
         fits &= smallest_window.margin_is_empty(low.activity[0])
     blocks = list(now.blocks)
     blocks[0], blocks[k] = low, jax.tree.map(partial(jnp.where, exact), block, now.blocks[k])
     to_try = jnp.where(exact, len(levels), k + 1).astype(jnp.int32)
     after = Activity(tuple(blocks), jnp.where(fits, 0, k).astype(jnp.int32))
-    return to_try, after, result._replace(level=jnp.int32(k))
+    return to_try, after, (*result[:3], jnp.int32(k))
 
 
 def _middle(levels: tuple[Level, ...], activity: Activity, inputs: StepInput) -> Array:

@@ -66,14 +66,6 @@ class PoseCells(NamedTuple):
     settling: Array
 
 
-class StepInfo(NamedTuple):
-    """spread: [3] of the packet, cells. outcome: an `Outcome`, int32. level: the window level, int32."""
-
-    spread: Array
-    outcome: Array
-    level: Array
-
-
 def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
     """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
@@ -88,12 +80,15 @@ def step(
     odometry: Odometry,
     recall: Array,
     energy: Array,
-) -> tuple[PoseCells, StepInfo]:
+) -> tuple[PoseCells, tuple[Array, Array, Array]]:
     """One step of the network.
 
     Args:
         levels: see `window_levels`. odometry: body-frame motion, m, m, rad (finite).
         recall: [3] recalled pose, cells. energy: injected there, 0 for none.
+
+    Returns:
+        the network; and the spread [3] of the packet, cells, an `Outcome` and the window level, int32.
     """
     dtype = cells.pose.dtype
     n, unit = rings(config, dtype), units(config, dtype)
@@ -118,4 +113,4 @@ def step(
     jumped = died | (jnp.max(jnp.abs(behind)) > JUMP)
     lag = jnp.where(measured, jnp.where(jumped, jnp.zeros_like(lag), behind), cells.lag)
     outcome = jnp.where(died, Outcome.RESEEDED, jnp.where(needed > substeps, Outcome.TOO_FAST, Outcome.OK))
-    return PoseCells(activity, pose, lag, settling), StepInfo(spread, outcome.astype(jnp.int32), level)
+    return PoseCells(activity, pose, lag, settling), (spread, outcome.astype(jnp.int32), level)

@@ -30,9 +30,9 @@ def main() -> None:
     cells, history = pose_cells.start(config, jnp.float64), []
     for _ in range(max(SHOWN) + 1):
         history.append(np.asarray(to_full_torus(levels, cells.activity)))  # [heading, y, x]
-        cells, info = step(cells)
+        cells, (spread, _, _) = step(cells)
     active = int((history[-1] > 0).sum())
-    print(f"after {SHOWN[-1]} steps: {active} of {history[-1].size} active, sd {info.spread[0]:.2f} cells")
+    print(f"after {SHOWN[-1]} steps: {active} of {history[-1].size} active, sd {spread[0]:.2f} cells")
     _draw([history[number] for number in SHOWN]).savefig("one_packet.png")
 
 

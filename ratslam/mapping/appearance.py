@@ -399,7 +399,7 @@ class LabelAppearance(Appearance):
     def gain_prior(self, usual: GainPrior) -> GainPrior:
         """An id is the same at a true pose, and another one at a false pose."""
         same, other = label_gains(len(np.unique(self._label.rows)))
-        return GainPrior(true=(same, LABEL_SPREAD), false=(other, LABEL_SPREAD))
+        return (same, LABEL_SPREAD), (other, LABEL_SPREAD)
 
     def take(self, frames: np.ndarray) -> None:
         self._label.replace(self._label.rows[frames])

@@ -274,11 +274,8 @@ LEAVING = -2.0
 """Log-odds of leaving mapped ground: false pose hypotheses do so more often than true ones."""
 
 
-class GainPrior(NamedTuple):
-    """Gains before any were counted: mean and standard deviation at `true` and at `false` poses, nat."""
-
-    true: tuple[float, float]
-    false: tuple[float, float]
+GainPrior = tuple[tuple[float, float], tuple[float, float]]
+"""Gains before any were counted: mean and standard deviation at true and at false poses, nat."""
 
 
 class GainOdds(NamedTuple):
@@ -296,7 +293,7 @@ class GainOdds(NamedTuple):
         return float(self.odds[np.searchsorted(self.edges, gain)])
 
 
-PRIOR = GainPrior(true=(1.9, 0.8), false=(0.5, 1.6))
+PRIOR: GainPrior = ((1.9, 0.8), (0.5, 1.6))
 """Of plain gains."""
 
 
@@ -401,8 +398,8 @@ def less_where_common(gain: np.ndarray, share: float = COMMON) -> np.ndarray:
 MAP_WEIGHTING = GainWeighting(np.asarray, PRIOR, 1.0)
 """For two pieces of finished maps, of which many keyframes are compared."""
 PIECE_WEIGHTING = GainWeighting(
-    partial(less_where_common, share=COMMON_OF_PIECE), GainPrior(true=(2.4, 0.8), false=(1.0, 1.6)), 1.5
+    partial(less_where_common, share=COMMON_OF_PIECE), ((2.4, 0.8), (1.0, 1.6)), 1.5
 )
 """For the newest piece of a growing map."""
-SESSION_WEIGHTING = GainWeighting(less_where_common, GainPrior(true=(2.95, 0.8), false=(1.55, 1.6)), 2.0)
+SESSION_WEIGHTING = GainWeighting(less_where_common, ((2.95, 0.8), (1.55, 1.6)), 2.0)
 """For a session of which few keyframes are known."""

@@ -64,24 +64,17 @@ ALONE = 5.0
 """Number of successive keyframes whose views count as one, because they are alike."""
 
 
-class _ClaimedRevisits(NamedTuple):
-    """n claims by `examined` keyframes.
+def claimed_revisits(
+    graph: KeyframeGraph, poses: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly.
 
-    Attributes:
-        frame: [n] keyframe. match: [n] the first of the older keyframes near it, of one pass. rank: [n]
-        share
-            of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by chance. A
-            control is as many keyframes elsewhere among the older ones, in the same order.
+    Returns:
+        of each of n claims its keyframe [n], the first of the older keyframes near it, of one pass [n], and
+        the share [n] of the controls that its view fits worse than these, 0..1; ties count half; 0.5 by
+        chance (a control is as many keyframes elsewhere among the older ones, in the same order); and how
+        many keyframes were examined.
     """
-
-    frame: np.ndarray
-    match: np.ndarray
-    rank: np.ndarray
-    examined: int
-
-
-def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> _ClaimedRevisits:
-    """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly."""
     first, count = graph.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
     facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
@@ -89,7 +82,7 @@ def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> _Cla
     row, near = np.nonzero(facing if whiskers else facing > 0)
     frame, reversed = frames[row], facing[row, near] < 0
     if not len(frame):
-        return _ClaimedRevisits(frame, near, np.zeros(0), len(frames))
+        return frame, near, np.zeros(0), len(frames)
     shares = np.concatenate([[0.0], CONTROLS])
     older = (frame - graph.guard)[:, None]
     others = (near[:, None] + (older * shares).astype(int)) % older
@@ -100,20 +93,20 @@ def claimed_revisits(graph: KeyframeGraph, poses: np.ndarray, most: int) -> _Cla
     best = np.minimum.reduceat(misfits.reshape(others.shape), passes, axis=0)
     here, elsewhere = best[:, :1], best[:, 1:]
     rank = (here < elsewhere).mean(axis=1) + (here == elsewhere).mean(axis=1) / 2
-    return _ClaimedRevisits(frame[passes], near[passes], rank, len(frames))
+    return frame[passes], near[passes], rank, len(frames)
 
 
 def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
     """What the views say against poses [N, 3] of the keyframes, chi-square: -2 times the log ratio of the
     density of the ranks where claims are right to that where they are wrong (uniform), for as many
     independent views as there are times `ALONE` keyframes."""
-    claims = claimed_revisits(graph, poses, JUDGED)
-    if not len(claims.frame):
+    claimant, _, rank, examined = claimed_revisits(graph, poses, JUDGED)
+    if not len(claimant):
         return 0.0
-    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * claims.rank ** (SHAPE - 1)
-    _, frame = np.unique(claims.frame, return_inverse=True)
+    right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * rank ** (SHAPE - 1)
+    _, frame = np.unique(claimant, return_inverse=True)
     each = np.bincount(frame, np.log(right)) / np.bincount(frame)
-    return float(-2 * each.sum() * len(poses) / (claims.examined * ALONE))
+    return float(-2 * each.sum() * len(poses) / (examined * ALONE))
 
 
 Place = Callable[[np.ndarray], np.ndarray]
@@ -378,9 +371,9 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
 
 def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
     """Log ratio of the claims of revisits that the views confirm to those that they contradict."""
-    claims = claimed_revisits(graph, poses, EXAMINED)
-    sides = 2 * claims.rank - 1
-    each = max(claims.examined, 1)
+    _, _, rank, examined = claimed_revisits(graph, poses, EXAMINED)
+    sides = 2 * rank - 1
+    each = max(examined, 1)
     agreed, contradicted = np.maximum(sides, 0).sum() / each, np.maximum(-sides, 0).sum() / each
     return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
 

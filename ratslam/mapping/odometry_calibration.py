@@ -40,14 +40,9 @@ BLOCKS = 12
 """Blocks of a recording for the jackknife estimate of the standard error."""
 
 
-class BiasEstimate(NamedTuple):
-    """Heading error per distance, rad/m, and its standard error."""
-
-    value: float
-    error: float
-
-
-NO_ESTIMATE = BiasEstimate(0.0, np.inf)
+BiasEstimate = tuple[float, float]
+"""Heading error per distance, rad/m, and its standard error."""
+NO_ESTIMATE: BiasEstimate = (0.0, np.inf)
 
 
 class SectorFan(Checkpointed):
@@ -109,9 +104,9 @@ class SectorFan(Checkpointed):
                 for row in self._measure_turns(np.arange(done, count) + lag, lag):
                     pairs.append(row)
         answers = [_fit_slope(self._pairs[lag].rows, abs(self._angle)) for lag in LAGS]
-        value = float(np.mean([answer.value for answer in answers]))
-        error = np.mean([answer.error**2 for answer in answers]) + (answers[0].value - answers[1].value) ** 2
-        return BiasEstimate(value, float(np.sqrt(error)))
+        values, errors = zip(*answers, strict=True)
+        variance = np.mean([error**2 for error in errors]) + (values[0] - values[1]) ** 2
+        return float(np.mean(values)), float(np.sqrt(variance))
 
     def _measure_turns(self, at: np.ndarray, lag: int) -> np.ndarray:
         """[n, 3] heading error (rad), its weight, and distance (m) of keyframes `at` [n] and those `lag`
@@ -198,7 +193,7 @@ def _fit_slope(pairs: np.ndarray, angle: float) -> BiasEstimate:
     if rest.min() <= 1e-9 * bottom.sum():
         return NO_ESTIMATE  # one block holds all the weight
     without = np.array([top.sum() - top[part].sum() for part in parts]) / rest
-    return BiasEstimate(value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum())))
+    return value, float(np.sqrt((1 - 1 / BLOCKS) * ((without - without.mean()) ** 2).sum()))
 
 
 TEXT = """\
@@ -233,9 +228,10 @@ def calibration_from_views(
 ) -> CalibrationPrior:
     """The prior with the heading bias that the views show, shrunk towards that of the start where the views
     are not certain of it."""
-    off, error = shown.value - start.bias, shown.error
+    value, error = shown
+    off = value - start.bias
     shrunk = start.bias + (off * max(0.0, 1 - (config.shrink * error / off) ** 2) if off else 0.0)
-    sd = min(np.hypot(error, shown.value - shrunk), 2 * start.bias_sd)
+    sd = min(np.hypot(error, value - shrunk), 2 * start.bias_sd)
     sd = max(sd, min(config.bias_least / cell, start.bias_sd))
     return start._replace(bias=shrunk, bias_sd=float(sd))
 

@@ -6,7 +6,6 @@ undone."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,19 +21,10 @@ YOUNG = 400
 """Number of keyframes of a piece up to which its tie is tried."""
 
 
-class Tie(NamedTuple):
-    """A placement of the newest piece.
-
-    Attributes:
-        log_odds: of the placement less the logarithm of the number of places; where those of another
-            placement are within half of `tie_log_odds`, the difference to the largest of these. closures:
-            implied by the placement.
-    """
-
-    log_odds: float
-    closures: Sequence[Candidate]
-
-
+Tie = tuple[float, Sequence[Candidate]]
+"""A placement of the newest piece: its log-odds less the logarithm of the number of places (where those of
+another placement are within half of `tie_log_odds`, the difference to the largest of these), and the closures
+that it implies."""
 FindTie = Callable[[KeyframeGraph, ClosureLog, Archive, LearnedOdds], Tie | None]
 """Finds the best placement of the keyframes since the newest beginning among those before, and keeps the
 odds that it learns for these; None without any."""
@@ -60,13 +50,13 @@ def tie_newest_piece(
     begins[: starts[-1]] = False
     across = np.flatnonzero(spans_beginnings(begins, log) & (log.verdicts() == Verdict.ACCEPTED))
     if not len(across):
-        if tie is None or tie.log_odds < graph.config.tie_log_odds:
+        if tie is None or tie[0] < graph.config.tie_log_odds:
             return False
-        for k, candidate in enumerate(tie.closures):
+        for k, candidate in enumerate(tie[1]):
             sequence = log.add(candidate, k > 0)
             archive.add(candidate, k > 0, graph)
             log.judge(sequence, Verdict.ACCEPTED)
-    elif tie is not None and tie.log_odds >= graph.config.tie_log_odds / 2:
+    elif tie is not None and tie[0] >= graph.config.tie_log_odds / 2:
         return False
     for sequence in across.tolist():
         log.judge(sequence, Verdict.UNDONE)

@@ -224,23 +224,19 @@ def _chi_squares(error: np.ndarray, information: np.ndarray) -> np.ndarray:
     return chi2
 
 
-class Kernel(NamedTuple):
-    """A robust kernel: cost, weight (its slope) and curvature (twice the fall of the slope, at most the
-    weight over the squared error) of an edge as functions of its squared Mahalanobis error."""
+Function = Callable[[np.ndarray], np.ndarray]
+Kernel = tuple[Function, Function, Function]
+"""A robust kernel: weight (the slope of the cost), cost, and curvature (twice the fall of the slope, at most
+the weight over the squared error) of an edge as functions of its squared Mahalanobis error."""
 
-    weight: Callable[[np.ndarray], np.ndarray]
-    loss: Callable[[np.ndarray], np.ndarray]
-    curvature: Callable[[np.ndarray], np.ndarray]
-
-
-no_kernel = Kernel(np.ones_like, lambda chi2: chi2, np.zeros_like)
+no_kernel: Kernel = (np.ones_like, lambda chi2: chi2, np.zeros_like)
 """Plain least squares."""
 
 
 def huber(scale: float) -> Kernel:
     """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber
     1964)."""
-    return Kernel(
+    return (
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
         lambda chi2: np.where(chi2 <= scale**2, 0.0, scale / np.maximum(chi2, 1e-300) ** 1.5),
@@ -255,7 +251,7 @@ def geman_mcclure(mu: float) -> Kernel:
         weight = (mu / (mu + chi2)) ** 2
         return weight * np.minimum(4 / (mu + chi2), 1 / np.maximum(chi2, 1e-300))
 
-    return Kernel(lambda chi2: (mu / (mu + chi2)) ** 2, lambda chi2: mu * chi2 / (mu + chi2), curvature)
+    return (lambda chi2: (mu / (mu + chi2)) ** 2, lambda chi2: mu * chi2 / (mu + chi2), curvature)
 
 
 class Termination(Enum):
@@ -349,9 +345,9 @@ def _evaluate(
     with np.errstate(over="ignore", invalid="ignore"):
         chi2 = _chi_squares(errors[0], information)
         among, weights, curvature = chi2[robust], np.ones(len(chi2)), np.zeros(len(chi2))
-        weights[robust] = kernel.weight(among)
-        curvature[robust] = kernel.curvature(among)
-        chi2[robust] = kernel.loss(among)
+        weight, loss, bend = kernel
+        weights[robust], curvature[robust] = weight(among), bend(among)
+        chi2[robust] = loss(among)
     return errors, weights, curvature, float(chi2.sum())
 
 

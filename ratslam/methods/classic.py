@@ -116,28 +116,26 @@ class ClassicBackend(Backend):
         turned = jnp.stack([jnp.zeros_like(relative), jnp.zeros_like(relative), relative / self.units[2]])
 
         recalled = (memory.packet[jnp.maximum(match.template, 0)] + turned) % self.rings
-        cells, info = pose_cells.step(
+        cells, (spread, outcome, level) = pose_cells.step(
             self.network, self.window_levels, state.cells, odometry, recalled, energy
         )
         canonical = (cells.pose - turned) % self.rings
-        world, decision = experience_map.decide(
+        world, (place, previous, action, room) = experience_map.decide(
             config.places, self.rings, state.places, canonical, memory.current, seen & (memory.current >= 0)
         )
 
-        outcome = jnp.where(learnt & decision.room, info.outcome, Outcome.FULL)
+        outcome = jnp.where(learnt & room, outcome, Outcome.FULL)
         outcome = jnp.where(clean, outcome, Outcome.NOT_FINITE).astype(jnp.int32)
         pose = cells.pose * self.units
         estimate = Estimate(
             pose=jnp.stack([pose[0], pose[1], wrap(pose[2])]),
-            spread=info.spread * self.units,
-            place=decision.place,
-            previous=decision.previous,
-            action=decision.action,
+            spread=spread * self.units,
+            place=place,
+            previous=previous,
+            action=action,
             lost=(outcome == Outcome.RESEEDED) | (outcome == Outcome.TOO_FAST),
         )
-        evidence = ClassicEvidence(
-            memory.current, match.error, relative, energy, cells.pose, info.level, outcome
-        )
+        evidence = ClassicEvidence(memory.current, match.error, relative, energy, cells.pose, level, outcome)
         return ClassicState(cells, memory, world, relative), estimate, evidence
 
     def probe(self) -> PoseCellProbe:

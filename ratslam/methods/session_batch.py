@@ -21,20 +21,9 @@ from ratslam.methods.recall import RecallBackend, RecallState
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
-
-class RecordedChunk(NamedTuple):
-    """What the kernel of a session was given at one chunk.
-
-    Attributes:
-        merged, feedback: of the map before it. sides: cells of the network along x and y. records: the packed
-            observations. steps: their number.
-    """
-
-    merged: MergedRows | None
-    feedback: MapFeedback
-    sides: tuple[int, ...]
-    records: PackedRecords
-    steps: int
+RecordedChunk = tuple[MergedRows | None, MapFeedback, tuple[int, ...], PackedRecords, int]
+"""What the kernel of a session was given at one chunk: rows merged and feedback of the map before it, cells
+of the network along x and y, the packed observations, and the number of steps."""
 
 
 class Recording(NamedTuple):
@@ -59,7 +48,7 @@ class RecordingSession(Session):
                 rows.write(k, observation)
             list(self.replay(part))
         chunks = [
-            RecordedChunk(*followed, rows, len(part))
+            (*followed, rows, len(part))
             for followed, rows, part in zip(self._followed, records, parts, strict=True)
         ]
         return Recording(chunks, self._capacity, jax.tree.map(np.asarray, self.state))
@@ -98,21 +87,22 @@ class SessionBatch:
         empty = backend.init(None, max(each.capacity for each in recordings))
         states, sides = _stack([empty] * len(recordings)), ()
         for chunks in zip(*(each.chunks for each in recordings), strict=True):
-            if len({(each.steps, each.sides, len(each.feedback.poses) > 0) for each in chunks}) > 1:
+            merged, feedback, network_sides, records, steps = zip(*chunks, strict=True)
+            with_map = [len(each.poses) > 0 for each in feedback]
+            if len(set(zip(steps, network_sides, with_map, strict=True))) > 1:
                 raise ValueError("sessions of a batch need the same numbers of steps and of cells")
-            if chunks[0].sides != sides:
-                sides = chunks[0].sides
+            if network_sides[0] != sides:
+                sides = network_sides[0]
                 states = jax.vmap(partial(backend.cover, sides=sides))(states)
-            states = self._merge(states, [each.merged for each in chunks])
-            if len(chunks[0].feedback.poses):
-                packed = _stack([empty.memory.pack_feedback(each.feedback) for each in chunks])
+            states = self._merge(states, merged)
+            if with_map[0]:
+                packed = _stack([empty.memory.pack_feedback(each) for each in feedback])
                 memory, belief = self._follow(states.memory, states.belief, packed)
                 states = states._replace(memory=memory, belief=belief)
-            records = _stack([each.records for each in chunks])
-            states, _ = self._run(states, records, np.int32(chunks[0].steps))
+            states, _ = self._run(states, _stack(records), np.int32(steps[0]))
         return cast(RecallState, jax.block_until_ready(states))
 
-    def _merge(self, states: RecallState, merged: list[MergedRows | None]) -> RecallState:
+    def _merge(self, states: RecallState, merged: Sequence[MergedRows | None]) -> RecallState:
         """The states after rows of some memories were merged, on the host."""
         if all(each is None for each in merged):
             return states

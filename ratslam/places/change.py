@@ -133,21 +133,15 @@ def _peaks(signs: Signs, radius: float) -> list[tuple[int, float, np.ndarray]]:
     return peaks
 
 
-class Touch(NamedTuple):
-    """How whisker images become points: the head, and the height (m) of pixel value 1 and of walls."""
-
-    head: Head
-    tallest: float
-
-
-def session_changes(place: Place, visits: Visits, touch: Touch) -> list[Change]:
+def session_changes(place: Place, visits: Visits, head: Head, tallest: float) -> list[Change]:
     """The places at which a session does not agree with the map, the surest first; none for maps of other
     images than those of the head's whiskers.
 
     Args:
-        visits: of the session; `Change.keyframes` number them.
+        visits: of the session; `Change.keyframes` number them. head, tallest: how whisker images become
+            points: the head, and the height (m) of pixel value 1 and of walls.
     """
-    made = _contacts_of(place, place.frames, touch)
+    made = _contacts_of(place, place.frames, head, tallest)
     if made is None or not len(visits.step):
         return []
     radius = RADIUS * place.ground.reach
@@ -156,23 +150,23 @@ def session_changes(place: Place, visits: Visits, touch: Touch) -> list[Change]:
     # Signs in the map itself: its later two thirds, each keyframe compared with those long before it.
     graph = place.map.keyframes()
     every, late = np.arange(graph.count), np.arange(graph.count // 3, graph.count)
-    own = _contacts_of(place, every, touch)
+    own = _contacts_of(place, every, head, tallest)
     assert own is not None
     revisits = contact_signs(own, own.ground.poses[late], own.levels[late], late - graph.guard)
     return find_changes(signs, learn_chance(revisits, radius), radius)
 
 
-def _contacts_of(place: Place, frames: np.ndarray, touch: Touch) -> ContactMap | None:
+def _contacts_of(place: Place, frames: np.ndarray, head: Head, tallest: float) -> ContactMap | None:
     """The contacts of keyframes [n] of a map; None where its views are not images of the head's whiskers, or
     recall has not learned to compare them."""
     appearance = place.map.appearance
     if not isinstance(appearance, WhiskerAppearance) or not appearance.metric().likeness.size:
         return None
     levels = appearance.stored(frames)[0].astype(int)
-    if levels.shape[1] != len(touch.head.length):
+    if levels.shape[1] != len(head.length):
         return None
     ground = place.ground._replace(poses=place.map.solution().fit.poses[frames])
-    return contact_map(ground, levels, appearance.layout, appearance.metric().likeness, *touch)
+    return contact_map(ground, levels, appearance.layout, appearance.metric().likeness, head, tallest)
 
 
 class ContactMap(NamedTuple):

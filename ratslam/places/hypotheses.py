@@ -125,11 +125,8 @@ SAME_HEADING = 0.5
 reach."""
 
 
-class Recalled(NamedTuple):
-    """The pose [3] at which recall places the newest keyframe, m, m, rad, and its gain there, nat."""
-
-    pose: np.ndarray
-    gain: float
+Recalled = tuple[np.ndarray, float]
+"""The pose [3] at which recall places the newest keyframe, m, m, rad, and its gain there, nat."""
 
 
 class SessionViews(Checkpointed):
@@ -224,8 +221,9 @@ class Hypotheses(Checkpointed):
         self.log_odds.rows[:] += log_odds
         elsewhere = np.zeros(self.count)
         if recalled is not None:
-            another = ~same_pose(ground, self.pose.rows, recalled.pose)
-            elsewhere = np.where(another, max(odds.of(recalled.gain), 0.0), 0.0)
+            pose, recalled_gain = recalled
+            another = ~same_pose(ground, self.pose.rows, pose)
+            elsewhere = np.where(another, max(odds.of(recalled_gain), 0.0), 0.0)
         self.states.rows[:] = continue_states(self.states.rows, log_odds, elsewhere)
         self.best.rows[:] = np.maximum(self.best.rows, summed(self.states.rows))
         kept: list[int] = []
@@ -250,14 +248,15 @@ class Hypotheses(Checkpointed):
         uncertain = [k for k in range(self.count) if not self.at(k).is_comparable(ground)]
         if not uncertain:
             return
-        here = [self.log_odds.rows[k] + self.at(k).log_share(ground, recalled.pose) for k in uncertain]
-        log_odds = float(max(here)) + odds.of(recalled.gain)
-        same = np.flatnonzero(same_pose(ground, self.pose.rows, recalled.pose))
+        pose, gain = recalled
+        here = [self.log_odds.rows[k] + self.at(k).log_share(ground, pose) for k in uncertain]
+        log_odds = float(max(here)) + odds.of(gain)
+        same = np.flatnonzero(same_pose(ground, self.pose.rows, pose))
         same = np.setdiff1d(same, uncertain)
         if len(same):
             self.log_odds.rows[same] = np.maximum(self.log_odds.rows[same], log_odds)
         else:
-            self._add_likely(PoseHypothesis(recalled.pose, np.diag(ground.variance)), log_odds)
+            self._add_likely(PoseHypothesis(pose, np.diag(ground.variance)), log_odds)
 
     def _add_likely(self, at: PoseHypothesis, log_odds: float) -> None:
         if log_odds >= MIN_LOG_ODDS:

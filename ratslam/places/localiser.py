@@ -31,7 +31,7 @@ from ratslam.mapping.ground import (
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.step_record import NO_TRAVEL
-from ratslam.places.hypotheses import LONGEST, Hypotheses, Recalled, SessionViews
+from ratslam.places.hypotheses import LONGEST, Hypotheses, SessionViews
 from ratslam.places.placement import NOTHING_RECALLED
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Observation
@@ -221,13 +221,13 @@ class Localiser(Checkpointed, Map):
         self._recalled = self._recalled.onwards(ground, moved, shift, match, float(evidence.posterior))
         recalled = None
         if gain is not None and self._recalled.now:
-            recalled = Recalled(self._recalled.pose, float(gain[shift, match]))
+            recalled = self._recalled.pose, float(gain[shift, match])
         confirmed = recalled if self._recalled.is_confirmed else None
         self._hypotheses.advance(ground, odds, moved, gain, confirmed)
         if recalled is not None:
             self._hypotheses.continue_uncertain(ground, odds, recalled)
         if confirmed is not None:
-            self._hypotheses.propose(ground, odds, self._views, confirmed.pose)
+            self._hypotheses.propose(ground, odds, self._views, confirmed[0])
         self._travel = NO_TRAVEL
         self._update_state(moved)
         known = self._state == Localisation.FOUND and gain is not None

@@ -254,10 +254,9 @@ class PieceTies:
                 found += _place_on(self._views, archive, odds, own, frames)
         if not found:
             return None
-        best, *others = sorted(found, key=lambda tie: -tie.log_odds)
-        rival = others[0].log_odds if others else -np.inf
-        margin = graph.config.tie_log_odds / 2
-        return best if best.log_odds - rival >= margin else best._replace(log_odds=best.log_odds - rival)
+        (log_odds, closures), *others = sorted(found, key=lambda tie: -tie[0])
+        ahead = log_odds - (others[0][0] if others else -np.inf)
+        return (log_odds if ahead >= graph.config.tie_log_odds / 2 else ahead), closures
 
 
 def _place_on(
@@ -285,7 +284,7 @@ def _place_on(
     places = float(np.log(max(ground.places(), 1.0)))
     session = Traverse(compared._replace(gain=PIECE_WEIGHTING.weigh(compared.gain)), motions)
     return [
-        Tie(
+        (
             float(path.independent_odds(ground).sum()) - places,
             [
                 Candidate(int(own[k]), int(frames[at.frame]), int(views.shifts[at.shift]), 1.0, at.gain)

@@ -41,7 +41,7 @@ CONFIRMING = 3
 """Keyframes after which a recalled pose has to agree with odometry before it is proposed."""
 
 
-class RecalledPose(NamedTuple):
+class _RecalledPose(NamedTuple):
     """Attributes:
     pose: [3] the newest recalled pose, moved on by odometry; NaN before any. agreeing: number of recalled
         poses in a row that agree with odometry. now: whether the newest keyframe was recalled.
@@ -58,19 +58,19 @@ class RecalledPose(NamedTuple):
 
     def onwards(
         self, ground: Ground, moved: Motion, shift: int, match: int, posterior: float
-    ) -> RecalledPose:
+    ) -> _RecalledPose:
         """After the next keyframe, reached by `moved`, which recall places at keyframe `match` of the ground
         (-1: nowhere), turned by the sector shift of row `shift`, with this posterior."""
         expected = compose(self.pose, moved.motion)
         if match < 0 or posterior <= 0.5:
-            return RecalledPose(expected, self.agreeing, False)
+            return _RecalledPose(expected, self.agreeing, False)
         pose = ground.claims(np.array([shift]), np.array([match]))[0]
         error = between(expected, pose)
         agrees = np.hypot(*error[:2]) < 2 * ground.reach and abs(error[2]) < ground.reach_heading
-        return RecalledPose(pose, self.agreeing + 1 if agrees else 1, True)
+        return _RecalledPose(pose, self.agreeing + 1 if agrees else 1, True)
 
 
-NOTHING_RECALLED = RecalledPose(np.full(3, np.nan), 0, False)
+NOTHING_RECALLED = _RecalledPose(np.full(3, np.nan), 0, False)
 """Before the first keyframe."""
 
 

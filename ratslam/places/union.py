@@ -196,16 +196,9 @@ LEAST = 8
 rows of coarse odometry and of views without contact may be equal by chance, but not in one order."""
 
 
-class Remembered(NamedTuple):
-    """The keyframes of a map, to be found again in other maps.
-
-    Attributes:
-        first: number of the first keyframe of each name; equal names are equal keyframes. steps: [N] at which
-            the keyframes were taken.
-    """
-
-    first: dict[bytes, int]
-    steps: np.ndarray
+Remembered = tuple[dict[bytes, int], np.ndarray]
+"""The keyframes of a map, to be found again in other maps: the number of the first keyframe of each name,
+where equal names are equal keyframes; and the steps [N] at which the keyframes were taken."""
 
 
 class Overlap(NamedTuple):
@@ -230,19 +223,20 @@ def remembered(map: KeyframeMap) -> Remembered:
     for number, (motion, view, label) in enumerate(zip(odometry, np.asarray(views), labels, strict=True)):
         content = motion.tobytes() + view.tobytes() + label.tobytes()
         first.setdefault(blake2b(content, digest_size=16).digest(), number)
-    return Remembered(first, map.keyframe_steps())
+    return first, map.keyframe_steps()
 
 
 def overlap(one: Remembered, other: Remembered) -> Overlap | None:
     """What two maps have of one session; None if nothing."""
-    pairs = [(number, other.first[name]) for name, number in one.first.items() if name in other.first]
+    (known, steps), (again, other_steps) = one, other
+    pairs = [(number, again[name]) for name, number in known.items() if name in again]
     apart = Counter(second - first for first, second in pairs)
-    needed = min(LEAST, max(min(len(one.first), len(other.first)) - 1, 2))
+    needed = min(LEAST, max(min(len(known), len(again)) - 1, 2))
     shifts = {shift for shift, count in apart.items() if count >= needed}
     common = np.array([pair for pair in pairs if pair[1] - pair[0] in shifts], int).reshape(-1, 2)
     if not len(common):
         return None
-    return Overlap(len(common), _ends(one.steps[common[:, 0]]), _ends(other.steps[common[:, 1]]))
+    return Overlap(len(common), _ends(steps[common[:, 0]]), _ends(other_steps[common[:, 1]]))
 
 
 def _ends(steps: Sequence[int] | np.ndarray) -> tuple[int, int]:

@@ -25,29 +25,24 @@ LARGEST_SUMS = 2**31
 """Most memory for sums, bytes."""
 
 
-class SumsPlan(NamedTuple):
-    """Sums of all cells: edges of the place bins [W + 1] and [H + 1], m, number of heading bins, and steps
-    between two summed ones."""
-
-    x_edges: np.ndarray
-    y_edges: np.ndarray
-    heading_bins: int
-    interval: int
+Bins = tuple[np.ndarray, np.ndarray, int]
+"""Edges of the place bins, [W + 1] along x and [H + 1] along y, m, and number of heading bins."""
 
 
 class RecordingPlan(NamedTuple):
-    """cells: of the method. cell: [C] int32 chosen cells in the flattened network. sums: None without
-    sums."""
+    """cells: of the method. cell: [C] int32 chosen cells in the flattened network. bins: over which all cells
+    are summed, every `interval` steps; None without sums."""
 
     cells: PoseCellProbe
     cell: np.ndarray
-    sums: SumsPlan | None
+    bins: Bins | None = None
+    interval: int = 1
 
     def probe(self) -> Probe:
         """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
         cells are summed what was held of them."""
         each = lambda state: self.cells.each(state, self.cell)  # noqa: E731
-        return Probe(each) if self.sums is None else Probe(each, self.cells.hold, self.sums.interval)
+        return Probe(each) if self.bins is None else Probe(each, self.cells.hold, self.interval)
 
 
 def plan_recording(config: RunConfig, source: Source, backend: Backend) -> RecordingPlan | None:
@@ -64,7 +59,7 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
         found = f"`backend: {config.backend}`, a method without pose cells"
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")
     sums = config.cells.sums
-    plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed), None)
+    plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed))
     if sums is None:
         return plan
     size = 8 * int(np.prod(cells.shape)) * (sums.bins**2 + sums.heading_bins)
@@ -80,7 +75,7 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
     x0, y0, x1, y1 = extent
     x_edges, y_edges = np.linspace(x0, x1, sums.bins + 1), np.linspace(y0, y1, sums.bins + 1)
     interval = max(1, round(source.rate_hz / sums.rate))
-    return plan._replace(sums=SumsPlan(x_edges, y_edges, sums.heading_bins, interval))
+    return plan._replace(bins=(x_edges, y_edges, sums.heading_bins), interval=interval)
 
 
 def _true_extent(source: Source, least: float) -> tuple[float, float, float, float] | None:
@@ -140,10 +135,10 @@ class CellRecorder:
         rows["place"] = [step.estimate.place for step in steps]
         rows["activity"] = [step.probed for step in steps]
         self._filled += len(steps)
-        if self._plan.sums is None:
+        if self._plan.bins is None:
             return
         if self._sums is None:
-            self._sums = CellSums(self._plan.sums, int(np.prod(self._plan.cells.shape)), samples[0].time)
+            self._sums = CellSums(self._plan.bins, int(np.prod(self._plan.cells.shape)), samples[0].time)
         for sample, step in zip(samples, steps, strict=True):
             if step.seldom is not None:
                 self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
@@ -179,13 +174,14 @@ class CellSums:
         began: time from which the first step counts, s.
     """
 
-    def __init__(self, plan: SumsPlan, cells: int, began: float) -> None:
-        self._plan, self._until = plan, began
-        self._width, self._height = len(plan.x_edges) - 1, len(plan.y_edges) - 1
+    def __init__(self, bins: Bins, cells: int, began: float) -> None:
+        self._x_edges, self._y_edges, self._turns = bins
+        self._until = began
+        self._width, self._height = len(self._x_edges) - 1, len(self._y_edges) - 1
         self._place = np.zeros((self._height * self._width, cells))
-        self._heading = np.zeros((plan.heading_bins, cells))
+        self._heading = np.zeros((self._turns, cells))
         self._place_seconds = np.zeros(self._height * self._width)
-        self._heading_seconds = np.zeros(plan.heading_bins)
+        self._heading_seconds = np.zeros(self._turns)
 
     def add(self, time: float, truth: np.ndarray | None, cell: np.ndarray, activity: np.ndarray) -> None:
         """Adds a step, for the time since the one before.
@@ -207,10 +203,10 @@ class CellSums:
 
     def result(self) -> BinnedSums:
         """The sums so far, float32."""
-        plan, grid = self._plan, (self._height, self._width)
+        grid = (self._height, self._width)
         return BinnedSums(
-            x_edges=plan.x_edges,
-            y_edges=plan.y_edges,
+            x_edges=self._x_edges,
+            y_edges=self._y_edges,
             seconds=self._place_seconds.reshape(grid),
             place=np.ascontiguousarray(self._place.T, np.float32).reshape(-1, *grid),
             heading_seconds=self._heading_seconds,
@@ -221,11 +217,10 @@ class CellSums:
         """The place bin (row by row) and the heading bin of a true pose, None outside."""
         if not np.isfinite(truth).all():
             return None
-        column, row = _bin(self._plan.x_edges, truth[0]), _bin(self._plan.y_edges, truth[1])
+        column, row = _bin(self._x_edges, truth[0]), _bin(self._y_edges, truth[1])
         if column is None or row is None:
             return None
-        count = self._plan.heading_bins
-        return row * self._width + column, round(float(truth[2]) / (2 * np.pi) * count) % count
+        return row * self._width + column, round(float(truth[2]) / (2 * np.pi) * self._turns) % self._turns
 
 
 def _bin(edges: np.ndarray, value: float) -> int | None:

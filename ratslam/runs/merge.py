@@ -238,7 +238,7 @@ def _check_sessions(maps: Sequence[SavedMap]) -> None:
                 f"its steps {_span(common.other)} are the session that {first.path} holds in its steps "
                 f"{_span(common.one)}: {common.keyframes} keyframes are equal to the bit"
             )
-            whole = [len(known.first) == common.keyframes for known in (seen, again)]
+            whole = [len(first) == common.keyframes for first, _ in (seen, again)]
             raise InputError(str(second.path), found, OTHERS, _cure(first.path, second, common, whole))
         if first.recording and first.recording == second.recording:
             found = f"its last session is of the same recording ({first.source.name}) as that of {first.path}"

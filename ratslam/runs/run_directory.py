@@ -30,7 +30,7 @@ from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.trajectory import current_error
 from ratslam.core.backend import Map
 from ratslam.core.session import CHUNK, Session
-from ratslam.places.change import Change, Touch, session_changes
+from ratslam.places.change import Change, session_changes
 from ratslam.places.localiser import Localiser
 from robot.sources.source import SourceInfo
 from robot.world.arena import Arena, read_arena, wall_segments
@@ -190,8 +190,8 @@ def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
     """The places at which a localised session does not agree with its map, the surest first."""
-    touch = Touch(ur10_head(config.head), config.image.tallest)
-    return session_changes(localiser.place, localiser.visits(), touch)
+    head, tallest = ur10_head(config.head), config.image.tallest
+    return session_changes(localiser.place, localiser.visits(), head, tallest)
 
 
 def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:

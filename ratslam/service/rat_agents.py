@@ -184,8 +184,8 @@ def _compiled(config: NetworkConfig, dtype: np.dtype) -> tuple[Callable[..., Any
 
     def step(cells: PoseCells, given: Any) -> tuple[PoseCells, Any, Any]:
         odometry, recall, energy = Odometry(*given[:4]), given[4:7], given[7]
-        cells, info = pose_cells.step(config, levels, cells, odometry, recall, energy)
-        return cells, info.outcome, to_full_torus(levels, cells.activity).ravel()
+        cells, (_, outcome, _) = pose_cells.step(config, levels, cells, odometry, recall, energy)
+        return cells, outcome, to_full_torus(levels, cells.activity).ravel()
 
     return jax.jit(start), jax.jit(step)
 

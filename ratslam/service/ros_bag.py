@@ -213,7 +213,7 @@ LAST_SECOND = 2**31 - 1
 """Largest number of seconds in a ROS 2 stamp."""
 
 
-class ExportedRun(NamedTuple):
+class _ExportedRun(NamedTuple):
     """A run of N steps; poses are in the frame of the map unless stated otherwise.
 
     Attributes:
@@ -236,7 +236,7 @@ class ExportedRun(NamedTuple):
     images: Callable[[], Iterator[tuple[int, np.ndarray]]]
 
 
-def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedRun:
+def read_exported_run(directory: Path, warn: Callable[[str], None]) -> _ExportedRun:
     """Reads a run directory, also the incomplete one of an interrupted run.
 
     Args:
@@ -258,7 +258,7 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> ExportedR
         there = np.isfinite(run.truth).all(axis=1)
         truth = np.full_like(run.truth, np.nan)
         truth[there] = compose(inverse(align(run.final[there], run.truth[there])), run.truth[there])
-    return ExportedRun(
+    return _ExportedRun(
         stamps=np.rint(run.time * 1e9).astype(np.int64),
         run=run,
         spread=np.stack(columns, axis=1),
@@ -320,7 +320,7 @@ LATCHED = ("/path/map", "/path/odometry", "/path/truth", "/map", "/markers")
 """Topics with one message, at the first stamp: late subscribers get it too."""
 
 
-def _messages(exported: ExportedRun, ros: RosMessages) -> Iterator[tuple[str, int, Any]]:
+def _messages(exported: _ExportedRun, ros: RosMessages) -> Iterator[tuple[str, int, Any]]:
     """All messages of a run in order of time, each with its topic and its stamp in ns."""
     first = int(exported.stamps[0])
     for topic, message in _latched_messages(exported, ros, first):
@@ -343,7 +343,7 @@ def _messages(exported: ExportedRun, ros: RosMessages) -> Iterator[tuple[str, in
             image = next(images, None)
 
 
-def _latched_messages(exported: ExportedRun, ros: RosMessages, first: int) -> Iterator[tuple[str, Any]]:
+def _latched_messages(exported: _ExportedRun, ros: RosMessages, first: int) -> Iterator[tuple[str, Any]]:
     run, stamps = exported.run, exported.stamps
     yield "/path/map", ros.path(stamps, run.final)
     own = compose(inverse(run.odometry[0]), run.odometry)
@@ -357,7 +357,7 @@ def _latched_messages(exported: ExportedRun, ros: RosMessages, first: int) -> It
         yield "/markers", ros.markers(markers)
 
 
-def _markers(exported: ExportedRun, ros: RosMessages, stamp: int) -> list[Any]:
+def _markers(exported: _ExportedRun, ros: RosMessages, stamp: int) -> list[Any]:
     """Experiences and their links, and the candidates for loop closures by verdict."""
     run, parts = exported.run, []
     nodes, links = run.nodes[:, :2], run.links
@@ -375,7 +375,7 @@ def _markers(exported: ExportedRun, ros: RosMessages, stamp: int) -> list[Any]:
     return parts
 
 
-def write_mcap(path: Path, exported: ExportedRun, ros: RosMessages) -> dict[str, tuple[str, int]]:
+def write_mcap(path: Path, exported: _ExportedRun, ros: RosMessages) -> dict[str, tuple[str, int]]:
     """Writes an MCAP file with the ROS 2 profile; equal runs give equal bytes.
 
     Returns:
@@ -402,7 +402,7 @@ def write_mcap(path: Path, exported: ExportedRun, ros: RosMessages) -> dict[str,
     return {topic: (kind, counts[topic]) for topic, kind in kinds.items()}
 
 
-def write_bag(folder: Path, name: str, exported: ExportedRun, ros: RosMessages) -> None:
+def write_bag(folder: Path, name: str, exported: _ExportedRun, ros: RosMessages) -> None:
     """Writes a ROS 2 bag into an existing folder: NAME_0.mcap and metadata.yaml."""
     file = f"{name}_0.mcap"
     topics = write_mcap(folder / file, exported, ros)

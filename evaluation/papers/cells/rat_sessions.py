@@ -46,8 +46,8 @@ class RatSessions:
         samples = [sample for sample, _ in rows]
         steps = list(self._session.replay([observation for _, observation in rows]))
         cells, summed = plan.cells, None
-        if plan.sums is not None:
-            summed = CellSums(plan.sums, int(np.prod(cells.shape)), samples[0].time)
+        if plan.bins is not None:
+            summed = CellSums(plan.bins, int(np.prod(cells.shape)), samples[0].time)
             for sample, step in zip(samples, steps, strict=True):
                 if step.seldom is not None:
                     summed.add(sample.time, sample.truth, *cells.active(step.seldom))

@@ -265,8 +265,8 @@ def _record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Reco
             assert isinstance(made.backend, RecallBackend)
             backend, session = made.backend, RecordingSession(made.backend, reserve=made.reserve)
         found = session.record(observations)
-        sides = [chunk.sides for chunk in found.chunks]  # numbers of cells along x and y
-        if not recordings or sides == [chunk.sides for chunk in recordings[0].chunks]:
+        sides = [chunk[2] for chunk in found.chunks]  # numbers of cells along x and y
+        if not recordings or sides == [chunk[2] for chunk in recordings[0].chunks]:
             recordings.append(found)
         if len(recordings) == RECORDED:
             break

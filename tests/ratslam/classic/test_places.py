@@ -28,11 +28,11 @@ def walk(visits, capacity=8):
 
 
 def actions(decisions):
-    return [Action(int(decision.action)) for decision in decisions]
+    return [Action(int(action)) for _, _, action, _ in decisions]
 
 
 def places(decisions):
-    return [int(decision.place) for decision in decisions]
+    return [int(place) for place, *_ in decisions]
 
 
 A, B, C = (1.0, 1, 1), (5.0, 5, 1), (8.0, 1, 20)
@@ -43,11 +43,11 @@ def test_new_views_create_places_and_equal_ones_keep_them():
     store, decisions = walk([(A, 0), (A, 0), ((1.5, 1, 1), 0), (B, 1), (B, 1)])
     assert actions(decisions) == [Action.CREATE, Action.NONE, Action.NONE, Action.CREATE, Action.NONE]
     assert places(decisions) == [0, 0, 0, 1, 1]
-    assert [int(decision.previous) for decision in decisions] == [-1, 0, 0, 0, 1]
+    assert [int(previous) for _, previous, _, _ in decisions] == [-1, 0, 0, 0, 1]
     assert np.asarray(store.packet[:2]).tolist() == [list(A), list(B)]
     assert np.asarray(store.template[:3]).tolist() == [0, 1, -1]
     assert np.asarray(store.link[0]).tolist() == [0, 1]
-    assert all(bool(decision.room) for decision in decisions)
+    assert all(bool(room) for *_, room in decisions)
 
 
 def test_a_connection_is_linked_once_then_set_in_either_direction():
@@ -131,7 +131,7 @@ def test_a_full_store_is_reported_and_overwrites_nothing():
     full = [(A, 0), (B, 1)]
     store, _ = walk(full, capacity=2)
     after, decisions = walk([*full, (C, 2), (A, 0)], capacity=2)
-    assert [bool(decision.room) for decision in decisions] == [True, True, False, True]
+    assert [bool(room) for *_, room in decisions] == [True, True, False, True]
     assert actions(decisions)[2:] == [Action.NONE, Action.SET]
     assert places(decisions)[2:] == [1, 0]
     for name in ("packet", "template", "count", "link", "links"):

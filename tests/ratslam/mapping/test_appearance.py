@@ -15,7 +15,7 @@ from ratslam.mapping.appearance import (
     ViewAppearance,
     WhiskerAppearance,
 )
-from ratslam.mapping.ground import GainPrior, learn_gain_odds
+from ratslam.mapping.ground import learn_gain_odds
 from ratslam.recall.observation_model import label_gains
 from tests.ratslam.mapping.appearance_cases import (
     PIXELS,
@@ -49,13 +49,14 @@ def test_equal_views_are_likelier_of_one_place(kind):
 
 
 def test_an_id_tells_a_true_pose_from_a_false_one_before_any_was_counted():
-    usual = GainPrior(true=(2.0, 1.0), false=(0.5, 1.0))
+    usual = ((2.0, 1.0), (0.5, 1.0))
     assert viewed(images(np.random.default_rng(0), 50)).gain_prior(usual) == usual
     for count in (3, 30, 300):
         prior = labelled(range(count)).gain_prior(usual)
-        assert (prior.true[0], prior.false[0]) == label_gains(count)
+        (true, _), (false, _) = prior
+        assert (true, false) == label_gains(count)
         odds, none = learn_gain_odds(np.zeros(0), np.zeros(0), prior), np.zeros(0)
-        assert odds.of(prior.true[0]) > 2 > -2 > odds.of(prior.false[0])
+        assert odds.of(true) > 2 > -2 > odds.of(false)
         assert odds.expected > 2 > learn_gain_odds(none, none, usual).expected
 
 

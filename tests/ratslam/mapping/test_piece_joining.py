@@ -12,7 +12,6 @@ from ratslam.mapping.keyframe_graph import APART
 from ratslam.mapping.loop_closures import Candidate
 from ratslam.mapping.map_solution import DOUBTED
 from ratslam.mapping.optimizer import CalibrationPrior
-from ratslam.mapping.piece_ties import Tie
 from tactile.base.se2 import between, compose
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, STEP, drive, new_map, sequence
 
@@ -27,7 +26,7 @@ TIE = [Candidate(LAP + k, k, 0, 1.0, 4.0) for k in range(2, 14)]
 
 def tie_late(graph, log, archive, odds):
     """The tie of the second lap to the first, once the views that show it are there."""
-    return Tie(20.0, TIE) if graph.total > LAP + 14 else None
+    return (20.0, TIE) if graph.total > LAP + 14 else None
 
 
 def driven(rule, *sequences, find_tie=None, last=LAP + 60):
@@ -54,7 +53,7 @@ def test_a_tie_is_undone_below_half_the_log_odds_that_it_needs(rule, stands):
     later = 0.5 * KeyframeMapConfig().tie_log_odds + (0.1 if stands else -0.1)
 
     def tie_once(graph, log, archive, odds):
-        return Tie(20.0 if graph.total < LAP + 40 else later, TIE) if graph.total > LAP + 14 else None
+        return (20.0 if graph.total < LAP + 40 else later, TIE) if graph.total > LAP + 14 else None
 
     assert not driven(rule, find_tie=tie_once, last=LAP + 38).pieces().any()
     map = driven(rule, find_tie=tie_once)

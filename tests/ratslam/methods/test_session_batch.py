@@ -34,8 +34,8 @@ def test_recording_does_not_change_a_session() -> None:
     other = empty_merging_session(1)
     list(other.replay(simulate_walk(0, path={"circuits": "CCCCCC"}).readings[:STEPS]))
     assert gap(session.state, other.state) == 0
-    assert sum(chunk.steps for chunk in recording.chunks) == STEPS
-    assert sum(chunk.merged is not None for chunk in recording.chunks) > 1
+    assert sum(chunk[-1] for chunk in recording.chunks) == STEPS
+    assert sum(chunk[0] is not None for chunk in recording.chunks) > 1
 
 
 @pytest.mark.parametrize("at_once", [False, True])

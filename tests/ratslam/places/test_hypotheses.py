@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.mapping.ground import Ground, Motion, PoseHypothesis
-from ratslam.places.hypotheses import SPAN, Hypotheses, Recalled, SessionViews
+from ratslam.places.hypotheses import SPAN, Hypotheses, SessionViews
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (
     POSES,
@@ -200,7 +200,7 @@ def test_a_recalled_pose_continues_one_that_odometry_has_made_uncertain() -> Non
     known, here = Hypotheses(), compose(LOOP.poses[5], np.array([0.1, 0.0, 0.0]))
     at = uncertain(LOOP.poses[5], 0.2)
     known.add(at, 20.0)
-    known.continue_uncertain(LOOP.ground, ODDS, Recalled(here, 3.0))
+    known.continue_uncertain(LOOP.ground, ODDS, (here, 3.0))
     assert known.count == 2
     assert_same_pose(known.pose.rows[1], here)
     expected = 20.0 + at.log_share(LOOP.ground, here) + ODDS.of(3.0)
@@ -210,7 +210,7 @@ def test_a_recalled_pose_continues_one_that_odometry_has_made_uncertain() -> Non
 def test_nothing_continues_where_no_pose_is_uncertain() -> None:
     known = Hypotheses()
     for _ in range(2):
-        known.continue_uncertain(LOOP.ground, ODDS, Recalled(LOOP.poses[30], 3.0))
+        known.continue_uncertain(LOOP.ground, ODDS, (LOOP.poses[30], 3.0))
         known.clear()
         known.add(uncertain(LOOP.poses[5], 0.01), 20.0)
     assert known.count == 1
@@ -221,7 +221,7 @@ def test_a_pose_that_is_known_already_takes_the_log_odds_of_the_likelier_way_the
         known, here = Hypotheses(), LOOP.poses[8]
         known.add(uncertain(LOOP.poses[5], 0.2), 20.0)
         known.add(uncertain(here, 0.01), log_odds)
-        known.continue_uncertain(LOOP.ground, ODDS, Recalled(here, 3.0))
+        known.continue_uncertain(LOOP.ground, ODDS, (here, 3.0))
         assert known.count == 2
         assert (known.log_odds.rows[1] > log_odds) == likelier
         assert known.log_odds.rows[1] >= log_odds

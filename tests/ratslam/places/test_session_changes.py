@@ -10,12 +10,12 @@ import pytest
 
 from ratslam.mapping.appearance import LabelAppearance, WhiskerAppearance
 from ratslam.mapping.ground import Ground, learn_gain_odds
-from ratslam.places.change import Touch, session_changes
+from ratslam.places.change import session_changes
 from ratslam.places.localiser import Place, Visits
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
-TOUCH = Touch(ur10_head(HeadConfig()), 0.05)
+TOUCH = (ur10_head(HeadConfig()), 0.05)
 LAYOUT = pixel_layout((3, 6, 1))
 LONG = 100
 """Keyframes of one way along the corridor."""
@@ -65,7 +65,7 @@ def visits(ways: int, changed: int) -> Visits:
 
 def test_the_missing_wall_is_named_where_it_was() -> None:
     place = corridor()
-    (change,) = session_changes(place, visits(3, 3), TOUCH)
+    (change,) = session_changes(place, visits(3, 3), *TOUCH)
     assert change.kind == "gone"
     assert change.position[0] == pytest.approx(1.0, abs=0.05)
     assert change.position[1] > 0.03
@@ -73,17 +73,17 @@ def test_the_missing_wall_is_named_where_it_was() -> None:
 
 
 def test_an_unchanged_session_names_nothing() -> None:
-    assert session_changes(corridor(), visits(3, 0), TOUCH) == []
+    assert session_changes(corridor(), visits(3, 0), *TOUCH) == []
 
 
 def test_a_map_that_was_continued_after_the_change_knows_both_looks() -> None:
     """Nothing is named any more, whether the wall is gone or is back."""
     place = corridor(after=3)
-    assert session_changes(place, visits(3, 3), TOUCH) == []
-    assert session_changes(place, visits(3, 0), TOUCH) == []
+    assert session_changes(place, visits(3, 3), *TOUCH) == []
+    assert session_changes(place, visits(3, 0), *TOUCH) == []
 
 
 def test_maps_of_other_views_name_nothing() -> None:
     place = corridor()
     place.map.appearance = LabelAppearance()
-    assert session_changes(place, visits(1, 1), TOUCH) == []
+    assert session_changes(place, visits(1, 1), *TOUCH) == []
