@@ -211,14 +211,14 @@ def cells_of(poses: np.ndarray) -> list[Cell]:
     return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
 
 
-class World(NamedTuple):
+class _World(NamedTuple):
     """A maze and its loop in anticlockwise order."""
 
     maze: Maze
     loop: list[Cell]
 
 
-class Overlap(NamedTuple):
+class _Overlap(NamedTuple):
     """Two sessions in parts of a maze that share half their cells, and one session over both.
 
     Attributes:
@@ -231,7 +231,7 @@ class Overlap(NamedTuple):
     parts: _TwoParts
 
 
-class Carried(NamedTuple):
+class _Carried(NamedTuple):
     """A session in one part of a maze, and two sessions of a robot that was carried away after it.
 
     Attributes:
@@ -258,9 +258,9 @@ class Change(NamedTuple):
     places: np.ndarray
 
 
-def open_world(maze: int) -> World:
+def open_world(maze: int) -> _World:
     """The unchanged maze of a seed."""
-    return World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
+    return _World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
 
 
 def ten_circuits(maze: int) -> Recipe:
@@ -296,7 +296,7 @@ def same_maze(maze: int, number: int) -> Recipe:
     return Recipe(_later(maze, name, {"path": {"circuits": PAPER_CIRCUITS, "start": start}}))
 
 
-def overlapping_sessions(maze: int) -> Overlap:
+def overlapping_sessions(maze: int) -> _Overlap:
     """Explorations of two parts that share half their cells, and one as long as both together over both."""
     random = stream(maze, "atlas.overlap.parts")
     world = open_world(maze)
@@ -307,10 +307,10 @@ def overlapping_sessions(maze: int) -> Overlap:
         name: _explore_all(maze, world, f"overlap {name}", cells, steps)
         for name, (cells, steps) in lengths.items()
     }
-    return Overlap(**sessions, parts=parts)
+    return _Overlap(**sessions, parts=parts)
 
 
-def carried_sessions(maze: int) -> Carried:
+def carried_sessions(maze: int) -> _Carried:
     """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place."""
     random = stream(maze, "atlas.carried.parts")
     world = open_world(maze)
@@ -322,7 +322,7 @@ def carried_sessions(maze: int) -> Carried:
     truth = record(Recipe(config)).truth
     entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts.one), len(truth))
     path = {"explore": float(LOCALISED), "within": _turned(parts.other, random)}
-    return Carried(
+    return _Carried(
         first=_explore_all(maze, world, "carried first", parts.one, PART),
         known=Recipe(config, 0, entry + REENTERED),
         entry=entry,
@@ -379,7 +379,7 @@ def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
 
 
-def _explore_all(maze: int, world: World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
+def _explore_all(maze: int, world: _World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
     """A session that enters each of these cells and no other, from a random one on.
 
     Raises:

@@ -70,7 +70,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 """Settings of the rows."""
 
 
-class Recorded(NamedTuple):
+class _Recorded(NamedTuple):
     """The drive: observations, true poses [T, 3] (NaN where unknown), and walls [S, 4], m."""
 
     observations: list[Observation]
@@ -101,7 +101,7 @@ class BumpsResult(NamedTuple):
     walls: np.ndarray
 
 
-def measure(folder: Path) -> BumpsResult:
+def _measure(folder: Path) -> BumpsResult:
     """Maps the drive with every variant and seed.
 
     Raises:
@@ -113,7 +113,7 @@ def measure(folder: Path) -> BumpsResult:
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     segments = np.loadtxt(walls, delimiter=",", skiprows=1, ndmin=2)
-    drive = Recorded([observation_of(sample) for sample in samples], truth, segments)
+    drive = _Recorded([observation_of(sample) for sample in samples], truth, segments)
     final, online = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, settings in VARIANTS.items():
         with open_observations(load_config(CONFIG, settings)) as (config, source):
@@ -139,7 +139,7 @@ def measure(folder: Path) -> BumpsResult:
     )  # fmt: skip
 
 
-def table(result: BumpsResult) -> list[str]:
+def _table(result: BumpsResult) -> list[str]:
     """The lines of the table: odometry, then the variants of the filter."""
     lines = markdown_header(("real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"))
     rows = lines.split("\n")
@@ -163,7 +163,7 @@ def table(result: BumpsResult) -> list[str]:
     ]
 
 
-def draw(result: BumpsResult, file: Path) -> None:
+def _draw(result: BumpsResult, file: Path) -> None:
     """Draws paths and map over the true walls into a PNG file."""
     final, odometry = np.median(result.final["grid filter"]), result.odometry["odometry"]
     line = f"ATE {final:.2f} m, odometry {odometry:.2f} m; shades: map of the filter; black: true walls"
@@ -216,7 +216,7 @@ def _run(
     return _ate(path, truth), _ate(online, truth), path, grid
 
 
-def _odometry_errors(drive: Recorded) -> dict[str, float]:
+def _odometry_errors(drive: _Recorded) -> dict[str, float]:
     """ATE of dead reckoning: as it is, with one error fitted to the truth, with known errors taken out."""
     moves = np.array([each.odometry for each in drive.observations])
     pressed = _pressed_steps(drive)
@@ -238,7 +238,7 @@ def _odometry_errors(drive: Recorded) -> dict[str, float]:
     }
 
 
-def _pressed_steps(drive: Recorded) -> np.ndarray:
+def _pressed_steps(drive: _Recorded) -> np.ndarray:
     """[T] bool, steps that begin in contact and drive forward."""
     touching = [False, *(each.contact.any() for each in drive.observations[:-1])]
     return np.array(
@@ -262,4 +262,4 @@ def _aligned(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return compose(align(path[_known(truth)], truth[_known(truth)]), path)
 
 
-FIGURE = Figure("A real Create and its bumpers", measure, table, draw)
+FIGURE = Figure("A real Create and its bumpers", _measure, _table, _draw)

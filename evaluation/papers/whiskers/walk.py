@@ -137,13 +137,13 @@ def _continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> _Walk
     return _WalkEnd(last + 1, reckoned, drawn, heading)
 
 
-def energy(result: SessionResult, steps: int | None = None, *, odometry: bool = False) -> float:
+def _energy(result: SessionResult, steps: int | None = None, *, odometry: bool = False) -> float:
     """Energy Metric of the map or of odometry over the first steps."""
     path = result.odometry if odometry else result.trajectory
     return float(energy_all_pairs(path[:steps], result.truth[:steps]).total)
 
 
-def table(walks: list[_WalkResult]) -> list[str]:
+def _table(walks: list[_WalkResult]) -> list[str]:
     """The lines of the table."""
     lines = [
         "| maze | whisks | EM | odometry | simulated whiskers | one direction only | shuffled (closures) "
@@ -153,7 +153,7 @@ def table(walks: list[_WalkResult]) -> list[str]:
         *(_line(walk) for walk in walks),
     ]
     reached, three = (
-        sum(energy(walk.real, steps) <= GOAL for walk, steps in zip(walks, ends, strict=True))
+        sum(_energy(walk.real, steps) <= GOAL for walk, steps in zip(walks, ends, strict=True))
         for ends in ([None] * len(walks), [walk.end.turned for walk in walks])
     )
     heading = np.sqrt(np.mean([walk.end.heading**2 for walk in walks]))
@@ -174,11 +174,11 @@ def _line(walk: _WalkResult) -> str:
     false = closure_errors(real) > FALSE_CLOSURE_DISTANCE if len(real.closures) else np.zeros(0, bool)
     late = real.closures[:, 0] >= three if len(real.closures) else false
     cells = [str(walk.maze), str(len(real.truth))]
-    cells += [f"{energy(real):.3f}", f"{energy(real, odometry=True):.3f}"]
-    cells += [f"{energy(walk.simulated):.3f}", f"{energy(walk.one_way):.3f}"]
-    cells += [f"{energy(walk.shuffled):.3f} ({len(walk.shuffled.closures)})", f"{walk.end.reckoned:.3f}"]
+    cells += [f"{_energy(real):.3f}", f"{_energy(real, odometry=True):.3f}"]
+    cells += [f"{_energy(walk.simulated):.3f}", f"{_energy(walk.one_way):.3f}"]
+    cells += [f"{_energy(walk.shuffled):.3f} ({len(walk.shuffled.closures)})", f"{walk.end.reckoned:.3f}"]
     cells += [f"{np.median(drawn):.3f} ({(drawn <= GOAL).mean():.0%})" for drawn in walk.end.drawn]
-    cells += [f"{energy(real, three):.3f}", f"{energy(real, three, odometry=True):.3f}"]
+    cells += [f"{_energy(real, three):.3f}", f"{_energy(real, three, odometry=True):.3f}"]
     cells += [f"{false.sum()} / {len(false)} ({false[late].sum()} / {late.sum()})"]
     return f"| {' | '.join(cells)} |"
 
@@ -192,7 +192,7 @@ NOTE = (
 )
 
 
-def draw(walks: list[_WalkResult], png: Path) -> None:
+def _draw(walks: list[_WalkResult], png: Path) -> None:
     """Draws the maps of all walks above those of odometry, aligned with the true path by three circuits."""
     figure, axes = plt.subplots(2, len(walks), figsize=(3.1 * len(walks), 5.6), layout="constrained")
     for column, walk in zip(axes.T, walks, strict=True):
@@ -215,7 +215,7 @@ def draw(walks: list[_WalkResult], png: Path) -> None:
     plt.close(figure)
 
 
-FIGURE = Figure("A map from real whisker images on a simulated walk", _measure, table, draw)
+FIGURE = Figure("A map from real whisker images on a simulated walk", _measure, _table, _draw)
 
 
 TURNS = 0.05
