@@ -80,7 +80,7 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[_Agreement]:
         return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
 
 
-def agreement_table(result: list[_Agreement]) -> Iterator[str]:
+def _agreement_table(result: list[_Agreement]) -> Iterator[str]:
     """The lines of the table."""
     yield (
         "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
@@ -137,7 +137,7 @@ def _numbers(values: Iterator[Any]) -> np.ndarray:
     return np.array([float(value) for value in values])
 
 
-FIGURE = Figure("Agreement with other packages", compare_scores, agreement_table, None)
+FIGURE = Figure("Agreement with other packages", compare_scores, _agreement_table, None)
 
 HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
 """How each package is installed."""

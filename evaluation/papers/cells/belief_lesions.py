@@ -260,7 +260,7 @@ def same_closures(one: _LesionFigures, other: _LesionFigures) -> float:
     return len(pairs & others) / len(others) if others else np.nan
 
 
-def table_lesions(result: Mapping[_LesionTask, _LesionFigures]) -> list[str]:
+def _table_lesions(result: Mapping[_LesionTask, _LesionFigures]) -> list[str]:
     """The lines of the table, and what it does not show."""
     lesions = list(dict.fromkeys(task.lesion for task in result))
     rows = [row for row in dict.fromkeys(task.row for task in result) if row]
@@ -300,7 +300,7 @@ def _cells(result: Mapping[_LesionTask, _LesionFigures], lesion: str, row: str) 
     ]
 
 
-def draw_lesions(result: Mapping[_LesionTask, _LesionFigures], png: Path) -> None:
+def _draw_lesions(result: Mapping[_LesionTask, _LesionFigures], png: Path) -> None:
     """Share of revisits closed, and EM, of every lesion."""
     lesions = list(dict.fromkeys(task.lesion for task in result))
     rows = [row for row in dict.fromkeys(task.row for task in result) if row]
@@ -420,7 +420,7 @@ def _update_time(session: Session) -> float:
     return 1e6 * min(time_call(lambda: jax.block_until_ready(run())).processor for _ in range(CALLS))
 
 
-def table_sizes(result: Mapping[_SizeTask, _SizeFigures]) -> list[str]:
+def _table_sizes(result: Mapping[_SizeTask, _SizeFigures]) -> list[str]:
     """The lines of the table, and what it does not show."""
     columns = (
         "cells a side", "cell, m", "grows", "cells at the end", "revisits closed", "closures, false", "EM",
@@ -463,7 +463,7 @@ def _networks(result: Mapping[_SizeTask, _SizeFigures]) -> dict[tuple[int, float
     return found
 
 
-def draw_sizes(result: Mapping[_SizeTask, _SizeFigures], png: Path) -> None:
+def _draw_sizes(result: Mapping[_SizeTask, _SizeFigures], png: Path) -> None:
     """Share of revisits closed against the cells a side and against the time of an update."""
     networks = _networks(result)
     groups = {
@@ -486,5 +486,5 @@ def draw_sizes(result: Mapping[_SizeTask, _SizeFigures], png: Path) -> None:
     figure.savefig(png)
 
 
-LESIONS_FIGURE = Figure("Lesions of the belief network", measure_lesions, table_lesions, draw_lesions)
-SCALE_FIGURE = Figure("Numbers and sizes of cells", measure_sizes, table_sizes, draw_sizes)
+LESIONS_FIGURE = Figure("Lesions of the belief network", measure_lesions, _table_lesions, _draw_lesions)
+SCALE_FIGURE = Figure("Numbers and sizes of cells", measure_sizes, _table_sizes, _draw_sizes)

@@ -165,7 +165,7 @@ def _near(world: World, places: np.ndarray) -> np.ndarray:
     return apart < BASIN * CELLS.cell_size
 
 
-def table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
+def _table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
     """The lines of the table, and what it does not show."""
     found, note = result
     best = found[EXACT]
@@ -195,7 +195,7 @@ def table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
     ]
 
 
-def draw_posterior(result: tuple[Mapping[str, _Scores], str], png: Path) -> None:
+def _draw_posterior(result: tuple[Mapping[str, _Scores], str], png: Path) -> None:
     """Loss by session, and the regions."""
     found, _ = result
     best = found[EXACT].score
@@ -229,7 +229,7 @@ SIGN, DECIDED = 0.01, 0.95
 """Departure from 1/2 that shows evidence; share from which a belief has decided."""
 
 
-class RoomsResult(NamedTuple):
+class _RoomsResult(NamedTuple):
     """Beliefs in n pairs of rooms.
 
     Attributes:
@@ -266,7 +266,7 @@ def alike_rooms(seed: int) -> World:
     return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
 
 
-def measure_rooms(task: Task, sessions: int = 3) -> RoomsResult:
+def measure_rooms(task: Task, sessions: int = 3) -> _RoomsResult:
     """The probabilities of the two rooms, and closures of so many sessions of the whole product."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {}
     for seed in task.seeds(20):
@@ -285,7 +285,7 @@ def measure_rooms(task: Task, sessions: int = 3) -> RoomsResult:
         list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
         for alike in (True, False)
     )
-    return RoomsResult(share, packet, last, evident, closures, unlike)
+    return _RoomsResult(share, packet, last, evident, closures, unlike)
 
 
 def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
@@ -299,7 +299,7 @@ USUAL_CONTROL = (0.3, 0.5, 0.1, 0.1)
 """Of `additive`."""
 
 
-def table_rooms(result: RoomsResult) -> list[str]:
+def _table_rooms(result: _RoomsResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     columns = (
         "belief", "before: farthest from 1/2", "best packet, largest", "decided too early",
@@ -344,7 +344,7 @@ def table_rooms(result: RoomsResult) -> list[str]:
     ]
 
 
-def draw_rooms(result: RoomsResult, png: Path) -> None:
+def _draw_rooms(result: _RoomsResult, png: Path) -> None:
     """Share of the true room over time."""
     line = "Share of the true room in what the belief holds in both; dashed: the first difference."
     figure, axes = panel_grid("Two rooms that look alike", line, 1, len(result.share), height=2.4)
@@ -396,7 +396,7 @@ def measure_kidnaps(task: Task) -> _Kidnaps:
 NO_ENTRY = "network without re-entry (control)"
 
 
-def table_kidnaps(result: _Kidnaps) -> list[str]:
+def _table_kidnaps(result: _Kidnaps) -> list[str]:
     """The lines of the table, and what it does not show."""
     found_after, novelties = result
     columns = (
@@ -426,7 +426,7 @@ def table_kidnaps(result: _Kidnaps) -> list[str]:
     ]
 
 
-def draw_kidnaps(result: _Kidnaps, png: Path) -> None:
+def _draw_kidnaps(result: _Kidnaps, png: Path) -> None:
     """Novelty over time, and how many are found again."""
     found_after, novelties = result
     line = f"Found again by the network: {np.isfinite(found_after[NETWORK]).mean():.0%}. Dashed: the kidnap."
@@ -501,7 +501,7 @@ def measure_conflicts(task: Task) -> _Weights:
     return {key: np.array(weights) for key, weights in found.items()}
 
 
-def table_conflicts(result: _Weights) -> list[str]:
+def _table_conflicts(result: _Weights) -> list[str]:
     """The lines of the table, and what it does not show."""
     names = list(dict.fromkeys(name for *_, name in result))
     columns = (
@@ -526,7 +526,7 @@ def table_conflicts(result: _Weights) -> list[str]:
     ]
 
 
-def draw_conflicts(result: _Weights, png: Path) -> None:
+def _draw_conflicts(result: _Weights, png: Path) -> None:
     """Weight of the first cue against the angle, by case."""
     names = list(dict.fromkeys(name for *_, name in result))
     line = f"Weight of the first cue after {READ} views; exact inference and the network beside the control."
@@ -544,8 +544,8 @@ def draw_conflicts(result: _Weights, png: Path) -> None:
 
 
 POSTERIOR_FIGURE = Figure(
-    "Belief: score against exact inference", measure_posterior, table_posterior, draw_posterior
+    "Belief: score against exact inference", measure_posterior, _table_posterior, _draw_posterior
 )
-ROOMS_FIGURE = Figure("Belief: two rooms that look alike", measure_rooms, table_rooms, draw_rooms)
-KIDNAP_FIGURE = Figure("Belief: kidnap", measure_kidnaps, table_kidnaps, draw_kidnaps)
-CONFLICT_FIGURE = Figure("Belief: cues in conflict", measure_conflicts, table_conflicts, draw_conflicts)
+ROOMS_FIGURE = Figure("Belief: two rooms that look alike", measure_rooms, _table_rooms, _draw_rooms)
+KIDNAP_FIGURE = Figure("Belief: kidnap", measure_kidnaps, _table_kidnaps, _draw_kidnaps)
+CONFLICT_FIGURE = Figure("Belief: cues in conflict", measure_conflicts, _table_conflicts, _draw_conflicts)

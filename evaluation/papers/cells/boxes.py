@@ -233,7 +233,7 @@ def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _MapFit:
     return _MapFit(still[0], best[0], still[1], best[1])
 
 
-def table_boxes(result: _Boxes) -> list[str]:
+def _table_boxes(result: _Boxes) -> list[str]:
     """The lines of the table, and what it does not show."""
     sessions, side, torus = result
     lines = [
@@ -273,7 +273,7 @@ NOT_SHOWN = (
 )
 
 
-def draw_result(result: _Boxes, png: Path) -> None:
+def _draw_boxes(result: _Boxes, png: Path) -> None:
     """Maps of some columns in each box, and histograms of the correlations of all columns."""
     sessions, side, torus = result
     found = sessions[0].moved.best
@@ -344,7 +344,7 @@ def _range(fits: list[_MapFit], field: str) -> str:
     return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
 
-FIGURE = Figure("Rate maps in two boxes", measure_boxes, table_boxes, draw_result)
+FIGURE = Figure("Rate maps in two boxes", measure_boxes, _table_boxes, _draw_boxes)
 
 
 SHOWN = 7

@@ -74,7 +74,7 @@ LEVELS = (Noise(0.0, 0.0), *(Noise(each, 0.0) for each in SPEED), *(Noise(0.0, e
 """One block of networks."""
 
 
-class DriftResult(NamedTuple):
+class _DriftResult(NamedTuple):
     """Errors of n seeds at L levels of noise and at M times.
 
     Attributes:
@@ -88,11 +88,11 @@ class DriftResult(NamedTuple):
     added: np.ndarray
 
 
-def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> DriftResult:
+def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> _DriftResult:
     """The errors of all seeds after the given times, s."""
     prepare_precision("float64")
     found = [_errors_of(seed, times) for seed in task.seeds(USUAL)]
-    return DriftResult(times, *(np.array(each) for each in zip(*found, strict=True)))
+    return _DriftResult(times, *(np.array(each) for each in zip(*found, strict=True)))
 
 
 def rms(errors: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def rms(errors: np.ndarray) -> np.ndarray:
     return np.sqrt((errors**2).mean(axis=0))
 
 
-def table_drift(result: DriftResult) -> list[str]:
+def _table_drift(result: _DriftResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     packet, odometry, added = rms(result.packet), rms(result.odometry), rms(result.added)
     lines = [
@@ -124,7 +124,7 @@ NOT_SHOWN = (
 )
 
 
-def draw_drift(result: DriftResult, png: Path) -> None:
+def _draw_drift(result: _DriftResult, png: Path) -> None:
     """Errors of position and heading against the noise of speed and of heading."""
     most = float(result.added[..., 0].max()), float(result.added[..., 1].max())
     line = (
@@ -150,7 +150,7 @@ def draw_drift(result: DriftResult, png: Path) -> None:
 
 
 def _draw_curves(
-    axes: style.Axes, result: DriftResult, rows: Sequence[int], levels: Sequence[float], quantity: int
+    axes: style.Axes, result: _DriftResult, rows: Sequence[int], levels: Sequence[float], quantity: int
 ) -> None:
     packet, odometry = rms(result.packet)[rows, :, quantity], rms(result.odometry)[rows, :, quantity]
     for j, time in enumerate(result.times):
@@ -211,7 +211,7 @@ def _odometry(study: StudyCourse) -> np.ndarray:
     return np.array(poses)
 
 
-DRIFT = Figure("Path integration drift against noise", measure_drift, table_drift, draw_drift)
+DRIFT = Figure("Path integration drift against noise", measure_drift, _table_drift, _draw_drift)
 
 
 PATHS = ("sargolini", "walk")
@@ -239,7 +239,7 @@ class Schedule(NamedTuple):
     end: float = 240.0
 
 
-class AnchoringResult(NamedTuple):
+class _AnchoringResult(NamedTuple):
     """Errors of n seeds over T steps.
 
     Attributes:
@@ -258,7 +258,7 @@ class AnchoringResult(NamedTuple):
         return np.median(self.error[path, test][:, rows].reshape(-1, 2), axis=0)
 
 
-def measure_anchoring(task: Task, schedule: Schedule | None = None) -> AnchoringResult:
+def measure_anchoring(task: Task, schedule: Schedule | None = None) -> _AnchoringResult:
     """The errors of all paths, tests and seeds."""
     schedule = schedule or Schedule()
     sessions = RatSessions(
@@ -276,7 +276,7 @@ def measure_anchoring(task: Task, schedule: Schedule | None = None) -> Anchoring
             again[path, test] = np.array(
                 [_anchored_after(each[test], each["light"], schedule) for each in runs]
             )
-    return AnchoringResult(schedule, error, again)
+    return _AnchoringResult(schedule, error, again)
 
 
 def _anchored_after(run: CellRecording, light: CellRecording, schedule: Schedule) -> float:
@@ -290,7 +290,7 @@ def _anchored_after(run: CellRecording, light: CellRecording, schedule: Schedule
     return float(near[0]) / RATE if len(near) else np.inf
 
 
-def table_anchoring(result: AnchoringResult) -> list[str]:
+def _table_anchoring(result: _AnchoringResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     _, back, end = result.schedule
     seeds = len(next(iter(result.error.values())))
@@ -322,7 +322,7 @@ ANCHORING_NOT_SHOWN = (
 )
 
 
-def draw_anchoring(result: AnchoringResult, png: Path) -> None:
+def _draw_anchoring(result: _AnchoringResult, png: Path) -> None:
     """Median errors over time, with the range of the middle half of the seeds."""
     begins, back, end = result.schedule
     during = {
@@ -382,4 +382,4 @@ def _run(sessions: RatSessions, schedule: Schedule, path: str, test: str, seed: 
     return sessions.run(replace(log, views=views))
 
 
-ANCHORING = Figure("Anchoring by views", measure_anchoring, table_anchoring, draw_anchoring)
+ANCHORING = Figure("Anchoring by views", measure_anchoring, _table_anchoring, _draw_anchoring)

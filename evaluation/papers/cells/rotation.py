@@ -106,7 +106,7 @@ class _Rotation(NamedTuple):
     course: np.ndarray
 
 
-class RotationResult(NamedTuple):
+class _RotationResult(NamedTuple):
     """The rotations of n seeds for each of `CONDITIONS`."""
 
     schedule: Schedule
@@ -117,7 +117,7 @@ class RotationResult(NamedTuple):
         return np.degrees([[getattr(each, kind) for each in seeds] for seeds in self.found])
 
 
-def measure_rotation(task: Task, schedule: Schedule | None = None) -> RotationResult:
+def measure_rotation(task: Task, schedule: Schedule | None = None) -> _RotationResult:
     """The rotations of all conditions and seeds."""
     schedule = schedule or Schedule()
     sessions = RatSessions(
@@ -138,7 +138,7 @@ def measure_rotation(task: Task, schedule: Schedule | None = None) -> RotationRe
         )
         turn = np.radians(condition.degrees)
         found.append([rotation_of(sessions.run(each), schedule, turn) for each in sources])
-    return RotationResult(schedule, found)
+    return _RotationResult(schedule, found)
 
 
 def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> _Rotation:
@@ -167,7 +167,7 @@ def rotation_of(recording: CellRecording, schedule: Schedule, turn: float) -> _R
     )
 
 
-def table_rotation(result: RotationResult) -> list[str]:
+def _table_rotation(result: _RotationResult) -> list[str]:
     """The lines of the table, and what it does not show."""
     kinds = [result.degrees(kind) for kind in KINDS]
     lines = [
@@ -193,7 +193,7 @@ NOT_SHOWN = (
 )
 
 
-def draw_rotation(result: RotationResult, png: Path) -> None:
+def _draw_rotation(result: _RotationResult, png: Path) -> None:
     """Rotations against the turn of the cues, and the rotation of the packet's heading over time."""
     heading = result.degrees("heading")
     gains = [heading[k] / CONDITIONS[k].degrees for k in range(len(ANGLES)) if ANGLES[k]]
@@ -220,7 +220,7 @@ def draw_rotation(result: RotationResult, png: Path) -> None:
     figure.savefig(png)
 
 
-def _draw_courses(axes: style.Axes, result: RotationResult) -> None:
+def _draw_courses(axes: style.Axes, result: _RotationResult) -> None:
     """Medians over the seeds, smoothed by a running median of a second."""
     marks = style.GREY, style.SKY, style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.INK
     time = np.arange(len(result.found[0][0].course)) / RATE
@@ -271,4 +271,4 @@ def _preferred_turn(recording: CellRecording, before: np.ndarray, late: np.ndarr
     return complex(np.exp(1j * (directions[1] - directions[0])[active]).mean())
 
 
-FIGURE = Figure("How far cue rotation is followed", measure_rotation, table_rotation, draw_rotation)
+FIGURE = Figure("How far cue rotation is followed", measure_rotation, _table_rotation, _draw_rotation)

@@ -92,7 +92,7 @@ def _compare(
     return _ShuffledRow(way, name, checked, share, mean)
 
 
-def shuffle_table(result: tuple[str, list[_ShuffledRow]]) -> Iterator[str]:
+def _shuffle_table(result: tuple[str, list[_ShuffledRow]]) -> Iterator[str]:
     """The lines of the table."""
     note, rows = result
     yield note
@@ -111,7 +111,7 @@ def shuffle_table(result: tuple[str, list[_ShuffledRow]]) -> Iterator[str]:
         )  # fmt: skip
 
 
-FIGURE = Figure("Shuffled controls", check_shuffles, lambda result: list(shuffle_table(result)), None)
+FIGURE = Figure("Shuffled controls", check_shuffles, lambda result: list(_shuffle_table(result)), None)
 
 
 SMOOTHING = 1.5

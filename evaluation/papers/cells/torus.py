@@ -142,7 +142,7 @@ def measure_cells(
     return _LatticeFigures(size, bin, maps, hexagonal, square, spacing, fields.number)
 
 
-def table_torus(result: _Torus) -> list[str]:
+def _table_torus(result: _Torus) -> list[str]:
     """The lines of the table, and what it does not show."""
     large, single, small, torus = result
     lines = [
@@ -180,7 +180,7 @@ NOT_SHOWN = (
 )
 
 
-def draw_result(result: _Torus, png: Path) -> None:
+def _draw_torus(result: _Torus, png: Path) -> None:
     """A row of maps and one of autocorrelograms for each box; histograms of the scores in the larger."""
     large, _, small, torus = result
     values = (large.spacing, large.square.score, large.hexagonal.score)
@@ -242,7 +242,7 @@ def _counts(fields: np.ndarray) -> str:
     return ", ".join(f"{number}: {count} cells" for number, count in zip(numbers, cells, strict=True))
 
 
-FIGURE = Figure("A torus cell in boxes of two sizes", measure_torus, table_torus, draw_result)
+FIGURE = Figure("A torus cell in boxes of two sizes", measure_torus, _table_torus, _draw_torus)
 
 
 SHOWN = 4

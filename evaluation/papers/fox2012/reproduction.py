@@ -73,7 +73,7 @@ FILTERED, RECKONED, TRUE = "filter", "dead reckoning", "true path"
 """Paths along which a method's marks are drawn: the filter's, a lower bound and an upper bound."""
 
 
-class Protocol(NamedTuple):
+class _Protocol(NamedTuple):
     """A figure of the paper.
 
     Attributes:
@@ -96,20 +96,20 @@ _SMALL: dict[str, tuple[float, tuple[str, ...]]] = {"1.25 m arena": (0.05, ())}
 _LARGE = ("create_simulation.arena.side=2.5", "create_simulation.reports=1500")
 
 PROTOCOLS = {
-    "fox-fig4": Protocol(
+    "fox-fig4": _Protocol(
         "Mean maps of three mappers",
         "Fox et al. 2012, III, Fig. 4",
         _SMALL,
         note="One arena, six minutes from a different start in each trial. The paper does not print its "
         "arena, whisker mounts and likelihood constants: compare rankings, not values.",
     ),
-    "fox-fig5": Protocol(
+    "fox-fig5": _Protocol(
         "Maps of single trials",
         "Fox et al. 2012, IV, Fig. 5",
         _SMALL,
         note="The trials of fox-fig4 with the same numbers.",
     ),
-    "fox-fig6": Protocol(
+    "fox-fig6": _Protocol(
         "A larger arena at two levels of odometry noise",
         "Fox et al. 2012, III, Fig. 6",
         {"2 % noise": (0.02, _LARGE), "5 % noise": (0.05, _LARGE)},
@@ -188,7 +188,7 @@ _LEGEND = (
 _PREFIXES = {FILTERED: "{}, ", RECKONED: "  on dead reckoning, ", TRUE: "  on the true path, "}
 
 
-def _render_results(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
+def _render_results(protocol: _Protocol, rows: Sequence[ResultRow], sets: int) -> str:
     """All metrics of a reproduction, then the tests of the paper's order of mappers."""
     done = len({row.number for row in rows})
     lines = [f"{protocol.title} ({protocol.source}); {done} of {sets} sets", ""]
@@ -324,7 +324,7 @@ def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
 Rows = Sequence[ResultRow]
 
 
-def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
+def _draw_reproduction(name: str, protocol: _Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: method below method, or set below set."""
     shown = [row for row in rows if row.key[3] == FILTERED]
     first_only, lines = False, len(protocol.methods)
@@ -390,7 +390,9 @@ class _MapResult(NamedTuple):
     online: np.ndarray
 
 
-def plan_jobs(protocol: Protocol, sets: int, seed: int, assignments: Sequence[str] = ()) -> list[_SessionJob]:
+def plan_jobs(
+    protocol: _Protocol, sets: int, seed: int, assignments: Sequence[str] = ()
+) -> list[_SessionJob]:
     """All sessions of a reproduction, set by set.
 
     Raises:

@@ -103,7 +103,7 @@ def _measure_arena(task: MapTask, side: float = SMALL) -> ArenaFigures:
     )
 
 
-def arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
+def _arena_lines(found: Sequence[ArenaFigures]) -> Iterator[str]:
     """The lines of unknown starts."""
     yield HEADER
     n = len(found)
@@ -162,9 +162,9 @@ def _localise(session: Session, drive: ArenaDrive) -> Localised:
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
-GRID = Figure("Localise in a grid map from an unknown start", _measure_arena, arena_lines, _draw_arenas, 20)
+GRID = Figure("Localise in a grid map from an unknown start", _measure_arena, _arena_lines, _draw_arenas, 20)
 GRID_LARGE = Figure(
-    "The same in arenas of 2.5 m", partial(_measure_arena, side=LARGE), arena_lines, _draw_arenas, 6
+    "The same in arenas of 2.5 m", partial(_measure_arena, side=LARGE), _arena_lines, _draw_arenas, 6
 )
 
 

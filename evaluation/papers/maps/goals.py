@@ -425,7 +425,7 @@ def _is_solved(drive: Drive) -> bool:
     return drive.state is DriveState.BLOCKED or (drive.replans > 0 and drive.reached)
 
 
-def goal_lines(found: Sequence[GoalFigures]) -> Iterator[str]:
+def _goal_lines(found: Sequence[GoalFigures]) -> Iterator[str]:
     """The lines of drives to goals."""
     yield HEADER
     free, walled = ([drive for one in found for drive in getattr(one, name)] for name in ("free", "walled"))
@@ -477,7 +477,7 @@ def goal_lines(found: Sequence[GoalFigures]) -> Iterator[str]:
     )
 
 
-def draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
+def _draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
     """Draws the drives of one maze, and how far from the goals all of them ended."""
     one, free = found[0], [drive for one in found for drive in one.free]
     gap = np.full((1, 2), np.nan)  # between the paths of two drives
@@ -498,4 +498,4 @@ def draw_goals(found: Sequence[GoalFigures], png: Path) -> None:
     draw_panels(png, "Driving to goals on a map of touch", line, paths, panel)
 
 
-GOALS = Figure("Drive to goals on a map", _measure_goals, goal_lines, draw_goals, 1)
+GOALS = Figure("Drive to goals on a map", _measure_goals, _goal_lines, _draw_goals, 1)

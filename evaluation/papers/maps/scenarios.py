@@ -110,11 +110,8 @@ SMALLEST = 4
 """Fewest cells of a part."""
 
 
-class _TwoParts(NamedTuple):
-    """Two lists of cells of a maze, each connected, in order of growth."""
-
-    one: tuple[Cell, ...]
-    other: tuple[Cell, ...]
+_Parts = tuple[tuple[Cell, ...], tuple[Cell, ...]]
+"""Two lists of cells of a maze, each connected, in order of growth."""
 
 
 def _maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
@@ -149,7 +146,7 @@ def _grow_part(
     return grown
 
 
-def _overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> _TwoParts:
+def _overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> _Parts:
     """Two connected parts of equal size that share half the cells of each, as large as they are found to fit.
 
     Raises:
@@ -163,11 +160,11 @@ def _overlapping_parts(graph: networkx.Graph, random: np.random.Generator) -> _T
             one = shared and _grow_part(graph, shared, half, (), random)
             other = one and shared and _grow_part(graph, shared, half, one[half:], random)
             if one and other:
-                return _TwoParts(tuple(one), tuple(other))
+                return tuple(one), tuple(other)
     raise InputError("simulation.maze", f"{len(cells)} cells", "room for two parts that overlap")
 
 
-def _separate_parts(graph: networkx.Graph, random: np.random.Generator) -> _TwoParts:
+def _separate_parts(graph: networkx.Graph, random: np.random.Generator) -> _Parts:
     """Two connected parts without a common cell that hold all cells: a random spanning tree, divided at the
     edge that leaves the parts most equal.
 
@@ -183,7 +180,7 @@ def _separate_parts(graph: networkx.Graph, random: np.random.Generator) -> _TwoP
         side = min(sides, key=lambda part: abs(2 * len(part) - len(graph)))
         rest = sorted(set(graph) - side)
         if min(len(side), len(rest)) >= SMALLEST:
-            return _TwoParts(tuple(sorted(side)), tuple(rest))
+            return tuple(sorted(side)), tuple(rest)
     raise InputError("simulation.maze", f"{len(graph)} cells", "room for two separate parts")
 
 
@@ -211,14 +208,14 @@ def cells_of(poses: np.ndarray) -> list[Cell]:
     return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
 
 
-class World(NamedTuple):
+class _World(NamedTuple):
     """A maze and its loop in anticlockwise order."""
 
     maze: Maze
     loop: list[Cell]
 
 
-class Overlap(NamedTuple):
+class _Overlap(NamedTuple):
     """Two sessions in parts of a maze that share half their cells, and one session over both.
 
     Attributes:
@@ -228,10 +225,10 @@ class Overlap(NamedTuple):
     one: Recipe
     other: Recipe
     both: Recipe
-    parts: _TwoParts
+    parts: _Parts
 
 
-class Carried(NamedTuple):
+class _Carried(NamedTuple):
     """A session in one part of a maze, and two sessions of a robot that was carried away after it.
 
     Attributes:
@@ -244,7 +241,7 @@ class Carried(NamedTuple):
     known: Recipe
     entry: int
     unknown: Recipe
-    parts: _TwoParts
+    parts: _Parts
 
 
 class Change(NamedTuple):
@@ -258,9 +255,9 @@ class Change(NamedTuple):
     places: np.ndarray
 
 
-def open_world(maze: int) -> World:
+def open_world(maze: int) -> _World:
     """The unchanged maze of a seed."""
-    return World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
+    return _World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
 
 
 def ten_circuits(maze: int) -> Recipe:
@@ -296,34 +293,34 @@ def same_maze(maze: int, number: int) -> Recipe:
     return Recipe(_later(maze, name, {"path": {"circuits": PAPER_CIRCUITS, "start": start}}))
 
 
-def overlapping_sessions(maze: int) -> Overlap:
+def overlapping_sessions(maze: int) -> _Overlap:
     """Explorations of two parts that share half their cells, and one as long as both together over both."""
     random = stream(maze, "atlas.overlap.parts")
     world = open_world(maze)
     parts = _overlapping_parts(_maze_graph(world.maze, world.loop[0]), random)
-    union = tuple(dict.fromkeys(parts.one + parts.other))
-    lengths = {"one": (parts.one, PART), "other": (parts.other, PART), "both": (union, 2 * PART)}
+    union = tuple(dict.fromkeys(parts[0] + parts[1]))
+    lengths = {"one": (parts[0], PART), "other": (parts[1], PART), "both": (union, 2 * PART)}
     sessions = {
         name: _explore_all(maze, world, f"overlap {name}", cells, steps)
         for name, (cells, steps) in lengths.items()
     }
-    return Overlap(**sessions, parts=parts)
+    return _Overlap(**sessions, parts=parts)
 
 
-def carried_sessions(maze: int) -> Carried:
+def carried_sessions(maze: int) -> _Carried:
     """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place."""
     random = stream(maze, "atlas.carried.parts")
     world = open_world(maze)
     parts = _separate_parts(_maze_graph(world.maze, world.loop[0]), random)
     if random.integers(2):
-        parts = _TwoParts(parts.other, parts.one)
+        parts = parts[::-1]
     way = _enter(world.maze, parts, random)
     config = _later(maze, "carried known", {"path": {"cells": way}})
     truth = record(Recipe(config)).truth
-    entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts.one), len(truth))
-    path = {"explore": float(LOCALISED), "within": _turned(parts.other, random)}
-    return Carried(
-        first=_explore_all(maze, world, "carried first", parts.one, PART),
+    entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts[0]), len(truth))
+    path = {"explore": float(LOCALISED), "within": _turned(parts[1], random)}
+    return _Carried(
+        first=_explore_all(maze, world, "carried first", parts[0], PART),
         known=Recipe(config, 0, entry + REENTERED),
         entry=entry,
         unknown=Recipe(_later(maze, "carried unknown", {"path": path})),
@@ -379,7 +376,7 @@ def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
 
 
-def _explore_all(maze: int, world: World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
+def _explore_all(maze: int, world: _World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
     """A session that enters each of these cells and no other, from a random one on.
 
     Raises:
@@ -400,14 +397,14 @@ def _turned(cells: tuple[Cell, ...], random: np.random.Generator) -> tuple[Cell,
     return cells[first:] + cells[:first]
 
 
-def _enter(maze: Maze, parts: _TwoParts, random: np.random.Generator) -> list[Cell]:
+def _enter(maze: Maze, parts: _Parts, random: np.random.Generator) -> list[Cell]:
     """A route of 0 to `LEAD` unknown cells and then known ones, longer than `REENTERED` whisks there."""
     lead, cells = int(random.integers(LEAD + 1)), REENTERED // 4
     if not lead:
-        start = _turned(parts.one, random)[0]
-        return exploration_route(maze, start, cells, random, parts.one)
+        start = _turned(parts[0], random)[0]
+        return exploration_route(maze, start, cells, random, parts[0])
     # Pairs of an outside cell and a cell of the part that no wall separates, in order.
-    doors = sorted((a, b) for a in parts.other for b in maze.neighbours(a) if b in parts.one)
+    doors = sorted((a, b) for a in parts[1] for b in maze.neighbours(a) if b in parts[0])
     outside, inside = doors[int(random.integers(len(doors)))]
-    before = exploration_route(maze, outside, lead, random, parts.other)[::-1] if lead > 1 else [outside]
-    return [*before, *exploration_route(maze, inside, cells, random, parts.one)]
+    before = exploration_route(maze, outside, lead, random, parts[1])[::-1] if lead > 1 else [outside]
+    return [*before, *exploration_route(maze, inside, cells, random, parts[0])]

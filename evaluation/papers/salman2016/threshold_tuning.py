@@ -47,7 +47,7 @@ class ThresholdScore(NamedTuple):
     incorrect: int
 
 
-class Tuning(NamedTuple):
+class _Tuning(NamedTuple):
     """The chosen score or None, the reason, the views, all scores, and the scored steps (from, to)."""
 
     winner: ThresholdScore | None
@@ -57,7 +57,7 @@ class Tuning(NamedTuple):
     steps: tuple[int, int]
 
 
-def tune_threshold(document: Document, folder: Path, workers: int = 1) -> Tuning:
+def tune_threshold(document: Document, folder: Path, workers: int = 1) -> _Tuning:
     """Tunes the threshold of a configuration.
 
     Args:
@@ -78,7 +78,7 @@ def tune_threshold(document: Document, folder: Path, workers: int = 1) -> Tuning
     scored = run_tasks(_score_thresholds, [(config, log, base, part) for part in parts], workers=workers)
     scores = [score for part in scored for score in part]
     winner, reason = choose_threshold(scores, views)
-    return Tuning(winner, reason, views, scores, (base, log.length))
+    return _Tuning(winner, reason, views, scores, (base, log.length))
 
 
 def choose_threshold(
@@ -121,7 +121,7 @@ def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarr
     return np.min([np.abs(views[:, None] - other[None]).mean(axis=axes) for other in shifted], axis=0)
 
 
-def render_tuning(tuning: Tuning) -> str:
+def render_tuning(tuning: _Tuning) -> str:
     """The differences of views, the score of each threshold, and the choice."""
     views, (start, stop) = tuning.views, tuning.steps
     lines = [
@@ -145,7 +145,7 @@ def render_tuning(tuning: Tuning) -> str:
     return "\n".join([*lines, "", f"{verdict}: {tuning.reason}"])
 
 
-def save_tuning(tuning: Tuning, directory: Path) -> tuple[Path, Path]:
+def save_tuning(tuning: _Tuning, directory: Path) -> tuple[Path, Path]:
     """Writes threshold.png and threshold.csv to a folder, created if missing."""
     directory.mkdir(parents=True, exist_ok=True)
     plot, table = directory / "threshold.png", directory / "threshold.csv"

@@ -15,7 +15,7 @@ session, the code that measured it, and its figures, each a number or yes or no.
 Example:
     >>> key = ("clean", "31100")
     >>> old, new = ({key: StoredSession(key, "", {"em": em})} for em in (0.02, 0.01))
-    >>> pairs = pair_sessions(old, new, ["clean"])
+    >>> pairs = _pair_sessions(old, new, ["clean"])
     >>> paired_ratios(*pairs.known("em")).tolist()
     [0.5]
 """
@@ -205,7 +205,7 @@ class _Pairs(NamedTuple):
         return [key for key, there in zip(self.keys, has, strict=True) if there], old, new
 
 
-def pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> _Pairs:
+def _pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> _Pairs:
     """The sessions of these rows that are in both runs, in the order of that now."""
     old, new = ({key: one for key, one in run.items() if key[0] in rows} for run in (old, new))
     keys = [key for key in new if key in old]
@@ -279,7 +279,7 @@ def compare_runs(what: Compared, log: SessionLog, rows: Sequence[str]) -> Iterat
         if not number:
             yield markdown_header(["row", *cells])
         yield markdown_row([name, *cells.values()])
-    keys, before, now = _failures(what, pair_sessions(log.earlier, log.measured, rows))
+    keys, before, now = _failures(what, _pair_sessions(log.earlier, log.measured, rows))
     failures = [" ".join(key) for key, new in zip(keys, now & ~before, strict=True) if new]
     yield from ["", f"New failures: {', '.join(failures) or 'none'}."]
     yield from _provenance(log, rows)
@@ -324,9 +324,9 @@ def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, _Pairs]
     """The pairs of each row, then of all rows if there are several."""
     assert log.earlier is not None
     for row in rows:
-        yield row, pair_sessions(log.earlier, log.measured, [row])
+        yield row, _pair_sessions(log.earlier, log.measured, [row])
     if len(rows) > 1:
-        yield ALL, pair_sessions(log.earlier, log.measured, rows)
+        yield ALL, _pair_sessions(log.earlier, log.measured, rows)
 
 
 def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
@@ -339,7 +339,7 @@ def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
     ]
     if lone:
         yield f"In one run alone and left out, sessions: {'; '.join(lone)}."
-    keys = pair_sessions(log.earlier, log.measured, rows).keys
+    keys = _pair_sessions(log.earlier, log.measured, rows).keys
     codes = [Counter(run[key].code for key in keys) for run in (log.earlier, log.measured)]
     named = [", ".join(f"{code} ({count} sessions)" for code, count in each.items()) for each in codes]
     yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."

@@ -1,6 +1,6 @@
 """Tables of speed, µs: a pose-cell step by size of the network, and steps of many networks and sessions.
 
-The speed table times a step in replay beside `NumpyNetwork`, the baseline of all stated speeds. All columns
+The speed table times a step in replay beside `_NumpyNetwork`, the baseline of all stated speeds. All columns
 of a row are timed in turns on one core, so that they share its state; only ratios carry over to other
 machines.
 
@@ -63,7 +63,7 @@ def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], An
     window, start = replay_network(n, "window", steps)
     single, start32 = replay_network(n, "window", steps, np.float32)
     dense, whole = replay_network(n, "dense", few)
-    network = NumpyNetwork(n)
+    network = _NumpyNetwork(n)
     return {
         "window": (partial(window, start), steps),
         "window, float32": (partial(single, start32), steps),
@@ -130,7 +130,7 @@ def interleaved_medians(
     return {name: float(np.median(each)) for name, each in times.items()}
 
 
-class NumpyNetwork:
+class _NumpyNetwork:
     """A dense network of [K, N, N] cells in plain NumPy float64, the straightforward way.
 
     `step(d, turn)` moves it d cells forward and turns it by `turn` cells: separable circular convolutions as

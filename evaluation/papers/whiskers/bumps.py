@@ -70,14 +70,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 """Settings of the rows."""
 
 
-class Recorded(NamedTuple):
-    """The drive: observations, true poses [T, 3] (NaN where unknown), and walls [S, 4], m."""
-
-    observations: list[Observation]
-    truth: np.ndarray
-    walls: np.ndarray
-
-
 class BumpsResult(NamedTuple):
     """The result.
 
@@ -101,7 +93,7 @@ class BumpsResult(NamedTuple):
     walls: np.ndarray
 
 
-def measure(folder: Path) -> BumpsResult:
+def _measure(folder: Path) -> BumpsResult:
     """Maps the drive with every variant and seed.
 
     Raises:
@@ -113,33 +105,33 @@ def measure(folder: Path) -> BumpsResult:
     unknown = np.full(3, np.nan)
     truth = np.array([unknown if sample.truth is None else sample.truth for sample in samples])
     segments = np.loadtxt(walls, delimiter=",", skiprows=1, ndmin=2)
-    drive = Recorded([observation_of(sample) for sample in samples], truth, segments)
+    observations = [observation_of(sample) for sample in samples]
     final, online = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, settings in VARIANTS.items():
         with open_observations(load_config(CONFIG, settings)) as (config, source):
             session = build_session(config, source)
-        runs = [_run(session, _treat(name, drive.observations, seed), drive.truth, seed) for seed in SEEDS]
+        runs = [_run(session, _treat(name, observations, seed), truth, seed) for seed in SEEDS]
         final[name], online[name] = (np.array([run[part] for run in runs]) for part in range(2))
         if name == "grid filter":
             middle = runs[int(np.argsort(final[name])[len(runs) // 2])]
     # Least-squares ratio of the true advance to that of the odometry, in pressed steps and in others.
-    odometry = np.array([each.odometry.dx for each in drive.observations])[1:]
+    odometry = np.array([each.odometry.dx for each in observations])[1:]
     true = between(truth[:-1], truth[1:])[:, 0]
-    known, pressed = np.isfinite(true), _pressed_steps(drive)[1:]
+    known, pressed = np.isfinite(true), _pressed_steps(observations)[1:]
     first, second = (
         float(true[rows] @ odometry[rows] / (odometry[rows] @ odometry[rows]))
         for rows in (known & pressed, known & ~pressed)
     )
-    touching, known = np.array([each.contact.any() for each in drive.observations]), _known(truth)
+    touching, known = np.array([each.contact.any() for each in observations]), _known(truth)
     return BumpsResult(
-        final, online, _odometry_errors(drive), (first, second),
+        final, online, _odometry_errors(observations, truth), (first, second),
         wall_distances(truth[known, :2], touching[known], segments).contact,
-        truth, _aligned(_dead_reckoning(drive.observations), truth), _aligned(middle[2], truth),
+        truth, _aligned(_dead_reckoning(observations), truth), _aligned(middle[2], truth),
         (middle[3], align(middle[2][known], truth[known])), segments,
     )  # fmt: skip
 
 
-def table(result: BumpsResult) -> list[str]:
+def _table(result: BumpsResult) -> list[str]:
     """The lines of the table: odometry, then the variants of the filter."""
     lines = markdown_header(("real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"))
     rows = lines.split("\n")
@@ -163,7 +155,7 @@ def table(result: BumpsResult) -> list[str]:
     ]
 
 
-def draw(result: BumpsResult, file: Path) -> None:
+def _draw(result: BumpsResult, file: Path) -> None:
     """Draws paths and map over the true walls into a PNG file."""
     final, odometry = np.median(result.final["grid filter"]), result.odometry["odometry"]
     line = f"ATE {final:.2f} m, odometry {odometry:.2f} m; shades: map of the filter; black: true walls"
@@ -216,17 +208,17 @@ def _run(
     return _ate(path, truth), _ate(online, truth), path, grid
 
 
-def _odometry_errors(drive: Recorded) -> dict[str, float]:
+def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict[str, float]:
     """ATE of dead reckoning: as it is, with one error fitted to the truth, with known errors taken out."""
-    moves = np.array([each.odometry for each in drive.observations])
-    pressed = _pressed_steps(drive)
+    moves = np.array([each.odometry for each in observations])
+    pressed = _pressed_steps(observations)
 
     def error(turn: float = 1.0, drift: float = 0.0, slip: float = 0.0) -> float:
         motion = moves[:, :3] * [1, 1, turn] + drift * moves[:, 3:] * [0, 0, 1]
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
-        return _ate(integrate(motion), drive.truth)
+        return _ate(integrate(motion), truth)
 
-    corrected = correct_observations(OTHER_CREATES, drive.observations)
+    corrected = correct_observations(OTHER_CREATES, observations)
     return {
         "odometry": error(),
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),
@@ -234,16 +226,14 @@ def _odometry_errors(drive: Recorded) -> dict[str, float]:
             error(drift=d / 60) for d in np.arange(-0.5, 0.5, 0.02)
         ),
         "odometry without forward motion and half of the turn in pressed steps": error(slip=1.0),
-        f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), drive.truth),
+        f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), truth),
     }
 
 
-def _pressed_steps(drive: Recorded) -> np.ndarray:
+def _pressed_steps(observations: list[Observation]) -> np.ndarray:
     """[T] bool, steps that begin in contact and drive forward."""
-    touching = [False, *(each.contact.any() for each in drive.observations[:-1])]
-    return np.array(
-        [t and each.odometry.dx > 0 for t, each in zip(touching, drive.observations, strict=True)]
-    )
+    touching = [False, *(each.contact.any() for each in observations[:-1])]
+    return np.array([t and each.odometry.dx > 0 for t, each in zip(touching, observations, strict=True)])
 
 
 def _dead_reckoning(observations: list[Observation]) -> np.ndarray:
@@ -262,4 +252,4 @@ def _aligned(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return compose(align(path[_known(truth)], truth[_known(truth)]), path)
 
 
-FIGURE = Figure("A real Create and its bumpers", measure, table, draw)
+FIGURE = Figure("A real Create and its bumpers", _measure, _table, _draw)

@@ -65,7 +65,7 @@ class Label(IntEnum):
     UNCLEAR = 2
 
 
-class Score(NamedTuple):
+class _Score(NamedTuple):
     """Contacts found against marks. A figure without rows to divide by is NaN.
 
     Attributes:
@@ -119,7 +119,7 @@ def merge_marks(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.where(first == second, first, Label.UNCLEAR)
 
 
-def score_contacts(contact: np.ndarray, marks: np.ndarray) -> Score:
+def score_contacts(contact: np.ndarray, marks: np.ndarray) -> _Score:
     """Scores contacts found, [...] bool, against marks of the same shape."""
     unclear = marks == Label.UNCLEAR
     right = int((contact & (marks == Label.CONTACT)).sum())
@@ -127,7 +127,7 @@ def score_contacts(contact: np.ndarray, marks: np.ndarray) -> Score:
         int(wrong.sum()) for wrong in (contact & (marks == Label.FREE), ~contact & (marks == Label.CONTACT))
     )
     doubtful, silent = int((contact & unclear).sum()), int((~contact & unclear).sum())
-    return Score(
+    return _Score(
         precision=_share(right, right + false),
         recall=_share(right, right + missed),
         strict_precision=_share(right, right + false + doubtful),
@@ -152,8 +152,8 @@ class _MarkResult(NamedTuple):
     annotators: tuple[str, ...]
     agreement: float
     unclear: float
-    whiskers: dict[str, list[Score]]
-    pooled: dict[str, Score]
+    whiskers: dict[str, list[_Score]]
+    pooled: dict[str, _Score]
 
 
 class _ContactResult(NamedTuple):
@@ -252,7 +252,7 @@ def _mark_table(result: _ContactResult) -> list[str]:
     return lines
 
 
-def _mark_line(name: str, rule: str, score: Score) -> str:
+def _mark_line(name: str, rule: str, score: _Score) -> str:
     figures = (score.precision, score.recall, score.strict_precision, score.strict_recall)
     shown = " | ".join("-" if np.isnan(figure) else f"{figure:.3f}" for figure in figures)
     return f"| {name} | {rule} | {score.unclear:.1%} | {shown} |"

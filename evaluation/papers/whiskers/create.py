@@ -193,7 +193,7 @@ def _measure_create(folder: Path) -> CreateResult:
     )
 
 
-def create_table(result: CreateResult) -> list[str]:
+def _table_create(result: CreateResult) -> list[str]:
     """The lines of the tables."""
     lines = [markdown_header(COLUMNS)]
     odometry = next(iter(result.variants.values())).odometry
@@ -258,7 +258,7 @@ def _wall_table(distances: WallDistances) -> list[str]:
     return rows
 
 
-def draw_create(result: CreateResult, png: Path) -> None:
+def _draw_create(result: CreateResult, png: Path) -> None:
     """Draws the room with true and estimated paths, and the distances from the wall."""
     line = "nine depth rays, default settings; rigid alignment with the overhead camera"
     figure = new_figure(8.0, "A real Create in a walled room", line)
@@ -289,4 +289,4 @@ def draw_create(result: CreateResult, png: Path) -> None:
     figure.savefig(png)
 
 
-FIGURE = Figure("A real Create: recall with nine depth rays", _measure_create, create_table, draw_create)
+FIGURE = Figure("A real Create: recall with nine depth rays", _measure_create, _table_create, _draw_create)

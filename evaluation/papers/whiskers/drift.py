@@ -95,7 +95,7 @@ DriftResult = tuple[dict[str, _FreeFigures], dict[str, _CreepFigures]]
 """Figures of free whiskers and after contacts, by source."""
 
 
-def measure_drift(folder: Path) -> DriftResult:
+def _measure_drift(folder: Path) -> DriftResult:
     """The figures of real and simulated whiskers.
 
     Raises:
@@ -222,7 +222,7 @@ CAVEATS = (
 )
 
 
-def drift_table(result: DriftResult) -> list[str]:
+def _table_drift(result: DriftResult) -> list[str]:
     """The lines of the table."""
     lines = [markdown_header(COLUMNS)]
     for name, free in result[0].items():
@@ -236,7 +236,7 @@ def drift_table(result: DriftResult) -> list[str]:
     return [*lines, "", CAVEATS]
 
 
-def draw_drift(result: DriftResult, png: Path) -> None:
+def _draw_drift(result: DriftResult, png: Path) -> None:
     """Draws autocorrelation, drift and creep of real and simulated whiskers."""
     from matplotlib.figure import Figure
 
@@ -266,7 +266,7 @@ def draw_drift(result: DriftResult, png: Path) -> None:
     figure.savefig(png, dpi=130)
 
 
-FIGURE = Figure("Noise, drift and creep of whiskers", measure_drift, drift_table, draw_drift)
+FIGURE = Figure("Noise, drift and creep of whiskers", _measure_drift, _table_drift, _draw_drift)
 
 
 Decide = Callable[[np.ndarray], np.ndarray]

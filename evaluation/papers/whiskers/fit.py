@@ -34,7 +34,7 @@ RECORDS = {
 CREATE, MAPPED = "real Create", ("Intel lab", "ACES")
 """The record that is drawn; those whose revisits are compared with the truth."""
 VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
-"""The quantities of the _table, and what is assumed."""
+"""The quantities of the table, and what is assumed."""
 
 
 class _RecordResult(NamedTuple):

@@ -69,14 +69,11 @@ DISTANCES = {
 """Order of the norm, and whether it is of the signed roots."""
 
 
-class _LikenessResult(NamedTuple):
-    """Held-out comparisons: of each block of the whiskers, and of all contacts of the taxels."""
-
-    blocks: list[_HeldOut]
-    contacts: list[_HeldOut]
+_Likeness = tuple[list[_HeldOut], list[_HeldOut]]
+"""Held-out comparisons: of each block of the whiskers, and of all contacts of the taxels."""
 
 
-def _measure(folder: Path) -> _LikenessResult:
+def _measure(folder: Path) -> _Likeness:
     """Compares all held-out images.
 
     Raises:
@@ -91,7 +88,7 @@ def _measure(folder: Path) -> _LikenessResult:
     felt = read_contacts(taxels)
     pressures = np.stack([contact.pressure.mean(axis=0).reshape(-1) for contact in felt])
     contacts = _ImageSet(pressures, np.array([contact.object for contact in felt]), np.arange(len(felt)))
-    return _LikenessResult(
+    return (
         [_hold_out(whiskers, whiskers.run == block) for block in np.unique(whiskers.run)],
         [_hold_out(contacts, np.arange(len(contacts.run)) == k) for k in range(len(contacts.run))],
     )
@@ -136,9 +133,9 @@ def _pooled(parts: list[_HeldOut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return odds, same, np.concatenate([part.distance.ravel() for part in parts])
 
 
-def _table(result: _LikenessResult) -> list[str]:
+def _table(result: _Likeness) -> list[str]:
     """The lines of the table."""
-    blocks = result.blocks
+    blocks, contacts = result
     chosen = [block for k, block in enumerate(blocks) if k in DEVELOPED]
     confirmed = [block for k, block in enumerate(blocks) if k not in DEVELOPED]
     names = ("log-odds", *DISTANCES)
@@ -151,7 +148,7 @@ def _table(result: _LikenessResult) -> list[str]:
         ("8 whiskers, 10 objects, blocks 1-3 (model chosen on these)", chosen, True),
         ("the same, blocks 4-6 (confirming)", confirmed, True),
         ("the same, all six blocks", blocks, True),
-        ("3 x 22 taxels, 6 objects, one contact left out (same model)", result.contacts, False),
+        ("3 x 22 taxels, 6 objects, one contact left out (same model)", contacts, False),
     ]
     for label, parts, by_block in rows:
         odds, same, distance = _pooled(parts)
@@ -177,13 +174,14 @@ NOTES = [
 ]
 
 
-def _draw(result: _LikenessResult, png: Path) -> None:
+def _draw(result: _Likeness, png: Path) -> None:
     """Draws ROC, reliability and recognition."""
+    blocks, contacts = result
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
     kinds = {
-        "whiskers, blocks 1-3": result.blocks[: len(DEVELOPED)],
-        "whiskers, blocks 4-6": result.blocks[len(DEVELOPED) :],
-        "taxels": result.contacts,
+        "whiskers, blocks 1-3": blocks[: len(DEVELOPED)],
+        "whiskers, blocks 4-6": blocks[len(DEVELOPED) :],
+        "taxels": contacts,
     }
     for color, (label, parts) in zip(("C0", "C1", "C2"), kinds.items(), strict=True):
         odds, same, distance = _pooled(parts)

@@ -192,7 +192,7 @@ class TangentResult(NamedTuple):
     without_contact: dict[str, int]
 
 
-def measure(folder: Path) -> TangentResult:
+def _measure(folder: Path) -> TangentResult:
     """Tracks all sweeps.
 
     Raises:
@@ -294,7 +294,7 @@ def _contacts_at_tip(known: SignalMap, signal: np.ndarray) -> np.ndarray:
     return contacts
 
 
-def table(result: TangentResult) -> list[str]:
+def _table(result: TangentResult) -> list[str]:
     """Tables of the cylinder and of the other objects."""
     lines = [
         "| cylinder of 30 mm diameter | sweeps | tangent's error, median (90 %) | contact taken at the tip "
@@ -370,7 +370,7 @@ def _spread(angles: list[np.ndarray]) -> str:
     return f"{middle:.1f}° ({high:.1f}°)"
 
 
-def draw(result: TangentResult, png: Path) -> None:
+def _draw(result: TangentResult, png: Path) -> None:
     """Outlines with tangents, and the errors on the cylinder."""
     import matplotlib.pyplot as plt
 
@@ -416,4 +416,4 @@ def _draw_errors(axis: Axes, result: TangentResult) -> None:
     axis.legend()
 
 
-FIGURE = Figure("Tangents of objects along which a real whisker slid", measure, table, draw)
+FIGURE = Figure("Tangents of objects along which a real whisker slid", _measure, _table, _draw)

@@ -48,29 +48,17 @@ DRAWS = 200
 """Number of draws of the noise of odometry after the reversal."""
 
 
-class _WalkEnd(NamedTuple):
-    """What odometry alone makes of the fourth circuit.
-
-    Attributes:
-        turned: number of whisks before the robot turns round for it. reckoned: Energy Metric of the true path
-            up to there and raw odometry onwards. drawn: [2, DRAWS] the same of the true path and of the map,
-            with noise of odometry drawn anew. heading: error of the map's heading before the robot turns,
-            aligned by the three circuits, rad.
-    """
-
-    turned: int
-    reckoned: float
-    drawn: np.ndarray
-    heading: float
-
-
 class _WalkResult(NamedTuple):
     """One walk.
 
     Attributes:
         maze: its number. real, shuffled: the session with recorded images, and with rows of any object.
             simulated, one_way: with simulated whiskers, and with such that compare one direction only.
-        end: what odometry alone makes of the fourth circuit.
+        turned: number of whisks before the robot turns round for the fourth circuit. The others are what
+            odometry alone makes of that circuit. reckoned: Energy Metric of the true path up to there and
+            raw odometry onwards. drawn: [2, DRAWS] the same of the true path and of the map, with noise of
+            odometry drawn anew. heading: error of the map's heading before the robot turns, aligned by the
+            three circuits, rad.
     """
 
     maze: int
@@ -78,7 +66,10 @@ class _WalkResult(NamedTuple):
     shuffled: SessionResult
     simulated: SessionResult
     one_way: SessionResult
-    end: _WalkEnd
+    turned: int
+    reckoned: float
+    drawn: np.ndarray
+    heading: float
 
 
 def _measure(folder: Path) -> list[_WalkResult]:
@@ -110,8 +101,8 @@ def _measure(folder: Path) -> list[_WalkResult]:
     one_way = [run_session(compare_one_way(config), log) for config, log in sessions]
     real, shuffled = recorded[: len(mazes)], recorded[len(mazes) :]
     ends = [_continue_walk(*row) for row in zip(mazes, real, logs[: len(mazes)], strict=True)]
-    rows = zip(mazes, real, shuffled, simulated, one_way, ends, strict=True)
-    return [_WalkResult(*row) for row in rows]
+    rows = zip(mazes, real, shuffled, simulated, one_way, strict=True)
+    return [_WalkResult(*row, *end) for row, end in zip(rows, ends, strict=True)]
 
 
 def whisker_config(maze: int) -> RunConfig:
@@ -125,8 +116,10 @@ def compare_one_way(config: RunConfig) -> RunConfig:
     return config.model_copy(update={"recall": config.recall.model_copy(update={"shifts": 0})})
 
 
-def _continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> _WalkEnd:
-    """The walk continued by odometry alone from the reversal on."""
+def _continue_walk(
+    maze: int, real: SessionResult, log: InMemorySource
+) -> tuple[int, float, np.ndarray, float]:
+    """The last four fields of a `_WalkResult`: the walk continued by odometry alone from the reversal on."""
     truth, last = real.truth, last_before_reversal(real.truth)
     reckoned = energy_all_pairs(continue_path(truth, log.motion[:, :3], last), truth).total
     odometry = walk_simulation(maze).odometry
@@ -134,16 +127,16 @@ def _continue_walk(maze: int, real: SessionResult, log: InMemorySource) -> _Walk
     before = slice(last + 1)
     turn = align(real.trajectory[before], truth[before])[2]
     heading = float(wrap(real.trajectory[last, 2] + turn - truth[last, 2]))
-    return _WalkEnd(last + 1, reckoned, drawn, heading)
+    return last + 1, reckoned, drawn, heading
 
 
-def energy(result: SessionResult, steps: int | None = None, *, odometry: bool = False) -> float:
+def _energy(result: SessionResult, steps: int | None = None, *, odometry: bool = False) -> float:
     """Energy Metric of the map or of odometry over the first steps."""
     path = result.odometry if odometry else result.trajectory
     return float(energy_all_pairs(path[:steps], result.truth[:steps]).total)
 
 
-def table(walks: list[_WalkResult]) -> list[str]:
+def _table(walks: list[_WalkResult]) -> list[str]:
     """The lines of the table."""
     lines = [
         "| maze | whisks | EM | odometry | simulated whiskers | one direction only | shuffled (closures) "
@@ -153,11 +146,11 @@ def table(walks: list[_WalkResult]) -> list[str]:
         *(_line(walk) for walk in walks),
     ]
     reached, three = (
-        sum(energy(walk.real, steps) <= GOAL for walk, steps in zip(walks, ends, strict=True))
-        for ends in ([None] * len(walks), [walk.end.turned for walk in walks])
+        sum(_energy(walk.real, steps) <= GOAL for walk, steps in zip(walks, ends, strict=True))
+        for ends in ([None] * len(walks), [walk.turned for walk in walks])
     )
-    heading = np.sqrt(np.mean([walk.end.heading**2 for walk in walks]))
-    bound, from_map = np.mean([(walk.end.drawn <= GOAL).mean(axis=1) for walk in walks], axis=0)
+    heading = np.sqrt(np.mean([walk.heading**2 for walk in walks]))
+    bound, from_map = np.mean([(walk.drawn <= GOAL).mean(axis=1) for walk in walks], axis=0)
     return [
         *lines,
         "",
@@ -170,15 +163,15 @@ def table(walks: list[_WalkResult]) -> list[str]:
 
 def _line(walk: _WalkResult) -> str:
     """The row of a walk."""
-    real, three = walk.real, walk.end.turned
+    real, three = walk.real, walk.turned
     false = closure_errors(real) > FALSE_CLOSURE_DISTANCE if len(real.closures) else np.zeros(0, bool)
     late = real.closures[:, 0] >= three if len(real.closures) else false
     cells = [str(walk.maze), str(len(real.truth))]
-    cells += [f"{energy(real):.3f}", f"{energy(real, odometry=True):.3f}"]
-    cells += [f"{energy(walk.simulated):.3f}", f"{energy(walk.one_way):.3f}"]
-    cells += [f"{energy(walk.shuffled):.3f} ({len(walk.shuffled.closures)})", f"{walk.end.reckoned:.3f}"]
-    cells += [f"{np.median(drawn):.3f} ({(drawn <= GOAL).mean():.0%})" for drawn in walk.end.drawn]
-    cells += [f"{energy(real, three):.3f}", f"{energy(real, three, odometry=True):.3f}"]
+    cells += [f"{_energy(real):.3f}", f"{_energy(real, odometry=True):.3f}"]
+    cells += [f"{_energy(walk.simulated):.3f}", f"{_energy(walk.one_way):.3f}"]
+    cells += [f"{_energy(walk.shuffled):.3f} ({len(walk.shuffled.closures)})", f"{walk.reckoned:.3f}"]
+    cells += [f"{np.median(drawn):.3f} ({(drawn <= GOAL).mean():.0%})" for drawn in walk.drawn]
+    cells += [f"{_energy(real, three):.3f}", f"{_energy(real, three, odometry=True):.3f}"]
     cells += [f"{false.sum()} / {len(false)} ({false[late].sum()} / {late.sum()})"]
     return f"| {' | '.join(cells)} |"
 
@@ -192,17 +185,17 @@ NOTE = (
 )
 
 
-def draw(walks: list[_WalkResult], png: Path) -> None:
+def _draw(walks: list[_WalkResult], png: Path) -> None:
     """Draws the maps of all walks above those of odometry, aligned with the true path by three circuits."""
     figure, axes = plt.subplots(2, len(walks), figsize=(3.1 * len(walks), 5.6), layout="constrained")
     for column, walk in zip(axes.T, walks, strict=True):
         paths = {"recorded images": walk.real.trajectory, "odometry": walk.real.odometry}
         for axis, (name, path) in zip(column, paths.items(), strict=True):
-            aligned = compose(align(path[: walk.end.turned], walk.real.truth[: walk.end.turned]), path)
+            aligned = compose(align(path[: walk.turned], walk.real.truth[: walk.turned]), path)
             axis.plot(*walk.real.truth[:, :2].T, color="0.75", lw=3, label="truth")
             parts = (
-                (slice(walk.end.turned), "C0", "three circuits"),
-                (slice(walk.end.turned - 1, None), "C1", "fourth"),
+                (slice(walk.turned), "C0", "three circuits"),
+                (slice(walk.turned - 1, None), "C1", "fourth"),
             )
             for part, color, label in parts:
                 axis.plot(*aligned[part, :2].T, color=color, lw=1, label=label)
@@ -215,7 +208,7 @@ def draw(walks: list[_WalkResult], png: Path) -> None:
     plt.close(figure)
 
 
-FIGURE = Figure("A map from real whisker images on a simulated walk", _measure, table, draw)
+FIGURE = Figure("A map from real whisker images on a simulated walk", _measure, _table, _draw)
 
 
 TURNS = 0.05

@@ -19,7 +19,6 @@ from evaluation.papers.cells.belief_lesions import (
     replaced,
     same_closures,
     silent_cells,
-    table_lesions,
 )
 from evaluation.papers.figure import CELLS, Task, find_figure
 from evaluation.papers.tables import touch_table as touch
@@ -56,9 +55,9 @@ def test_a_network_that_knows_no_places_closes_nothing(result: Any, lesion: str)
 
 
 def test_table_and_picture(result: Any, tmp_path: Path) -> None:
-    rows = [line for line in table_lesions(result) if line.startswith(f"| {CHOSEN[2]}")]
-    assert [row.split(" | ")[3:5] for row in rows] == [["0, 0", "0%"]]
     figure = find_figure(CELLS["lesions"])
+    rows = [line for line in figure.table(result) if line.startswith(f"| {CHOSEN[2]}")]
+    assert [row.split(" | ")[3:5] for row in rows] == [["0, 0", "0%"]]
     assert figure.draw is not None
     figure.draw(result, tmp_path / "lesions.png")
     assert (tmp_path / "lesions.png").read_bytes().startswith(b"\x89PNG")

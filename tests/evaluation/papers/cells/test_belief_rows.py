@@ -16,7 +16,6 @@ from evaluation.papers.cells.belief_rows import (
     MANY,
     NETWORK,
     NO_ENTRY,
-    RoomsResult,
     alike_rooms,
     inside,
     log_gain,
@@ -46,7 +45,7 @@ def posterior() -> Any:
 
 
 @pytest.fixture(scope="module")
-def rooms() -> RoomsResult:
+def rooms() -> Any:
     return measure_rooms(SMALL, sessions=0)
 
 
@@ -118,7 +117,7 @@ def test_smaller_cells_come_closer_to_exact_inference() -> None:
     assert fine < 0.6 * coarse
 
 
-def test_rooms_that_look_alike_share_the_belief_until_they_differ(rooms: RoomsResult) -> None:
+def test_rooms_that_look_alike_share_the_belief_until_they_differ(rooms: Any) -> None:
     share = rooms.share[NETWORK]
     assert np.abs(share[~rooms.evident] - 0.5).max() < 0.1
     assert share[:, -1].min() > 0.9

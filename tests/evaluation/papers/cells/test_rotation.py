@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,10 @@ from hypothesis import strategies as st
 from evaluation.cells.recording import CellRecording
 from evaluation.papers.cells.rotation import (
     CONDITIONS,
-    RotationResult,
+    FIGURE,
     Schedule,
-    draw_rotation,
     measure_rotation,
     rotation_of,
-    table_rotation,
 )
 from evaluation.papers.figure import Task
 from tactile.base.se2 import wrap
@@ -63,12 +62,12 @@ def test_a_packet_that_follows_odometry_has_not_turned(turn: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def result() -> RotationResult:
+def result() -> Any:
     return measure_rotation(Task(41000, sessions=1), SHORT)
 
 
 @pytest.mark.soak
-def test_nothing_turns_where_no_cue_turns(result: RotationResult) -> None:
+def test_nothing_turns_where_no_cue_turns(result: Any) -> None:
     heading = result.degrees("heading")
     for condition, turned in zip(CONDITIONS, heading, strict=True):
         if condition.control:
@@ -76,15 +75,16 @@ def test_nothing_turns_where_no_cue_turns(result: RotationResult) -> None:
 
 
 @pytest.mark.soak
-def test_sessions_are_equal_until_the_turn(result: RotationResult) -> None:
+def test_sessions_are_equal_until_the_turn(result: Any) -> None:
     rows = round(SHORT.turn * 10)
     first = result.found[0][0].course[:rows]
     assert all(np.abs(wrap(seeds[0].course[:rows] - first)).max() < 1e-9 for seeds in result.found)
 
 
 @pytest.mark.soak
-def test_table_and_picture(result: RotationResult, tmp_path: Path) -> None:
-    text = "\n".join(table_rotation(result))
+def test_table_and_picture(result: Any, tmp_path: Path) -> None:
+    text = "\n".join(FIGURE.table(result))
     assert all(f"| {each.name} | {each.degrees} |" in text for each in CONDITIONS)
-    draw_rotation(result, tmp_path / "rotation.png")
+    assert FIGURE.draw is not None
+    FIGURE.draw(result, tmp_path / "rotation.png")
     assert (tmp_path / "rotation.png").read_bytes().startswith(b"\x89PNG")

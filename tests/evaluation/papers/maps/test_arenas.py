@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.papers.maps.arenas import (
+    GRID,
     REPORTS,
     SOON,
     ArenaDrive,
     ArenaFigures,
-    arena_lines,
     shuffled_contacts,
 )
 from evaluation.papers.maps.localising import Judged
@@ -36,9 +36,7 @@ def figures(found_at: int, error: float, other_at: int) -> ArenaFigures:
 
 
 def measured(*found: ArenaFigures) -> dict[str, str]:
-    return {
-        figure: values[0].split(" [")[0] for figure, values in cells_by_figure(arena_lines(found)).items()
-    }
+    return {figure: values[0].split(" [")[0] for figure, values in cells_by_figure(GRID.table(found)).items()}
 
 
 def test_right_and_wrong_sessions_are_counted() -> None:

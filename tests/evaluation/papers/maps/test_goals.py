@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from evaluation.papers.maps.goals import (
+    GOALS,
     ClosedLoop,
     Drive,
     GoalFigures,
     cells_between,
     clearance,
-    draw_goals,
     driven_map,
-    goal_lines,
     shortest_driven,
     walls_of,
 )
@@ -49,7 +48,7 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
         drive(DriveState.REACHED, 0.01),
     ]
     found = GoalFigures(MAZE, [drive(*end) for end in ends], walled, 120.0, np.zeros((2, 2)), 0.09)
-    lines = cells_by_figure(goal_lines([found]))
+    lines = cells_by_figure(GOALS.table([found]))
     assert lines["reached (truly within 0.09 m)"][0].startswith("1 of 3")
     assert lines["reached (truly within 0.09 m)"][1].startswith("0 of 3")
     assert lines["said to be reached at a wrong place"][0].startswith("1 of 6")
@@ -60,7 +59,8 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
     assert counts == [2, 1, 0, 1]
     assert record["path_ratio"] == pytest.approx(0.2 / 0.18)
     assert record["error"] == pytest.approx(0.105)
-    draw_goals([found], tmp_path / "goals.png")
+    assert GOALS.draw is not None
+    GOALS.draw([found], tmp_path / "goals.png")
     assert (tmp_path / "goals.png").stat().st_size > 10_000
 
 

@@ -109,7 +109,7 @@ def test_overlapping_sessions_share_half_their_cells(maze: int) -> None:
 def test_a_carried_robot_is_in_the_known_part_for_sixty_whisks_or_never(maze: int) -> None:
     found = carried_sessions(maze)
     known = set(cells_of(record(found.first).truth))
-    assert known == set(found.parts.one)
+    assert known == set(found.parts[0])
     back = cells_of(record(found.known).truth)
     assert not set(back[: found.entry]) & known
     assert set(back[found.entry :]) <= known

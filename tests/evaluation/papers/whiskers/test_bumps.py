@@ -26,18 +26,19 @@ def some_result() -> BumpsResult:
 
 
 def test_the_table_names_the_rows_that_are_worse_than_their_odometry(tmp_path: Path) -> None:
-    lines = bumps.table(some_result())
+    lines = list(bumps.FIGURE.table(some_result()))
     assert "| grid filter | 0.70 (1.20) | 0.80 (1.30) | 1 of 3 |" in lines
     assert f"| {bumps.OTHERS} | 0.50 (0.50) | 0.50 (0.50) | 1 of 1 |" in lines
     assert "3 contacts; the true distance to the nearest wall is 0.180 m" in lines[-1]
     assert "advances by 0.10 of its odometry, in others by 0.90" in lines[-1]
-    bumps.draw(some_result(), tmp_path / "bumps.png")
+    assert bumps.FIGURE.draw is not None
+    bumps.FIGURE.draw(some_result(), tmp_path / "bumps.png")
     assert (tmp_path / "bumps.png").stat().st_size > 10_000
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"create_lab_odometry\.csv"):
-        bumps.measure(tmp_path)
+        bumps.FIGURE.measure(tmp_path)
 
 
 @pytest.mark.soak
@@ -49,7 +50,7 @@ def test_the_filter_is_better_than_odometry_because_wheels_slip_at_walls(
     rows = {"grid filter": few, "no slip at walls": (*few, "grid.drift.slip=0.0")}
     monkeypatch.setattr(bumps, "VARIANTS", rows)
     monkeypatch.setattr(bumps, "SEEDS", range(2))
-    result = bumps.measure(reference_data)
+    result = bumps.FIGURE.measure(reference_data)
     assert result.odometry["odometry"] == pytest.approx(1.08, abs=0.005)
     assert (result.final["grid filter"] < result.final["no slip at walls"].min()).all()
     assert (result.final["no slip at walls"] < 1.05 * result.odometry["odometry"]).all()

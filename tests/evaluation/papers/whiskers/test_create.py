@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.papers.whiskers.bumps import wall_distances
-from evaluation.papers.whiskers.create import CreateResult, Variant, create_table, draw_create, true_revisits
+from evaluation.papers.whiskers.create import FIGURE, CreateResult, Variant, true_revisits
 from ratslam.mapping.appearance import ViewAppearance
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.mapping.keyframe_graph import KeyframeGraph
@@ -59,7 +59,7 @@ def test_true_revisits_are_of_the_same_place_and_heading():
 
 
 def test_the_table_counts_sessions_above_odometry(result):
-    lines = create_table(result)
+    lines = list(FIGURE.table(result))
     summary = next(line for line in lines if line.startswith("ATE in m."))
     assert "Above odometry: 0 at the end, 1 live" in summary
     assert "2 settings, median: 0.700 at the end" in summary
@@ -69,5 +69,5 @@ def test_the_table_counts_sessions_above_odometry(result):
 
 
 def test_the_picture_is_drawn(result, tmp_path):
-    draw_create(result, tmp_path / "create.png")
+    FIGURE.draw(result, tmp_path / "create.png")
     assert (tmp_path / "create.png").stat().st_size > 10_000

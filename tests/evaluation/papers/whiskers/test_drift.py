@@ -9,13 +9,11 @@ import pytest
 
 from evaluation.papers.whiskers.drift import (
     CHECK,
+    FIGURE,
     FIT,
     RATE,
     creep_figures,
-    draw_drift,
-    drift_table,
     free_figures,
-    measure_drift,
     simulate_free,
 )
 from robot.simulation.head.baseline import HALL_BASELINE, BaselineConfig
@@ -52,7 +50,7 @@ def test_the_creep_of_a_signal_is_found() -> None:
 def test_the_simulator_has_the_noise_drift_and_creep_of_the_fitted_whiskers(
     reference_data: Path, tmp_path: Path
 ) -> None:
-    found = measure_drift(reference_data)
+    found = FIGURE.measure(reference_data)
     free, crept = found
     fitted, creep = free["fitted"], crept["fitted"]
     assert fitted.time == pytest.approx(HALL_BASELINE.colour_time, rel=0.15)
@@ -63,11 +61,12 @@ def test_the_simulator_has_the_noise_drift_and_creep_of_the_fitted_whiskers(
     assert free["checked"].drift == pytest.approx(fitted.drift, rel=0.3)
     assert free["control: white noise"].drift < 0.2 * fitted.drift
     assert free["camera"].drift < 0.2 * fitted.drift
-    assert len(drift_table(found)) == 2 + len(free) + 1
-    draw_drift(found, tmp_path / "drift.png")
+    assert len(list(FIGURE.table(found))) == 2 + len(free) + 1
+    assert FIGURE.draw is not None
+    FIGURE.draw(found, tmp_path / "drift.png")
     assert (tmp_path / "drift.png").stat().st_size > 10_000
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="reaching_take20"):
-        measure_drift(tmp_path)
+        FIGURE.measure(tmp_path)

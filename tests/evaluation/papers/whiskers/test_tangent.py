@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.papers.whiskers.tangent import (
+    FIGURE,
     RADIUS,
     CylinderResult,
     SweepResult,
@@ -15,11 +16,8 @@ from evaluation.papers.whiskers.tangent import (
     Tangents,
     angle_between,
     circle_tangents,
-    draw,
     fit_centre,
-    measure,
     repeatability,
-    table,
 )
 from tactile.base.errors import InputError
 
@@ -60,25 +58,26 @@ def test_table_and_picture_hold_each_figure_beside_its_control(tmp_path: Path) -
         {"flat": sweeps, "star 2": sweeps},
         {"flat": 0, "star 2": 1},
     )
-    lines = table(result)
+    lines = list(FIGURE.table(result))
     row = next(line for line in lines if line.startswith("| all |"))
     assert "| 6 | 5.0° (5.0°) | 5.0° (5.0°) |" in row
     assert "| 15.0 mm (15.0-15.0) | 6 of 6 |" in row
     motion = angle_between(np.concatenate(truth), 0.0)
     assert f"{np.median(motion):.1f}°" in row
     assert any(line.startswith("| star 2 | 2 (1) |") for line in lines)
-    draw(result, tmp_path / "picture.png")
+    assert FIGURE.draw is not None
+    FIGURE.draw(result, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
 def test_a_missing_bench_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file or folder"):
-        measure(tmp_path)
+        FIGURE.measure(tmp_path)
 
 
 @pytest.mark.soak
 def test_the_figure_meets_its_goals_on_the_real_bench(reference_data: Path) -> None:
-    result = measure(reference_data)
+    result = FIGURE.measure(reference_data)
     days = list(result.cylinder.values())
     sweeps = [sweep for day in days for sweep in day.sweeps]
     truth = [one for day in days for one in day.truth]
