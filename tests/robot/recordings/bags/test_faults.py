@@ -19,7 +19,7 @@ from robot.recordings.bags.topic_suggestion import suggested_topics
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import Source
-from tactile.base import files
+from tactile.base import bounded
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import Entry, header, odometry, pose, quaternion, scan, tf, transform, write_bag
 
@@ -70,7 +70,7 @@ def test_what_expands_to_too_much_is_refused(
     beams = [scan(time, np.ones(400_000), -1.5, 1e-6) for time in TIMES[:1]]
     path = written(tmp_path, kind, sorted([*WHEELS, *beams], key=lambda entry: entry.time))
     assert describe_bag(path).topics
-    monkeypatch.setattr(files, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(bounded, "MOST_BYTES", 1 << 20)
     refused(lambda: opened(path), "expands to", "at most 1 MiB: 1 MiB, or 32 times what is stored")
 
 
