@@ -84,6 +84,7 @@ def test_an_installed_program_finds_its_configurations(site: Path, tmp_path: Pat
     assert Path(recording).exists()
 
 
+@pytest.mark.timeout(1200)  # Numba compiles anew in another folder
 @pytest.mark.parametrize(
     ("command", "file"),
     [
