@@ -105,7 +105,7 @@ def replay_network(
             far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
             inject = (k % every == every - 1) if every else jnp.bool_(False)
             cells, report = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
-            return cells, above + (report.level > 0).astype(jnp.int32)
+            return cells, above + (report[2] > 0).astype(jnp.int32)
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
 
