@@ -2,7 +2,7 @@
 
 `python -m ratslam.examples.come_back` maps a maze, is set down in it somewhere else, and prints
 
-    found after 42 whisks, 0.03 m off; 0.7 m to the start
+    found after 45 whisks, 0.04 m off; 0.6 m to the start
 """
 
 from pathlib import Path
