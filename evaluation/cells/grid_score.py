@@ -20,7 +20,7 @@ from tactile.base.errors import InputError
 
 _OVERLAP = 0.8
 """Kept lags reach this share of the side of the map, as in opexebo."""
-_AUTOCORRELOGRAM_BATCH = 64
+_MAPS_AT_ONCE = 64
 """Maps of one batch: its arrays fit the cache."""
 
 
@@ -52,8 +52,8 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
         (int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:]
     ]  # largest kept lags
     maps = np.empty((len(rates), 2 * reach[0] + 1, 2 * reach[1] + 1))
-    for start in range(0, len(rates), _AUTOCORRELOGRAM_BATCH):
-        batch = slice(start, start + _AUTOCORRELOGRAM_BATCH)
+    for start in range(0, len(rates), _MAPS_AT_ONCE):
+        batch = slice(start, start + _MAPS_AT_ONCE)
         visited = np.isfinite(rates[batch])
         # Maps of mean 0 and mean square 1, 0 without visits.
         count = np.maximum(visited.sum(axis=(1, 2)), 1)[:, None, None]
@@ -207,7 +207,7 @@ def _sweep(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool) -> None:
         np.minimum(row, top, out=row)
 
 
-_BATCH = 128
+_SCORED_AT_ONCE = 128
 """Maps of one batch: its arrays fit the cache."""
 _FLAT = 1e-12
 """A variance below this share of the mean square is rounding: the annulus is flat."""
@@ -262,7 +262,7 @@ def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -
         raise InputError(
             "autocorrelograms", f"array of shape {list(maps.shape)}", "maps [n, h, w] with odd sides"
         )
-    batches = [maps[i : i + _BATCH] for i in range(0, len(maps), _BATCH)]
+    batches = [maps[i : i + _SCORED_AT_ONCE] for i in range(0, len(maps), _SCORED_AT_ONCE)]
     return np.concatenate([_score_batch(batch, lattice) for batch in batches] or [np.empty(0)])
 
 

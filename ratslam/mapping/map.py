@@ -284,7 +284,8 @@ class KeyframeMap(Checkpointed, Map):
         if int(evidence.keyframe) >= 0:
             self._append(observation)
             shown = self.appearance.learn(evidence, lambda: self.archive.confirmed_pairs(graph, self.log))
-            if self.closes_loops and np.isfinite(shown[1]) and self.config.bias_from_views:
+            _, standard_error = shown
+            if self.closes_loops and np.isfinite(standard_error) and self.config.bias_from_views:
                 prior = calibration_from_views(self.config, self.cell, graph.start, shown)
                 self._acceptance.learn_bias(graph, self.log, prior)
             matched = self._judge_candidate(evidence)

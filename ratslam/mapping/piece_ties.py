@@ -45,18 +45,19 @@ def tie_newest_piece(
     starts = np.flatnonzero(graph.begins.rows)
     if graph.total % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
         return False
-    tie, begins = find(graph, log, archive, odds), graph.begins.rows.copy()
+    log_odds, closures = find(graph, log, archive, odds) or (-np.inf, ())
+    begins = graph.begins.rows.copy()
     # Accepted sequences between keyframes before the newest beginning and since.
     begins[: starts[-1]] = False
     across = np.flatnonzero(spans_beginnings(begins, log) & (log.verdicts() == Verdict.ACCEPTED))
     if not len(across):
-        if tie is None or tie[0] < graph.config.tie_log_odds:
+        if log_odds < graph.config.tie_log_odds:
             return False
-        for k, candidate in enumerate(tie[1]):
+        for k, candidate in enumerate(closures):
             sequence = log.add(candidate, k > 0)
             archive.add(candidate, k > 0, graph)
             log.judge(sequence, Verdict.ACCEPTED)
-    elif tie is not None and tie[0] >= graph.config.tie_log_odds / 2:
+    elif log_odds >= graph.config.tie_log_odds / 2:
         return False
     for sequence in across.tolist():
         log.judge(sequence, Verdict.UNDONE)

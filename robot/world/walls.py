@@ -1,10 +1,8 @@
-"""Walls as boxes, and the first contact of whiskers of the UR-10 head with them, in closed form.
+"""Polygons in the plane, walls as boxes, and the first contact of whiskers of the UR-10 head with walls.
 
 A whisker swings in a vertical plane through the axis of the head, from outside down and inwards. It first
 touches the top of a box with its tip, or the far upper edge with its shaft. A box nearer to the axis than the
-whisker's base is touched beyond the vertical, by the tip on the far face.
-
-Polygons in the plane: containment, distances and crossings.
+whisker's base is touched beyond the vertical, by the tip on the far face. Contacts are in closed form.
 
 A polygon is [N, 2] corners in order, m, implicitly closed; a segment is a row x1, y1, x2, y2.
 """

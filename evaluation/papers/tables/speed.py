@@ -104,8 +104,8 @@ def replay_network(
             cells, above = carry
             far = (cells.pose + ring / 2 * np.array([1, 1, 0], dtype)) % ring
             inject = (k % every == every - 1) if every else jnp.bool_(False)
-            cells, report = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
-            return cells, above + (report[2] > 0).astype(jnp.int32)
+            cells, (_, _, level) = step(cells, far, jnp.where(inject, 0.02, 0.0).astype(dtype))
+            return cells, above + (level > 0).astype(jnp.int32)
 
         return jax.lax.fori_loop(0, steps, body, (cells, jnp.int32(0)))
 
@@ -265,8 +265,8 @@ def _record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Reco
             assert isinstance(made.backend, RecallBackend)
             backend, session = made.backend, RecordingSession(made.backend, reserve=made.reserve)
         found = session.record(observations)
-        sides = [chunk[2] for chunk in found.chunks]  # numbers of cells along x and y
-        if not recordings or sides == [chunk[2] for chunk in recordings[0].chunks]:
+        sides = [sides for _, _, sides, _, _ in found.chunks]  # numbers of cells along x and y
+        if not recordings or sides == [sides for _, _, sides, _, _ in recordings[0].chunks]:
             recordings.append(found)
         if len(recordings) == RECORDED:
             break

@@ -1,6 +1,6 @@
 """Fixed whiskers of the Create and the readings of their strain sensors (Fox et al. 2012, II-A).
 
-Each whisker has two channels: the horizontal strain at its base from bending (see `whisker_bending`), whose
+Each whisker has two channels: the horizontal strain at its base from bending (below), whose
 sign gives the side, and the vertical strain. Whiskers droop a little, so a force along the shaft bends them
 down; sensor axes are not exactly level, so part of the horizontal strain appears in the vertical channel.
 Sensors add noise, and the body vibrates at the start of a motion and, less, throughout it: the paper
